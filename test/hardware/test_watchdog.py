@@ -23,7 +23,8 @@ from exo_gravity.hardware.ownership.arm_on_bus import ArmLock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
-from .simulated_rig import SimulatedRig, wait_until
+from ..support.waiting import wait_until
+from .simulated_rig import SimulatedRig
 
 pytestmark = pytest.mark.real_time
 REPO = Path(__file__).parents[2]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from exo_gravity.nodes.imu.node import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.imu_faults import bowing_and_walking
+from ..support.waiting import wait_until
 
 G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -76,11 +76,9 @@ class ImuNode:
         values = {pair.key: pair.value for pair in self.reported[-1].values}
         self.received = max(self.received, int(values["received"]))
 
-    def wait_until(self, condition, timeout=20.0):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, f"{self.reported[-3:]}, {self.received} of {self.sent} samples received"
-            self.executor.spin_once(timeout_sec=0.05)
+    def wait_until(self, condition):
+        seen = lambda: f"{self.reported[-3:]}, {self.received} of {self.sent} samples received"  # noqa: E731
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), seen=seen)
 
     def reports(self, text, level=None, since=0):
         """Whether a status with `text` has come, not counting the first `since`."""

@@ -3,6 +3,7 @@
 How a device is opened again: hardware/test_imu_reopening.py.
 """
 
+import itertools
 import math
 import time
 
@@ -21,6 +22,7 @@ from exo_gravity.nodes.ros.run import keep_to_this_machine
 from ..hardware.virtual_time import VirtualClock
 from ..support.fake_imu.chip import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
+from ..support.waiting import wait_until
 
 keep_to_this_machine()
 PERIOD = 0.01  # s
@@ -94,25 +96,31 @@ def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_report
     listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", tilts.append, 50)
     listener.create_subscription(DiagnosticArray, "/diagnostics", lambda message: reports.extend(message.status), 50)
 
-    def wait_until(condition, sends=True):
-        end, due, counter = time.monotonic() + 20.0, time.monotonic(), 0
-        while not condition():
-            assert time.monotonic() < end, reports[-1]
-            if sends and time.monotonic() >= due:
-                due, counter = due + 0.01, counter + 1
-                # with noise, as every real one has
-                rig.sensor.send(rvc_packet(counter, (0, 20, 0), (0, 342, 940 + counter % 3)))
-            executor.spin_once(timeout_sec=0.002)
+    times = itertools.count(time.monotonic(), PERIOD)
+    counters, due = itertools.count(), [next(times)]
+
+    def spin():
+        executor.spin_once(timeout_sec=0.002)
+
+    def send_and_spin():
+        if time.monotonic() >= due[0]:
+            due[0] = next(times)
+            # with noise, as every real one has
+            rig.sensor.send(rvc_packet(next(counters), (0, 20, 0), (0, 342, 940 + round(due[0] / PERIOD) % 3)))
+        spin()
+
+    def wait(condition, meanwhile=send_and_spin):
+        wait_until(condition, meanwhile, seen=lambda: reports[-1])
 
     try:
-        wait_until(lambda: tilts)
+        wait(lambda: tilts)
         assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
-        wait_until(lambda: reports[-1].message == "publishing")
+        wait(lambda: reports[-1].message == "publishing")
         rig.sensor.unplug()
-        wait_until(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in reports[-1].message, sends=False)
+        wait(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in reports[-1].message, spin)
         assert reports[-1].level == DiagnosticStatus.ERROR
         rig.sensor.plug()
-        wait_until(lambda: reports[-1].message == "publishing")
+        wait(lambda: reports[-1].message == "publishing")
         assert int({pair.key: pair.value for pair in reports[-1].values}["opened"]) >= 2
     finally:
         node.close()

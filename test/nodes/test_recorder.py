@@ -30,6 +30,8 @@ from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
+from ..support.waiting import wait_until
+
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
@@ -67,12 +69,9 @@ class PublishingArm:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
-    def wait_until(self, condition, timeout=60.0):
+    def wait_until(self, condition):
         """Spin until `condition()` holds."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, "the condition did not hold in time"
-            self.executor.spin_once(timeout_sec=0.01)
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01))
 
     def is_recorded(self):
         """Return whether every topic that is to be recorded has a subscriber."""

@@ -18,6 +18,8 @@ from std_msgs.msg import String
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers
 
+from ..support.waiting import pause, wait_until
+
 keep_to_this_machine()
 
 NUMBERS = itertools.count(1)
@@ -52,12 +54,8 @@ class Pair:
         for text in texts:
             self.publisher.publish(String(data=text))
 
-    def wait_until(self, condition: Callable[[], Any], action: Callable[[], object] = lambda: None) -> None:
-        end = time.monotonic() + 20.0
-        while not condition():
-            action()
-            assert time.monotonic() < end, self.received
-            time.sleep(0.005)
+    def wait_until(self, condition: Callable[[], Any], meanwhile: Callable[[], object] = pause) -> None:
+        wait_until(condition, meanwhile, seen=lambda: self.received)
 
     def texts(self) -> list[str]:
         return [text for text, _, _ in self.received]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ..hardware.simulated_rig import wait_until
+from ..support.waiting import wait_until
 from .network import ADDRESSES, Network, Wire
 
 COUNT = 300
