@@ -15,7 +15,7 @@ from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.compensation.terms.springs import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import Tilt, pitch_roll
+from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.inputs import HOLD, MAX_LEAD
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
@@ -46,37 +46,6 @@ def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
     assert "older than 80 ms" in run.cycle(0.1).reason
-
-
-def gravity_at(bow, lean):
-    """Gravity in the trunk's axes after a bow by any angle of a trunk that leans: true at 90 degrees and beyond."""
-    down = np.array((0.0, math.sin(lean), -math.cos(lean)))
-    turn = np.array(((math.cos(bow), 0, -math.sin(bow)), (0, 1, 0), (math.sin(bow), 0, math.cos(bow))))
-    return turn @ down
-
-
-@pytest.mark.parametrize(("lean", "way"), [(-1e-9, -1.0), (0.0, 1.0), (0.3, -1.0)])
-def test_a_bow_through_90_degrees_and_lying_down_stay_compensated(lean, way):
-    run = CompensatorRun(use_imu=True)
-    base_from_trunk = np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1)))  # left arm: x0 left, y0 forward, z0 down
-    gravities = []
-    for k in range(2400):
-        bow = way * min(math.pi, 2.0 * max(0.0, k * PERIOD - 1.1))  # 2 rad/s, to 180 degrees
-        gravities.append(gravity_at(bow, lean))
-        run.compensator.tilt.set_tilt(run.now, *pitch_roll(gravities[-1]))
-        assert run.cycle().reason == ""
-    ramped = slice(round(1.1 / PERIOD) + 1, None)
-    directions = np.array(gravities[ramped]) @ base_from_trunk.T
-    expected = gravity_torque(ROBOT, np.tile(THETA, (len(directions), 1)), directions)
-    np.testing.assert_allclose(run.efforts[ramped], expected, atol=1e-6)
-
-
-def test_a_tilt_that_turns_faster_than_a_trunk_is_refused_whichever_way_it_turns():
-    for pitch, roll in ((0.3, 0.0), (0.0, -0.3), (-math.pi / 2, 0.0)):
-        run = CompensatorRun(use_imu=True)
-        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
-        with pytest.raises(ParameterError, match=r"trunk tilt = .*: must be within 0.1 rad plus 5 rad/s"):
-            run.compensator.tilt.set_tilt(run.now + 0.01, pitch, roll)
 
 
 def test_a_tilt_is_as_old_as_its_stamp():
@@ -149,15 +118,6 @@ def test_impossible_joint_angles_get_no_torque(theta):
     answer = run.cycle(theta=theta)
     assert answer.effort is None
     assert "not 4 numbers within 26 rad" in answer.reason
-
-
-@pytest.mark.parametrize("angle", [math.nan, math.inf, 4.0])
-def test_an_impossible_tilt_is_rejected_and_the_last_one_stays(angle):
-    run = CompensatorRun(use_imu=True)
-    run.compensator.tilt.set_tilt(run.now, 0.1, 0.0)
-    with pytest.raises(ParameterError):
-        run.compensator.tilt.set_tilt(run.now, angle, 0.0)
-    assert run.cycle().effort is not None
 
 
 def test_after_a_break_the_torque_ramps_in_again():
