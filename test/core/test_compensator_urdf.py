@@ -57,14 +57,6 @@ def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
     assert arm.step(4.0, POSE).reason == "trunk tilt older than 500 ms"
 
 
-def test_pitch_and_roll_give_the_same_gravity_as_the_vector():
-    arm = Compensator(settings(use_imu=True, max_effort_rate=1000.0))
-    for n in range(300):
-        arm.tilt.set_tilt(2.0 + n * PERIOD, math.asin(0.6), 0.0)
-        answer = arm.step(2.0 + n * PERIOD, POSE)
-    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
-
-
 def test_a_change_of_settings_fades_in_without_a_step():
     arm = Compensator(settings(max_effort_rate=1000.0))
     before = steps(arm, 1.0, 1.5)[-1]
