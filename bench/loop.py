@@ -34,7 +34,7 @@ SETTLING = 0.5  # s of movement before the measurement
 THREAD_PRIORITY = {"nodes": 0, "fifo": 50, "one process": 0}  # of the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
 CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
-QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that counts as quiet
+QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that is treated as quiet
 QUIET_OTHERS = 0.1  # the same for other programs: Linux counts that time in ticks
 
 Windows = list[tuple[float, float]]  # begin and end in s since 1970

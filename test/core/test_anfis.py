@@ -159,7 +159,7 @@ def test_on_a_tilted_trunk_the_law_names_the_tilt(pitch, roll):
     assert "tilted" in law().outside(ARM, INSIDE, Tilt.of("right", pitch, roll))
 
 
-def test_a_trunk_tilted_by_less_than_half_a_degree_counts_as_upright():
+def test_a_trunk_tilted_by_less_than_half_a_degree_is_treated_as_upright():
     assert not law().outside(ARM, INSIDE, Tilt.of("right", math.radians(0.49), 0.0))
 
 

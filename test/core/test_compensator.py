@@ -68,7 +68,7 @@ def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
 
 
 @pytest.mark.parametrize("acceleration", [-4.0, 0.0, 4.0])
-def test_a_late_tilt_is_turned_on_within_the_bound_that_it_states_and_then_withdrawn(acceleration):
+def test_a_late_tilt_is_extrapolated_within_the_bound_that_it_states_and_then_withdrawn(acceleration):
     run = CompensatorRun(use_imu=True)
     for _ in range(600):  # past the ramp
         run.compensator.tilt.set_gravity(run.now, (0.0, 0.0, -1.0), (0.0, 0.3, 0.0))

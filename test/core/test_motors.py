@@ -310,7 +310,7 @@ def test_a_frame_of_any_control_mode_is_a_command_to_a_v3_board(mode):
 
 
 @pytest.mark.parametrize("length", [0, 7, 9])
-def test_a_v3_status_frame_of_another_length_is_none(length):
+def test_a_v3_status_frame_of_another_length_is_ignored(length):
     assert MIT_V3.classify(MIT_V3.status_id(1), bytes(length), IDS) == (OTHER, 0)
 
 

@@ -68,7 +68,7 @@ class Rig:
 
 
 class SimulatedRig(Rig):
-    """A simulated arm on a bus of its own, in real time.
+    """A simulated arm on a separate bus, in real time.
 
     interface: 'virtual', or 'udp_multicast' to share it with processes.
     """

@@ -136,7 +136,9 @@ def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
     assert ask("enable", None, True) == "the node is not active"
 
 
-def test_one_request_carries_an_arm_on_after_a_fault_that_was_no_ones_or_is_refused_with_the_reason(ask, monkeypatch):
+def test_one_request_resumes_after_a_fault_that_leaves_nothing_to_repair_or_is_refused_with_the_reason(
+    ask, monkeypatch
+):
     loop = standing()
     assert ask("resume", loop) == "refused: the arm is disabled, must be in fault"
     loop.safety.enable(0.0)
@@ -169,7 +171,7 @@ def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, mo
     assert ask("set_zero", loop).endswith("c at 0.000 rad, elbow at 0.500 rad")
 
 
-def test_simulated_time_is_refused_beside_a_real_bus_at_the_start_and_live(node):
+def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
     operation.refuse_simulated_time(node, "udp_multicast")
     assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
     with pytest.raises(ParameterError, match="use_sim_time = True: must be false with a real bus"):

@@ -25,7 +25,7 @@ SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 @pytest.fixture(scope="module")
 def compensator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
-    """A probe beside a compensator that no test changes."""
+    """A probe of a compensator that no test changes."""
     probe = RosProbe()
     nodes = LaunchedNodes(tmp_path_factory.mktemp("compensator"), without=OTHER_NODES, compensator=NO_IMU).start()
     yield probe

@@ -183,7 +183,7 @@ def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_clear
     carried(rig)
 
 
-def test_joint_states_that_are_old_by_their_stamps_do_not_count(rig):
+def test_joint_states_that_are_old_by_their_stamps_are_ignored(rig):
     rig.lag = 1.0
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "no joint_states younger than 150 ms" in rig.status.message)

@@ -160,7 +160,9 @@ def test_raw_messages_are_passed_on_in_bytes_with_their_time_of_arrival(executor
     ],
     ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"],
 )
-def test_publishers_are_told_apart_and_their_losses_counted_by_the_numbers_of_their_messages(numbers, others, missed):
+def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of_their_messages(
+    numbers, others, missed
+):
     publishers = Publishers()
     changes = [publishers.is_another({"publication_sequence_number": number}) for number in numbers]
     assert [n for n, is_another in enumerate(changes) if is_another] == others

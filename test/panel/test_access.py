@@ -52,7 +52,7 @@ def test_without_a_token_only_a_loopback_name_may_be_asked_for():
     assert access_at("0.0.0.0", "secret").allows_host("panel.example.org")
 
 
-def test_the_cookie_is_a_secret_of_its_own():
+def test_the_cookie_is_not_the_token():
     access, other = (access_at("0.0.0.0", "secret") for _ in range(2))
     session = access.session
     assert len(session) >= 32 and session != other.session

@@ -104,7 +104,7 @@ def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared(visit, stage):
     assert not page.is_visible('[data-arm="right"] .remedy')
 
 
-def test_after_a_fault_that_was_no_ones_one_press_carries_the_arm_again(visit, stage):
+def test_after_a_fault_that_leaves_nothing_to_repair_one_press_carries_the_arm_again(visit, stage):
     page = visit()
     assert not page.is_visible('[data-arm="right"] .resume')
     stage.arms.fail("right", "command_stale")

@@ -50,7 +50,7 @@ def test_the_static_torque_of_a_worn_arm_includes_the_wearers_arm():
     np.testing.assert_allclose(arm.data.qfrc_bias, expected, atol=1e-12)
 
 
-def test_centres_of_gravity_beside_the_links_add_the_torques_of_their_moments():
+def test_centres_of_gravity_off_the_links_axes_add_the_torques_of_their_moments():
     rng = np.random.default_rng(2)
     links = SimulatedArm().config.links
     for _ in range(20):

@@ -202,7 +202,7 @@ class LateBus:
     ("waits", "simulated", "slip"),
     [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
 )
-def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_count_as_slip(monkeypatch, waits, simulated, slip):
+def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_are_slip(monkeypatch, waits, simulated, slip):
     bus, device = LateBus(waits), make_device()
     monkeypatch.setattr(device_module, "time", SimpleNamespace(monotonic=lambda: bus.now))
     device.run(bus, bus.done)

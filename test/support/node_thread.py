@@ -1,4 +1,4 @@
-"""Nodes of a test, on a thread of their own."""
+"""Nodes of a test, on a separate thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ InvalidHandle = rclpy_implementation.InvalidHandle
 
 
 class NodeThread:
-    """Nodes with these names in a context of their own, which a thread spins until `close`.
+    """Nodes with these names in a separate context, which a thread spins until `close`.
 
     after_spin: called on that thread whenever something may have arrived.
     """

@@ -19,6 +19,6 @@ def own_ports(first: int) -> Iterator[int]:
 
 
 def free_port() -> int:
-    """Return a TCP port of loopback that no one uses."""
+    """Return a TCP port of loopback that is free."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])

@@ -79,7 +79,7 @@ def test_mirrored_arms_share_one_table(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("plain")
-def test_a_motor_that_gives_three_quarters_of_its_torque_counts_as_three_quarters(run):
+def test_the_limits_of_a_motor_that_gives_three_quarters_of_its_torque_are_three_quarters(run):
     _, text = run("--body-mass", 75, changes={BRIDGE: {"torque_scale": [1.0, 0.75, 1.0, 1.0]}})
     (row,) = (line.split() for line in text.splitlines() if "2 shoulder abduction" in line)
     assert row[3:6] == ["AK80-9", "6.75", "13.5"]

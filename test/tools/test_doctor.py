@@ -133,9 +133,9 @@ def test_an_interface_as_docs_first_arming_sets_it_up_is_fine():
         ({"restart_ms": 0}, "restart", Level.WARNING, "restart-ms 100"),
     ],
 )
-def test_what_ip_tells_of_an_interface(change, what: str, level: Level, command: str):
-    told = {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}}
-    bad, worst = of_interface(link=told)
+def test_what_ip_reports_of_an_interface(change, what: str, level: Level, command: str):
+    changed = {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}}
+    bad, worst = of_interface(link=changed)
     assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].mend
 
 
@@ -154,7 +154,7 @@ def test_without_ip_the_state_is_unknown_and_a_virtual_interface_has_none():
 
 @pytest.fixture
 def computer(tmp_path, monkeypatch):
-    """A folder that looks like / on a computer where all is well, with `can0` and `can1`; `ip` tells of both."""
+    """A folder that looks like / on a computer where all is well, with `can0` and `can1`; `ip` reports both."""
     files = {
         "proc/version": FINE.kernel,
         "sys/kernel/realtime": "1",
@@ -240,7 +240,7 @@ def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
     assert code == 2 and "/right/can_bridge rate = 500.0: must be at most 400 Hz" in text
 
 
-def test_it_measures_in_a_process_of_its_own_at_the_rate_of_the_file():
+def test_it_measures_in_a_separate_process_at_the_rate_of_the_file():
     woken = doctor.measured(0.01, 0.2, 0)
     assert woken.lateness.shape == (20,) and (woken.lateness > -1e-6).all() and not woken.refused
 

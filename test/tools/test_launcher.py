@@ -167,7 +167,7 @@ def test_only_a_part_of_the_nodes_is_started(launched):
     assert list(launched("--only", "*/can_bridge", "/imu")[0]) == ["/imu", "/right/can_bridge"]
 
 
-def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_is_told_apart(launched):
+def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_names(launched):
     log = ("lab.right.compensator INFO compensating\n", "lab.right.can_bridge WARN late\n", "ERROR of a watchdog\n")
     one_process = ("--namespace", "lab", "--one-process")
     commands, lines = launched(*one_process, log=log)

@@ -117,7 +117,7 @@ def test_a_name_is_refused_as_a_subjects_code(run, capsys):
     assert not list(folder.glob("Anna*"))
 
 
-def test_progress_that_no_one_reads_any_more_ends_nothing():
+def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
     code = "import sys; from exo_gravity.tools.trial import _print_json as p; p(step=0); input(); p(step=1); p(step=2)"
     process = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
     assert process.stdin and process.stdout and process.stderr
