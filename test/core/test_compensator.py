@@ -6,12 +6,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, GuidedChange
-from exo_gravity.core.compensation.limiter import LONGEST_STEP
 from exo_gravity.core.compensation.terms.springs import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
@@ -221,33 +218,6 @@ def test_too_large_a_torque_is_clamped_and_the_joint_named():
     answer = run.cycle(2.0)
     assert answer.effort[1] == 1.0
     assert answer.clamped == (1,)
-
-
-CHANGES = st.fixed_dictionaries(
-    {},
-    optional={
-        "mode": st.sampled_from(["one_g", "zero_g"]),
-        "law": st.sampled_from(["exact", "paper_static", "paper_mobile"]),
-        "support": st.floats(0, 1),
-        "wearer_mass": st.tuples(*[st.floats(0, 2)] * 4),
-        "max_effort": st.tuples(*[st.floats(0, 20)] * 4),
-        "max_effort_rate": st.floats(1, 200),
-    },
-)
-PERIODS = st.sampled_from([0.001, 0.002, 0.004, 0.009, 0.011, 0.03, 0.045])  # late ones too
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.lists(st.tuples(CHANGES, st.lists(PERIODS, max_size=60), st.tuples(*[st.floats(-1.5, 1.5)] * 4)), max_size=9))
-def test_no_sequence_of_changes_poses_and_late_cycles_exceeds_the_torque_rate(sequence):
-    run = CompensatorRun()
-    run.cycle(1.2)
-    for change, periods, theta in sequence:
-        run.compensator.apply(settings_with(**change))
-        for period in periods:
-            run.cycle(period, theta, period)
-            allowed = change.get("max_effort_rate", 50.0) * min(period, LONGEST_STEP)
-            assert np.abs(np.subtract(*run.efforts[-2:])).max() <= allowed * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(
