@@ -30,9 +30,10 @@ from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
-from ..support.waiting import wait_until
+from ..support.waiting import PATIENCE, wait_until
 
-NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
+PROGRAM = "from exo_gravity.nodes.recorder import node; node.SILENCE = 3.0; node.main()"  # s: a busy machine sends late
+NODE = [sys.executable, "-c", PROGRAM, "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
 
@@ -148,7 +149,7 @@ def test_every_message_of_an_arm_is_in_the_recording(session, topic):
 def test_every_message_has_its_time_of_arrival(session):
     for stamp, message in recorded(session[0], "/right/joint_states"):
         sent = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        assert 0 < stamp - sent < 10**9
+        assert 0 < stamp - sent < PATIENCE * 10**9
 
 
 def test_a_best_effort_publisher_is_recorded_as_best_effort(session):
@@ -260,7 +261,7 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
         if now > death:
             process.stdin.close()  # the launcher has died
     assert process.poll() is None
-    assert process.wait(20) == 0
+    assert process.wait(PATIENCE) == 0
     assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0]) == k
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
