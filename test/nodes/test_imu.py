@@ -22,7 +22,7 @@ from exo_gravity.nodes.imu.node import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.imu_faults import bowing_and_walking
-from ..support.waiting import wait_until
+from ..support.waiting import PATIENCE, wait_until
 
 G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -56,7 +56,7 @@ class ImuNode:
 
     def close(self):
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(PATIENCE)
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)

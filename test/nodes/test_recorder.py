@@ -121,7 +121,7 @@ def session(tmp_path_factory):
         while not lines or "motor 2 is silent" not in lines[-1]:
             lines.append(process.stdout.readline())
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE)
         yield path, lines, process.returncode, known.topic_type_hash
     finally:
         process.kill()
@@ -194,7 +194,7 @@ def test_the_session_and_the_markers_are_messages_of_the_recording(session):
 
 def test_a_name_as_the_subjects_code_ends_the_recorder_with_2(tmp_path):
     process = start(tmp_path / "bag", "-p", "subject:='Anna Meier'")
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2 and "must be a code" in errors and not (tmp_path / "bag").exists()
 
 
@@ -207,7 +207,7 @@ def test_a_live_line_has_joints_step_and_faults(session):
 
 def test_without_an_output_the_node_names_the_missing_parameter_and_ends_with_2():
     process = start(None)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2 and "output" in errors
 
 
@@ -218,7 +218,7 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     k = 0
     while process.poll() is None and k < 20_000:
         arm.publish(k := k + 1)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
 
@@ -238,7 +238,7 @@ def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_re
         arm.publish(k)
     arm.wait_until(lambda: arm.publish(3050) or True)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     missed, unwritten = map(int, re.findall(r"messages lost so far: (\d+) did not arrive, (\d+) were not", errors)[-1])
     found = [

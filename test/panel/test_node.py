@@ -20,6 +20,7 @@ from ..support.launched_nodes import executable
 from ..support.node_thread import NodeThread
 from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
+from ..support.waiting import PATIENCE
 
 TOKEN = "a token for this test"
 NAMES = [f"joint_{n}" for n in range(4)]
@@ -104,7 +105,7 @@ def panel(tmp_path: Path) -> Iterator[PanelProcess]:
 def message(connection: ClientConnection, kind: str, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
     """Return the first message of this type for which `condition` holds."""
     while True:
-        content = json.loads(connection.recv(timeout=30))
+        content = json.loads(connection.recv(timeout=PATIENCE))
         if content["type"] == kind and condition(content):
             return content
 
@@ -165,7 +166,7 @@ def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(tmp_path)
         assert values["port"] == panel.port
         assert "token" not in values
         panel.process.terminate()
-        assert panel.process.wait(30) == 0
+        assert panel.process.wait(PATIENCE) == 0
     finally:
         probe.close()
         panel.close()

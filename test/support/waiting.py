@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-PATIENCE = 60.0  # s
+PATIENCE = 120.0  # s, after which a process or a condition is taken for stuck
 PAUSE = 0.005  # s between two looks
 
 

@@ -22,6 +22,7 @@ from exo_gravity.tools.trial import main
 
 from ..support import csv_rows
 from ..support.ports import own_ports
+from ..support.waiting import PATIENCE
 
 CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
@@ -125,7 +126,7 @@ def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
     process.stdout.close()
     process.stdin.write("\n")
     process.stdin.close()
-    assert process.wait(60) == 0 and process.stderr.read() == ""
+    assert process.wait(PATIENCE) == 0 and process.stderr.read() == ""
     process.stderr.close()
 
 
