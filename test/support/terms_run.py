@@ -75,7 +75,7 @@ class TermsRun:
         self._gravity: deque[Sequence[float]] = deque([LAWS["exact"](self.links, self.pose, UPRIGHT)])
         self._extra: deque[Sequence[float]] = deque([(0.0,) * 4])
         self._late = max(1, round(self.delay / self.period))
-        self._push = no_push
+        self._push: Push = no_push
         attach(self.device, lambda *state: np.asarray(self._push(*state)).tolist())
         for motor in MOTORS_OF_ARM:
             self.device.exchange(motor.can_id, motor.command(0.0, 0.0))

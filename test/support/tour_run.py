@@ -80,8 +80,8 @@ class TourRun:
                 position, velocity = [row.position for row in samples], [row.velocity for row in samples]
                 began = began or safety.state is State.ACTIVE
                 if began and safety.state is State.ACTIVE:
-                    if not self.log and self.disturb:
-                        attach(device, lambda time, *_: self.disturb(time, device) or (0.0,) * 4)
+                    if not self.log and (disturb := self.disturb):
+                        attach(device, lambda time, *_: disturb(time, device) or (0.0,) * 4)
                     self.fastest = max(self.fastest, *map(abs, device.arm.velocities))
                     effort = tour.step(now, position, velocity, tilt)
                     tour.plan()

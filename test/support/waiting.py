@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-PATIENCE = 120.0  # s, after which a process or a condition is taken for stuck
+PATIENCE = 100.0  # s, after which a process or a condition is taken for stuck; pytest ends a test after 120 s
 PAUSE = 0.005  # s between two looks
 
 
