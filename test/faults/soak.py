@@ -25,7 +25,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))  # before rclpy is imported
+from ..support.ports import own_domain
+
+os.environ.setdefault("ROS_DOMAIN_ID", str(own_domain()))  # before rclpy is imported
 
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped
