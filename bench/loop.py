@@ -34,7 +34,7 @@ SETTLING = 0.5  # s of movement before the measurement
 THREAD_PRIORITY = {"nodes": 0, "fifo": 50, "one process": 0}  # of the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
 CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
-QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that counts as quiet
+QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that is treated as quiet
 QUIET_OTHERS = 0.1  # the same for other programs: Linux counts that time in ticks
 
 Windows = list[tuple[float, float]]  # begin and end in s since 1970
@@ -69,7 +69,7 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
     watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
     that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
     """
-    with tempfile.TemporaryDirectory() as folder_name, _pinned(), contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder_name, pinned(), contextlib.ExitStack() as stack:
         folder = Path(folder_name)
         params, simulators = write_parameters(folder, rate, both_arms, seconds, THREAD_PRIORITY.get(kind, 0))
         namespaces = ["/right", "/left"] if both_arms else ["/right"]
@@ -149,22 +149,22 @@ def _measure(
     pids: dict[str, int], seconds: float, watch: Watch | None
 ) -> tuple[Windows, dict[str, float], tuple[float, float]]:
     """Let `seconds` pass; return that time and those of `watch`, each process's share of a core, and what was taken."""
-    before, begin = {name: _cpu_time(pid) for name, pid in pids.items()}, time.time()
-    (stolen, used), ours = _core_times(), _own_time()
+    before, begin = {name: cpu_time(pid) for name, pid in pids.items()}, time.time()
+    (stolen, used), ours = _core_times(), own_time()
     windows: Windows = []
     if watch:
         windows = watch(pids) or []
     else:
         time.sleep(seconds)
     end = time.time()
-    shares = {name: (_cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
+    shares = {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
     (stolen_later, used_later), total = _core_times(), (end - begin) * len(os.sched_getaffinity(0))
-    others = max(0.0, used_later - used - (_own_time() - ours))
+    others = max(0.0, used_later - used - (own_time() - ours))
     return [(begin, end), *windows], shares, ((stolen_later - stolen) / total, others / total)
 
 
 @contextlib.contextmanager
-def _pinned() -> Iterator[None]:
+def pinned() -> Iterator[None]:
     """Keep this thread, and the processes that it starts in the context, on `CORES` cores.
 
     Where there are more, they are not two threads of one core, and not the first, which serves most interrupts.
@@ -210,13 +210,13 @@ def _process(module: str, *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
         process.wait(300.0)
 
 
-def _cpu_time(pid: int) -> float:
+def cpu_time(pid: int) -> float:
     """Return the processor time in s that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def _own_time() -> float:
+def own_time() -> float:
     """Return the processor time in s of this process and of all that descend from it."""
     parents = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
@@ -228,7 +228,7 @@ def _own_time() -> float:
     total = 0.0
     for pid in ours:
         with contextlib.suppress(OSError):
-            total += _cpu_time(pid)
+            total += cpu_time(pid)
     return total
 
 

@@ -34,13 +34,13 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
             if kind == "fifo" and (both_arms or rate < 500):  # two devices would get no processor
                 continue
             progress(f"loop, {arms}, {rate} Hz: {kind}")
-            if run := _quietest_run(kind, rate, both_arms, 5.0 if quick else 20.0, progress):
+            if run := quietest_run(kind, rate, both_arms, 5.0 if quick else 20.0, progress):
                 runs[kind] = run
         name = f"loop, {arms}, {rate} Hz"
-        yield from _rows(name, rate, runs, "nodes")
-        yield from _rows(f"{name}, one process", rate, runs, "one process")
+        yield from rows_of(name, rate, runs, "nodes")
+        yield from rows_of(f"{name}, one process", rate, runs, "one process")
         if "fifo" in runs:
-            yield from _rows(f"{name}, thread_priority {THREAD_PRIORITY['fifo']}", rate, runs, "fifo")
+            yield from rows_of(f"{name}, thread_priority {THREAD_PRIORITY['fifo']}", rate, runs, "fifo")
         if "nodes" in runs:
             starts.append(runs["nodes"].start)
     if starts:
@@ -48,7 +48,7 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
         yield Row("start, launch to active: the checks and the ramp", median, CALM + RAMP, "s", _range(starts))
 
 
-def _quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:
+def quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:
     """Return the run from which least was taken, of up to `ATTEMPTS`; None if none carried the arm."""
     best = None
     for _ in range(ATTEMPTS):
@@ -64,7 +64,7 @@ def _quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progres
     return best
 
 
-def _rows(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
+def rows_of(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
     period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
     if kind not in runs:
         disturbed = any(run.is_disturbed for run in runs.values())

@@ -1,7 +1,7 @@
 """`make motion-monitor`: what the monitor of unexplained torque sees, and what it costs (docs/safety.md has the table).
 
 Offline, with the simulated arm, its CAN frames, the safety machine with its own limits and the compensator, judged by
-the arm's true motion. First compensators that are wrong, with an arm that no one holds; then an hour of wearers who
+the arm's true motion. First compensators that are wrong, with a free arm; then an hour of wearers who
 move as fast as `over_speed` permits, whose arm must not be let down once, for whatever reason.
 
     python -m bench.motion_monitor [--hours 1.0] [--addition 0.0]
@@ -386,7 +386,7 @@ def caught(
 
 
 def wrong_rows(**monitor: Any) -> Iterator[tuple[str, Caught]]:
-    """Yield what becomes of an arm that no one holds; monitor: `watched` and `addition`, as `caught` takes them."""
+    """Yield what becomes of a free arm; monitor: `watched` and `addition`, as `caught` takes them."""
     by_mass = (ArmModel(LENGTH, ROBOT.cog, mass) for mass in (3.0 * ROBOT.mass, ROBOT.mass[::-1]))
     tripled, reversed_ = (settings_of(robot=robot) for robot in by_mass)
     yield "masses 3 times too large, from the start", caught(tripled, None, **monitor)

@@ -95,7 +95,7 @@ def rows(tmp_path_factory):
         for name, value in {"SAMPLES": 300, "GAUSSIAN_SAMPLES": 80, "VERTICES": 3, "HELD_OUT": 100, "TIMED": 5}.items():
             patch.setattr(learned, name, value)
         few = {"hidden_layer_sizes": (16,), "solver": "lbfgs", "random_state": 0, "max_iter": 50}
-        patch.setattr(learned, "_network", lambda: learned.MLPRegressor(**few))
+        patch.setattr(learned, "network", lambda: learned.MLPRegressor(**few))
         patch.setattr(learned, "baseline_burden", lambda *given: asked.append(given) or Burden(1.0, 0.1, 0.2))
         study.measure_learned(configured_arm(), folder)
     for pitch in (0.0, 0.1):  # a law gets angles in rad
@@ -133,7 +133,7 @@ def test_the_box_is_within_the_joint_limits_and_outside_is_beyond_it():
 
 def test_the_cube_map_is_exact_at_its_vertices_and_constant_beyond_the_box():
     space = learned.Workspace(configured_arm())
-    model, _ = learned._cube_map(space)
+    model, _ = learned.cube_map(space)
     corners = np.array([[1.0, -1.0, 0.5, 0.0, -0.5, 1.0], [0.0] * 6])
     np.testing.assert_allclose(model(corners), space.torque(corners), atol=1e-12)
     np.testing.assert_allclose(model(1.5 * np.ones((1, 6))), model(np.ones((1, 6))))

@@ -38,7 +38,7 @@ def play(monkeypatch):
             return result
 
         monkeypatch.setattr(loops, "run_loop", next_run)
-        kept = loops._quietest_run("nodes", 500, False, 5.0, lambda _: None)
+        kept = loops.quietest_run("nodes", 500, False, 5.0, lambda _: None)
         return kept, len(results) - len(waiting)
 
     return play
@@ -61,7 +61,7 @@ def test_a_rate_at_which_no_run_carries_the_arm_ends_too(play):
     [(run(), run(), (False, False)), (run(), run(0.02), (False, True)), (run(0.0, 0.2), run(), (True, True))],
 )
 def test_a_figure_says_that_it_or_its_peer_was_disturbed(ours, python, marked):
-    rows = {row.name: row for row in loops._rows("loop", 500, {"nodes": ours, "python": python}, "nodes")}
+    rows = {row.name: row for row in loops.rows_of("loop", 500, {"nodes": ours, "python": python}, "nodes")}
     compared = rows["loop, p99: one period"], rows["loop, p99: Python without ROS"]
     assert tuple(row.disturbed for row in compared) == marked
     console = Console(width=150, file=io.StringIO())
@@ -71,13 +71,13 @@ def test_a_figure_says_that_it_or_its_peer_was_disturbed(ours, python, marked):
 
 def test_nodes_that_did_not_run_are_excused_where_their_peers_were_disturbed():
     for peer in (run(), run(0.0, 0.2)):
-        (row,) = loops._rows("loop", 500, {"python": peer}, "nodes")
+        (row,) = loops.rows_of("loop", 500, {"python": peer}, "nodes")
         assert row.ours == 100.0 and row.disturbed is peer.is_disturbed
 
 
 def test_what_is_started_while_pinned_runs_on_at_most_two_of_the_permitted_cores():
     permitted = os.sched_getaffinity(0)
-    with loop._pinned():
+    with loop.pinned():
         code = "import os; print(sorted(os.sched_getaffinity(0)))"
         printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
         assert printed.strip() == str(sorted(os.sched_getaffinity(0)))
@@ -86,13 +86,13 @@ def test_what_is_started_while_pinned_runs_on_at_most_two_of_the_permitted_cores
 
 
 def test_the_time_of_a_child_is_our_own_and_not_that_of_other_programs():
-    before = loop._own_time()
+    before = loop.own_time()
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         end = time.monotonic() + 30.0
-        while loop._cpu_time(busy.pid) < 0.2 and time.monotonic() < end:
+        while loop.cpu_time(busy.pid) < 0.2 and time.monotonic() < end:
             time.sleep(0.05)
-        assert loop._own_time() - before >= 0.2
+        assert loop.own_time() - before >= 0.2
     finally:
         busy.kill()
         busy.wait()

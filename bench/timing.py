@@ -3,7 +3,7 @@
 The content of a command shows which replies it answers. The arm moves to and fro, so that its angles change by a few
 position codes each cycle. The four angles of a cycle determine, by the law under test, the four command frames that
 answer it, bit for bit: while the arm is carried within its limits on an upright trunk, the loop changes nothing else.
-An answer that equals one of the last cycles' is left out: the arm turned too little to tell them apart. Every other
+An answer that equals one of the last cycles' is left out: the arm turned too little to distinguish them. Every other
 answer is searched in the later cycles; where a newer answer overtook it, that one counts. The latency of each motor
 runs from its reply to its command.
 """
@@ -20,7 +20,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import SPECIAL_FRAMES
 
 DISTINCT = 8  # cycles before, from whose answers an answer must differ
-GIVE_UP = 0.1  # s after which an answer counts as lost
+GIVE_UP = 0.1  # s after which an answer is treated as lost
 
 Law = Callable[[Sequence[float]], Sequence[float]]
 Answer = tuple[bytes, ...]  # the command frames to all motors

@@ -8,7 +8,9 @@ import pytest
 
 from exo_gravity.hardware.clock import favour
 
-os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 100 + 1)
+from .support.ports import own_domain
+
+os.environ["ROS_DOMAIN_ID"] = str(own_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 

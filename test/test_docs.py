@@ -15,6 +15,7 @@ from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.tools.launcher import node_modules
 
 from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2, commands_of, words_of
+from .support.waiting import PATIENCE
 
 TABLES = ROOT / "docs" / "tables.py"
 NODES = ("can_bridge", "compensator", "imu", "simulator", "recorder", "robot_model", "calibrator", "panel")
@@ -28,7 +29,7 @@ def name(path: Path) -> str:
 
 def run_tables(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(TABLES), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
 
 
 def anchors(path: Path) -> set[str]:

@@ -1,4 +1,4 @@
-"""python -m bench.baselines [--only growth,learned]: laws without a model, beside the exact law.
+"""python -m bench.baselines [--only growth,learned]: laws without a model, compared with the exact law.
 
 Tables go to the terminal, CSV files and a figure to a folder. It takes six minutes.
 """

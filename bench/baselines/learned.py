@@ -134,9 +134,9 @@ def baselines(configured: ConfiguredArm) -> Iterator[Baseline]:
     judged = _judged("exact law", workspace, lambda: (workspace.torque, configured.robot))
     yield judged._replace(pose_time=_pose_time(workspace.in_the_loop, inputs[:TIMED]))
     yield _in_use("exact law and PID", exact, feedback=True)
-    yield _judged("cube map", workspace, lambda: _cube_map(workspace))
+    yield _judged("cube map", workspace, lambda: cube_map(workspace))
     with threadpool_limits(1):
-        yield _judged("neural network", workspace, lambda: _fitted(_network(), inputs, torque))
+        yield _judged("neural network", workspace, lambda: _fitted(network(), inputs, torque))
         yield _judged("Gaussian process", workspace, lambda: _fitted(_gaussian_process(), inputs[few], torque[few]))
         yield _judged("gradient boosting", workspace, lambda: _fitted(_boosting(), inputs, torque))
 
@@ -184,7 +184,8 @@ def _pose_time(model: Model, inputs: np.ndarray) -> float:
     return float(np.median(times))
 
 
-def _cube_map(workspace: Workspace) -> tuple[Model, Any]:
+def cube_map(workspace: Workspace) -> tuple[Model, Any]:
+    """Return the cube map of a workspace, and what is kept of it."""
     axis = np.linspace(-1.0, 1.0, VERTICES)
     torque = workspace.torque(np.array(list(product(axis, repeat=INPUTS))))
     table = RegularGridInterpolator((axis,) * INPUTS, torque.reshape(*(VERTICES,) * INPUTS, 4))
@@ -200,7 +201,8 @@ def _fitted(regressor: Any, inputs: np.ndarray, torque: np.ndarray) -> tuple[Mod
     return lambda given: scale * regressor.predict(given), regressor
 
 
-def _network() -> Any:
+def network() -> Any:
+    """Return the neural network, untrained."""
     return MLPRegressor(
         hidden_layer_sizes=(64, 64), activation="tanh", solver="lbfgs", alpha=1e-6, max_iter=1500, random_state=0
     )

@@ -1,6 +1,6 @@
 """python -m bench.calibration [--devices 20] [--first 0] [--output build/calibration]: the study of `calibrate`.
 
-Random simulated devices go all the way that a user goes, offline and on one core, about a minute each. It prints a line
+Random simulated devices go through the whole procedure, offline and on one core, about a minute each. It prints a line
 per device and a table, writes both as JSON and Markdown, and exits with 1 if a limit is missed.
 """
 

@@ -1,6 +1,6 @@
 """The demo of `make calibrate-demo`: a simulated arm with a wrong parameter file, calibrated, and a picture of both.
 
-The device is that of config/sim.yaml with centres of gravity beside its links and motors that give more or less than
+The device is that of config/sim.yaml with centres of gravity off its links' axes and motors that give more or less than
 commanded; the file's masses are a fifth off. `calibrate gravity` runs on the nodes as on a real arm, for 4 minutes.
 Then the arm is let go in poses that the calibration did not see, with a fifth of the friction, by either file.
 """

@@ -1,4 +1,4 @@
-"""The limits that the study holds its devices to, and the table of what they showed."""
+"""The limits of the study, and the table of its results."""
 
 from __future__ import annotations
 

@@ -164,11 +164,11 @@ def _hanging(device: Device, rng: np.random.Generator) -> tuple[bool, np.ndarray
         options = argparse.Namespace(params=device.params, wait=hand.wait, pose=(0.0,) * 4)
         found = motors.calibrate_motors(options, arm, lambda what: None)
     signed = turns * device.direction
-    told = {name: f"{turn:+d} rotor turns" for name, turn in zip(arm.joint_names, signed, strict=True) if turn}
+    jumped = {name: f"{turn:+d} rotor turns" for name, turn in zip(arm.joint_names, signed, strict=True) if turn}
     names = [refusal.partition(":")[0] for refusal in found.refusals]
-    is_told = names == list(told) and all(told[n] in r for n, r in zip(names, found.refusals, strict=True))
+    is_named = names == list(jumped) and all(jumped[n] in r for n, r in zip(names, found.refusals, strict=True))
     zero = next(change.value for change in found.changes if change.name == "zero")
-    return is_told, np.degrees(np.subtract(zero, device.zero))
+    return is_named, np.degrees(np.subtract(zero, device.zero))
 
 
 def _hand(device: Device, rng: np.random.Generator, rest: np.ndarray) -> Hand:

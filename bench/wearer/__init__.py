@@ -1,1 +1,1 @@
-"""How well the arm tells what its wearer does: the study of `wearer_efforts` (docs/wearer_torque.md)."""
+"""How well the arm estimates what its wearer does: the study of `wearer_efforts` (docs/wearer_torque.md)."""

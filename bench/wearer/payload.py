@@ -34,7 +34,7 @@ LEAST_ERROR, LARGEST_SHARE = 0.03, 0.05  # kg, and of the mass
 class Balance(Compensator):
     """A compensator that weighs at `times`, s after the motors of `trial` are on.
 
-    texts: what each weighing said; results: None where there is none.
+    texts: what each weighing said; results: None for a weighing without one.
     """
 
     def __init__(self, settings: Settings) -> None:

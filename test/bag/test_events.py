@@ -1,4 +1,4 @@
-"""What a recording tells about its arms: when each was carried, faults, changed parameters, parameters at the start."""
+"""What a recording shows of its arms: when each was carried, faults, changed parameters, parameters at the start."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def status(level, text, **values):
     return "/diagnostics", kind, bytes(made.STORE.serialize_cdr(message, kind))
 
 
-def test_the_arm_counts_as_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
+def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
     states = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
     for tenth, state in enumerate(states):
         topic, kind, data = status(0, state, state=state)

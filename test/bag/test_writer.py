@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
-from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin
+from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.bag.reader import read_bag
@@ -109,8 +109,8 @@ def test_queued_messages_are_written_before_the_end(tmp_path):
 def test_messages_that_a_slow_disk_cannot_take_are_counted_and_the_recording_goes_on(tmp_path, monkeypatch):
     ready = threading.Event()
     monkeypatch.setattr("exo_gravity.bag.writer.MAX_WAITING", 10)
-    write = BagWriter._take
-    monkeypatch.setattr(BagWriter, "_take", lambda self, messages: ready.wait() and write(self, messages))
+    write = Writer.write
+    monkeypatch.setattr(Writer, "write", lambda self, *message: ready.wait() and write(self, *message))
     with closing(BagWriter(tmp_path / "bag")) as writer:
         writer.add_topic("/right/joint_states", JOINT_STATE, RELIABLE)
         for k in range(20):

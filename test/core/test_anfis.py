@@ -138,38 +138,32 @@ def test_a_single_pose_agrees_with_the_arrays_scaled_by_the_arms_gravity_and_gai
     assert law().torque(arm, INSIDE, UPRIGHT)[1:] == pytest.approx(tuple(expected))
 
 
-def test_inside_its_box_upright_and_for_its_arm_the_law_applies():
-    assert law().outside(ARM, INSIDE, UPRIGHT) == ""
+@pytest.mark.parametrize(
+    ("arm", "theta", "tilt"),
+    [
+        (ARM, INSIDE, UPRIGHT),
+        (ARM, (3.0, *INSIDE[1:]), UPRIGHT),
+        (ARM, INSIDE, Tilt.of("right", math.radians(0.49), 0.0)),
+        (ArmModel(ARM.length, ARM.cog, ARM.mass, (0.5,) * 4, 1.6), INSIDE, UPRIGHT),
+    ],
+    ids=["in its box", "any angle of joint 1", "tilted by half a degree", "another gain and gravity"],
+)
+def test_in_its_box_for_its_arm_and_upright_the_law_applies(arm, theta, tilt):
+    assert law().outside(arm, theta, tilt) == ""
 
 
-def test_the_law_applies_at_any_angle_of_joint_1():
-    assert not law().outside(ARM, (3.0, *INSIDE[1:]), UPRIGHT)
+WORN = ARM.with_wearer((0, 0, 1.0, 0.5), (0, 0, 0.1, 0.1))
+OUTSIDE = [(ARM, INSIDE, Tilt.of("right", *tilt), "tilted") for tilt in ((0.02, 0.0), (0.0, -0.02), (0.3, 0.3))]
+OUTSIDE += [
+    (ARM, (*INSIDE[:joint], angle, *INSIDE[joint + 1 :]), UPRIGHT, f"theta_{joint + 1}")
+    for joint in (1, 2, 3)
+    for angle in (-1.0, 3.5, math.nan)
+]
 
 
-@pytest.mark.parametrize("joint", [1, 2, 3])
-@pytest.mark.parametrize("angle", [-1.0, 3.5, math.nan])
-def test_outside_its_box_the_law_names_the_joint(joint, angle):
-    theta = list(INSIDE)
-    theta[joint] = angle
-    assert f"theta_{joint + 1}" in law().outside(ARM, theta, UPRIGHT)
-
-
-@pytest.mark.parametrize(("pitch", "roll"), [(0.02, 0.0), (0.0, -0.02), (0.3, 0.3)])
-def test_on_a_tilted_trunk_the_law_names_the_tilt(pitch, roll):
-    assert "tilted" in law().outside(ARM, INSIDE, Tilt.of("right", pitch, roll))
-
-
-def test_a_trunk_tilted_by_less_than_half_a_degree_counts_as_upright():
-    assert not law().outside(ARM, INSIDE, Tilt.of("right", math.radians(0.49), 0.0))
-
-
-def test_with_another_wearers_arm_the_law_does_not_apply():
-    loaded = ARM.with_wearer((0, 0, 1.0, 0.5), (0, 0, 0.1, 0.1))
-    assert "another arm" in law().outside(loaded, INSIDE, UPRIGHT)
-
-
-def test_another_gain_or_gravity_is_not_another_arm():
-    assert not law().outside(ArmModel(ARM.length, ARM.cog, ARM.mass, (0.5,) * 4, 1.6), INSIDE, UPRIGHT)
+@pytest.mark.parametrize(("arm", "theta", "tilt", "reason"), [*OUTSIDE, (WORN, INSIDE, UPRIGHT, "another arm")])
+def test_elsewhere_the_law_names_the_reason(arm, theta, tilt, reason):
+    assert reason in law().outside(arm, theta, tilt)
 
 
 def test_the_sentence_stays_the_same_as_long_as_the_reason_does():

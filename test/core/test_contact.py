@@ -31,7 +31,7 @@ def test_two_blows_more_than_a_second_apart_are_two_contacts():
     assert touched([*blow, *[0.0] * 250, *blow]).count == 2
 
 
-def test_a_torque_that_grows_as_a_persons_does_is_none():
+def test_a_torque_that_grows_as_a_persons_does_is_not_a_contact():
     assert touched([4.0 * math.sin(0.5 * math.pi * min(1.0, n / 150)) for n in range(300)]).count == 0
 
 

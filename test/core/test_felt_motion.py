@@ -45,7 +45,7 @@ def test_the_angular_acceleration_is_that_of_the_sway_when_the_motors_answer():
     assert felt.angular_acceleration[0] == pytest.approx(sway * w * math.cos(w * (1.004 + EFFECT)), rel=0.05)
 
 
-def test_too_few_or_too_old_samples_tell_nothing():
+def test_too_few_or_too_old_samples_give_no_motion():
     assert FeltMotion().at(0.0) is None
     assert following(shaken, lambda t: STILL, until=0.02).at(0.02) is None
     assert following(shaken, lambda t: STILL).at(1.1) is None

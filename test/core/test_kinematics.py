@@ -88,7 +88,7 @@ def left_behind(side, angular_acceleration, theta, torque):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_the_torque_takes_an_arm_of_slender_rods_along_with_its_base(side, monkeypatch):
-    monkeypatch.setattr(exo_gravity.sim.arm, "_TUBE_RADIUS", 1e-4)
+    monkeypatch.setattr(exo_gravity.sim.arm, "_TUBE_RADIUS", 1e-4)  # no parameter: the device has tubes
     rng = np.random.default_rng(5)
     for _ in range(30):
         theta, turning = rng.uniform((-1.5, 0, -0.7, 0), (1.5, 3, 2, 3)), rng.uniform(-3, 3, 3)

@@ -1,4 +1,4 @@
-"""What an effort controller gets, whose last command lasts for ever."""
+"""What is sent to an effort controller, which keeps its last command forever."""
 
 import pytest
 

@@ -17,7 +17,7 @@ LENGTH = (0.05, 0.13, 0.30, 0.30)
 
 
 def random_arm(rng):
-    """A random arm, and its centres of gravity beside the links: along y and z of Table 1."""
+    """A random arm, and its centres of gravity off the links' axes: along y and z of Table 1."""
     length, mass = rng.uniform(0.03, 0.5, 4), rng.uniform(0.1, 3.0, 4)
     beside = rng.uniform(-0.05, 0.05, (2, 4))
     arm = ArmModel(length, length * rng.uniform(0.0, 1.0, 4), mass, off_axis=off_axis_of(mass, *beside))
@@ -66,7 +66,7 @@ def test_the_regressor_times_the_moments_is_the_exact_law():
     np.testing.assert_allclose(one[0], gravity_torque(arm, theta[0], direction[0]), atol=ROUNDING)
 
 
-def test_centres_of_gravity_beside_the_links_agree_with_pinocchio():
+def test_centres_of_gravity_off_the_links_axes_agree_with_pinocchio():
     pin = pytest.importorskip("pinocchio")
     rng = np.random.default_rng(3)
     for _ in range(5):

@@ -1,4 +1,4 @@
-"""Torque that gravity cannot account for: what is explained, what is not, and what becomes of a wrong compensator."""
+"""Torque that gravity cannot account for: what is explained, what is not, and what happens with a wrong compensator."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_without_moments_every_torque_passes() -> None:
     assert monitor.step(PERIOD, joints(HANGING), (3.0, 9.0, 3.0, 3.0)) == ((3.0, 9.0, 3.0, 3.0), None)
 
 
-def test_a_wrong_compensator_is_let_down_before_an_arm_that_no_one_holds_is_fast() -> None:
+def test_a_wrong_compensator_is_let_down_before_a_free_arm_is_fast() -> None:
     tripled = settings_of(robot=ArmModel(ROBOT.length, ROBOT.cog, 3.0 * ROBOT.mass))
     hanging = caught(tripled, None)
     assert hanging.fault == "unexplained_torque" and hanging.time < 0.7 and hanging.speed < 0.8

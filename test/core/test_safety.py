@@ -242,7 +242,7 @@ def let_down_by(code: FaultCode) -> SafetyRun:
 
 
 @pytest.mark.parametrize("code", [code for code in FaultCode if code.is_no_ones])
-def test_after_a_let_down_that_was_no_ones_fault_resume_carries_the_arm_on_from_where_it_is(code):
+def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_from_where_it_is(code):
     arm = let_down_by(code)
     assert arm.machine.resume(arm.now)
     start = arm.now

@@ -1,4 +1,4 @@
-"""How much each thing that was not measured adds to the tilt's uncertainty, and when the estimate begins anew."""
+"""How much each thing that was not measured adds to the tilt's uncertainty, and when the estimate starts again."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_a_recording_at_20_hz_has_the_same_holds():
     assert len(analyse(Recording("right", whole.joint_names, *arrays)).holds) == 2
 
 
-def test_motion_before_release_does_not_count_as_drift():
+def test_motion_before_release_is_not_drift():
     slow = recording(smooth(POSE_A - 0.01, POSE_A, 2.0), still(POSE_A, 10.0), steps=SCRIPT)
     (hold,) = analyse(slow).holds
     assert hold.start >= 2.0 and np.all(hold.stray < 2 * POSITION_CODE)

@@ -52,7 +52,7 @@ def signal_bridge_and_watchdog(number: int) -> Action:
     return inject
 
 
-def kill_bridge_beside_frozen_watchdog(seconds: float) -> Action:
+def kill_bridge_with_frozen_watchdog(seconds: float) -> Action:
     """Freeze the watchdog for `seconds` s, and kill the bridge meanwhile."""
 
     def inject(rig: Rig) -> None:
@@ -66,7 +66,7 @@ def kill_bridge_beside_frozen_watchdog(seconds: float) -> Action:
 
 
 def let_step_fail(how: str) -> Action:
-    """Let the compensator's step `sleep` for ever or `raise` an exception: of a FailingStepRig."""
+    """Let the compensator's step `sleep` forever or `raise` an exception: of a FailingStepRig."""
     return lambda rig: rig.failure.write_text(how)
 
 

@@ -119,7 +119,7 @@ MUTATIONS = (
         (Edit(SAFETY, "elif fault is None:", "elif False:"),),
     ),
     Mutation(
-        "zeros once checked are trusted for ever",
+        "zeros once checked are always trusted",
         ("joint 2 jumps by a motor turn, then clear and enable",),
         (Edit(SAFETY, "if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
               "if False:"),

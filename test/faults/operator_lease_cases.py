@@ -59,7 +59,7 @@ class HeldRig(Rig):
 
 
 class SuccessorRig(AssistedRig):
-    """Beside the outer loop that assists the arm another one waits, which asks for nothing."""
+    """A second outer loop, which asks for nothing, waits while the first one assists the arm."""
 
     _successor: subprocess.Popen[bytes] | None = None
 

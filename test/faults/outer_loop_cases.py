@@ -83,7 +83,7 @@ def only_the_assistance_ends(records: np.ndarray, until: float = GONE_FOR) -> st
     wrong = np.abs(records["torque"][gone] - (records["torque"][0] - EFFORTS))
     motion = np.abs(records["position"] - records["position"][0]).max()
     if wrong.max(initial=0.0) > TOLERANCE:
-        return f"{wrong.max():.2f} Nm beside gravity compensation, {1000 * PROCESS_REACTION:.0f} ms after the fault"
+        return f"{wrong.max():.2f} Nm on top of gravity compensation, {1000 * PROCESS_REACTION:.0f} ms after the fault"
     return f"the arm moved by {motion:.2f} rad" if motion > MAX_MOTION else ""
 
 

@@ -21,7 +21,7 @@ START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, o
 
 
 def start_in_another_session(rig: Rig) -> None:
-    """Start a bridge as another user of the bus: it shares no folder of its own with the first one."""
+    """Start a bridge as another user of the bus: it shares no folder with the first one."""
     folder = rig.folder / "another_session"
     folder.mkdir(exist_ok=True)
     names = ("XDG_RUNTIME_DIR", "HOME", "TMPDIR", "XDG_CACHE_HOME")
@@ -45,7 +45,7 @@ class HandedOverRig(LauncherRig):
         super().close()
 
 
-def start_beside_silent_motors(rig: HandedOverRig) -> None:
+def start_with_silent_motors(rig: HandedOverRig) -> None:
     """Leave the watchdog alone with motors that do not reply; they reply again once the next bridge has the bus."""
     SILENCE(rig)
     bridge = rig.pid("can_bridge")
@@ -68,7 +68,7 @@ def next_bridge_let_it_down(rig: HandedOverRig) -> None:
 OWNERSHIP = (
     FaultCase("can_bridge of another session on the bus", start_in_another_session, limit=None, outcomes=("active",),
         afterwards=has_refused),
-    FaultCase("motors silent for long, then the next can_bridge", start_beside_silent_motors, HandedOverRig, limit=None,
+    FaultCase("motors silent for long, then the next can_bridge", start_with_silent_motors, HandedOverRig, limit=None,
         unreached=ALL_JOINTS, afterwards=next_bridge_let_it_down, ends_rig=True),
     FaultCase("can_bridge: SIGHUP", send_signal("can_bridge", signal.SIGHUP), limit=PROCESS_REACTION),
     FaultCase("launcher's terminal closed", lambda rig: rig.launcher.send_signal(signal.SIGHUP), LauncherRig,

@@ -182,7 +182,7 @@ class Rig:
 
 
 def kill_watchdogs(bridges: Collection[int]) -> None:
-    """Kill the watchdogs of these bridges: one that is left waits without end for a device that no longer runs."""
+    """Kill the watchdogs of these bridges: one that is left waits forever for a device that no longer runs."""
     arguments = {str(bridge).encode() for bridge in bridges}
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):

@@ -22,7 +22,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))  # before rclpy is imported
+from ..support.ports import own_domain
+
+os.environ.setdefault("ROS_DOMAIN_ID", str(own_domain()))  # before rclpy is imported
 
 from rich.console import Console
 from rich.table import Table

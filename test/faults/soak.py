@@ -2,7 +2,7 @@
 
 Each minute the operator changes the right arm's load at random, while it is free and while its wearer reaches, shakes,
 throws, pushes or holds it; in every second minute, by chance, a fault strikes it, judged as in the fault matrix. The
-arm must be carried again each time. The left arm is carried beside it, and a recorder runs throughout.
+arm must be carried again each time. The left arm is also carried, and a recorder runs throughout.
 
 The exit code is 1 if a fault was unsafe, a live change let the motors move an arm faster than MOVED, an arm was let
 down without a cause or not carried again, a change was refused, the recording has losses or ends early, or a node's
@@ -25,7 +25,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))  # before rclpy is imported
+from ..support.ports import own_domain
+
+os.environ.setdefault("ROS_DOMAIN_ID", str(own_domain()))  # before rclpy is imported
 
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped

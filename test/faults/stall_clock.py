@@ -1,4 +1,4 @@
-"""A process that measures how long the machine stands still, beside the tests that need it to keep up.
+"""A process that measures how long the machine stands still, next to tests that need it to keep up.
 
 Run with `-m test.faults.stall_clock`, it wakes every `TICK` s on each processor: a virtual machine may halt one of
 them alone. For each line on its standard input it prints the longest time in s between two wake-ups since the last such

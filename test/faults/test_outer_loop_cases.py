@@ -29,12 +29,12 @@ def test_an_arm_that_loses_only_its_assistance_is_found_safe(records):
 
 def test_assistance_that_stays_is_seen(records):
     records["torque"] = np.add(GRAVITY, EFFORTS)
-    assert only_the_assistance_ends(records) == "0.25 Nm beside gravity compensation, 150 ms after the fault"
+    assert only_the_assistance_ends(records) == "0.25 Nm on top of gravity compensation, 150 ms after the fault"
 
 
 def test_a_change_of_gravity_compensation_is_seen(records):
     records["torque"][200:, 3] -= 0.2
-    assert "0.20 Nm beside gravity compensation" in only_the_assistance_ends(records)
+    assert "0.20 Nm on top of gravity compensation" in only_the_assistance_ends(records)
 
 
 def test_an_arm_that_moves_is_seen(records):
@@ -49,4 +49,4 @@ def test_assistance_that_returns_with_the_next_outer_loop_is_seen(records):
     records["torque"][0] = np.add(GRAVITY, EFFORTS)
     assert check(records) == ""
     records["torque"][300:303, 1] += 0.2
-    assert "0.20 Nm beside gravity compensation" in check(records)
+    assert "0.20 Nm on top of gravity compensation" in check(records)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from exo_gravity.core.model.gravity import gravity_torque
@@ -68,7 +67,7 @@ class Rig:
 
 
 class SimulatedRig(Rig):
-    """A simulated arm on a bus of its own, in real time.
+    """A simulated arm on a separate bus, in real time.
 
     interface: 'virtual', or 'udp_multicast' to share it with processes.
     """
@@ -109,11 +108,3 @@ class NoWatchdog:
 
     def close(self) -> None:
         pass
-
-
-def wait_until(condition: Callable[[], object], timeout: float = 40.0) -> None:
-    """Wait until `condition()` holds."""
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "the condition did not hold in time"
-        time.sleep(0.005)

@@ -6,7 +6,7 @@ import pytest
 
 from exo_gravity.core.model.gravity import gravity_torque
 
-from .active_wearer import attach, hold_still, lift, push, reach, shake, throw
+from ..support.active_wearer import attach, hold_still, lift, push, reach, shake, throw
 from .virtual_rig import POSE, VirtualRig
 
 

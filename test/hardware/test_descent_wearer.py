@@ -5,7 +5,7 @@ import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
 
-from .active_wearer import attach, lift, reach, shake, throw
+from ..support.active_wearer import attach, lift, reach, shake, throw
 from .virtual_rig import POSE, Carried
 
 MOVED = 0.6  # rad/s that the motors may cause

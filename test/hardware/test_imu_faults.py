@@ -57,9 +57,9 @@ FAULTS = {
         for k, axis in enumerate("xyz")
     },
 }
-# The accelerometer alone tells these, and while the trunk moves it also measures the movement. The figures are the time
-# in s for which a wrong tilt is published until the fault has been told from movement.
-TOLD_BY_MOTION = {
+# The accelerometer alone shows these, and while the trunk moves it also measures the movement. The figures are the time
+# in s for which a wrong tilt is published until the fault is distinguished from movement.
+SHOWN_BY_MOTION = {
     "gyroscope reversed": (values(np.negative), 0.05),
     "gyroscope x reversed": (values(lambda w: w * (-1, 1, 1)), 0.1),
     "gyroscope y reversed": (values(lambda w: w * (1, -1, 1)), 0.05),
@@ -91,9 +91,9 @@ def test_a_fault_is_named_and_no_wrong_tilt_is_published(fault, start):
     assert wrong_time(motion, outcome) == 0.0
 
 
-@pytest.mark.parametrize("fault", TOLD_BY_MOTION)
+@pytest.mark.parametrize("fault", SHOWN_BY_MOTION)
 def test_a_wrong_axis_or_sign_is_named_within_a_few_bows(fault):
-    apply, longest = TOLD_BY_MOTION[fault]
+    apply, longest = SHOWN_BY_MOTION[fault]
     motion = apply(MOTION, 0)
     outcome = follow(motion)
     named = [k for k, text in enumerate(outcome.refusals) if "axes and signs" in text]

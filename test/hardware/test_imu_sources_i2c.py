@@ -131,7 +131,7 @@ def test_stamps_follow_the_sensors_own_clock(chip, fast):
     assert np.diff([sample.time for sample in samples]) == pytest.approx(period / fast, rel=0.1)
 
 
-def test_an_overflow_is_told_and_the_next_samples_are_whole(chip):
+def test_an_overflow_is_reported_and_the_next_samples_are_whole(chip):
     rig = Rig(chip, turning())
     source = rig.open(self_test=False)
     rig.read_for(source, 0.2)
@@ -166,7 +166,7 @@ def test_another_chip_is_refused_by_its_who_am_i(chip, register):
     assert rig.bus.closed
 
 
-def test_the_name_tells_the_chip_its_address_and_its_bus():
+def test_the_name_has_the_chip_its_address_and_its_bus():
     assert Rig("mpu9250").open().name == "MPU-9250 at 0x68 on /dev/i2c-1"
 
 
@@ -177,7 +177,7 @@ def test_a_missing_bus_is_named():
 
 def test_the_address_can_be_set(chip):
     rig = Rig(chip)
-    rig.bus._address = 0x6B
+    rig.bus.address = 0x6B
     with pytest.raises(DeviceError, match="does not answer: Remote I/O error"):
         rig.open()
     rig.bus.closed = False

@@ -62,7 +62,7 @@ def settled(rig, source, **cycle):
     assert rig.read(source, witmotion_cycle(**cycle)) != []
 
 
-def test_a_witmotion_sensor_is_told_its_content_and_rate(make_rig):
+def test_a_witmotion_sensor_gets_its_content_and_rate(make_rig):
     rig = make_rig("witmotion")
     source = rig.open()
     assert rig.sensor.received() == bytes.fromhex("FF AA 69 88 B5  FF AA 02 0E 02  FF AA 03 09 00")

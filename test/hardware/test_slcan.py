@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import threading
 import time
@@ -21,7 +22,7 @@ from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
 from ..support.simulated_device import joints_of, make_device
-from .simulated_rig import wait_until
+from ..support.waiting import pause, wait_until
 from .test_motor_bus import WEIGHTLESS
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
@@ -95,13 +96,14 @@ def test_after_the_adapter_was_unplugged_and_plugged_in_again_the_motors_are_rea
     assert all(error.startswith("CAN bus slcan ") and "ttyACM0: Could not" in error for error in errors[1:])
     assert device.powered  # the motors keep their last command
     adapter.plug_in()
-    end = time.monotonic() + 20.0
-    while motors.may_be_powered and time.monotonic() < end:
-        try:
+
+    def switch_off() -> None:
+        with contextlib.suppress(BusError):
             motors.exchange(OFF, in_1_s())
-        except BusError:
-            time.sleep(0.02)
-    assert not motors.may_be_powered and not device.powered
+        pause()
+
+    wait_until(lambda: not motors.may_be_powered, switch_off)
+    assert not device.powered
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])

@@ -191,7 +191,7 @@ def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(wire_format: WireF
     loop.cycle()
     rig.device.bus_silent = False
     loop.stop()
-    assert rig.motors_on == [is_on] * 4  # nobody knows, so nothing was sent
+    assert rig.motors_on == [is_on] * 4  # not known, so nothing was sent
 
 
 @pytest.mark.parametrize("spoil", [lambda rig: rig.switch_supply(False), lambda rig: None], ids=["supply", "efforts"])

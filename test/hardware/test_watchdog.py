@@ -22,7 +22,8 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import ArmLock, BusLock
 from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
-from .simulated_rig import SimulatedRig, wait_until
+from ..support.waiting import PATIENCE, wait_until
+from .simulated_rig import SimulatedRig
 
 pytestmark = pytest.mark.real_time
 REPO = Path(__file__).parents[2]
@@ -86,7 +87,7 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
 def test_the_arm_of_a_bridge_that_is_killed_is_let_down_by_the_watchdog_which_holds_its_bus_meanwhile(rig, carry):
     carrier = carry()
     carrier.kill()
-    assert carrier.process.wait(30) == -signal.SIGKILL
+    assert carrier.process.wait(PATIENCE) == -signal.SIGKILL
     with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
         BusLock(rig.arm.address, "another")
     assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")

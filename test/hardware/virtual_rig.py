@@ -93,7 +93,10 @@ class VirtualRig(Rig):
 
 
 class Carried:
-    """An arm that a control loop carries in `POSE`, ACTIVE; options: those of the loop. drives: all that were noted."""
+    """An arm that a control loop carries in `POSE`, ACTIVE; options: those of the loop.
+
+    drives: all that were noted. get_efforts: what the loop asks for efforts.
+    """
 
     def __init__(
         self,
@@ -111,14 +114,17 @@ class Carried:
         self.safety = SafetyMachine(quick, CYCLE, self.rig.motors)
         self.failure_of_efforts: Exception | None = None
         self._is_raised = False
-        self.loop = ControlLoop(self.motors, self.safety, CYCLE, get_efforts=self._get_efforts, **options)
+        self.get_efforts: Callable[[float], EffortCommand] = self._carrying
+        self.loop = ControlLoop(
+            self.motors, self.safety, CYCLE, get_efforts=lambda latest: self.get_efforts(latest), **options
+        )
         self.safety.enable(self.clock.monotonic())
         self.run_until(lambda: self.safety.fault or self.rig.is_raised)
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self._is_raised = True
         self.rig.top_speed = 0.0
 
-    def _get_efforts(self, latest: float) -> EffortCommand:
+    def _carrying(self, _latest: float) -> EffortCommand:
         if self.failure_of_efforts:
             raise self.failure_of_efforts
         efforts = self.rig.carrying if self._is_raised else self.rig.raising()

@@ -1,7 +1,7 @@
 """A CAN bus in virtual time, with a simulated device on it: the same frames as in real time, without threads or waits.
 
-Time passes only while someone waits for a frame or sleeps. Whatever is due meanwhile (replies, status frames, frames of
-other senders) happens then, in order. Sending takes no time.
+Time passes only while a thread waits for a frame or sleeps. Everything that is due meanwhile (replies, status
+frames, frames of other senders) happens then, in order. Sending takes no time.
 """
 
 from __future__ import annotations

@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation import guidance
-from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
+from ..support.compensator_rig import CompensatorRig
 from ..support.joint_state_feeder import PARTS, POSE
 
 keep_to_this_machine()
@@ -31,34 +25,22 @@ ASSIST = (0.5, -0.5, 0.25, 0.0)
 STILL = (0.0,) * 4
 
 
-class Rig:
+class Rig(CompensatorRig):
     """A compensator, and a node that plays the bridge and the outer loop. added: (4,) Nm beyond gravity, the newest."""
 
     def __init__(self) -> None:
-        names = ["--ros-args", "-r", "__ns:=/right", "-p", "use_imu:=false"]
-        rclpy.init(args=names)
-        self.node = CompensatorNode()
-        self.user = rclpy.create_node("outer_loop")
-        self.executor, self._of_node = SingleThreadedExecutor(), SingleThreadedExecutor()
-        self.executor.add_node(self.user)
-        self._of_node.add_node(self.node)
-        self._closing = False
-        # On a separate thread, so that neither node keeps the other from sending.
-        self._thread = threading.Thread(target=self._spin)
-        self._thread.start()
+        super().__init__("/right", {"use_imu": "false"})
         self.joint_states = self.user.create_publisher(JointState, "joint_states", 1)
         self.assist = self.user.create_publisher(JointState, "assist_efforts", 1)
         self.added, self.velocity, self.names, self.efforts = np.full(4, np.nan), STILL, NAMES, ASSIST
-        self.values: dict[str, str] = {}
-        self.message = ""
         self.user.create_subscription(JointState, "effort_commands", self._on_command, 1)
-        self.user.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        self.assisted, self.without = False, 0  # number of successive commands without addition
+        self.assisted = False
         self.user.create_timer(0.005, self._send)
+        self.start()
 
-    def _spin(self) -> None:
-        while not self._closing:
-            self._of_node.spin_once(timeout_sec=0.05)
+    @property
+    def message(self) -> str:
+        return self.status.message
 
     def _send(self) -> None:
         stamp = self.user.get_clock().now().to_msg()
@@ -72,33 +54,6 @@ class Rig:
 
     def _on_command(self, message: JointState) -> None:
         self.added = np.subtract(message.effort, GRAVITY) if message.effort else np.full(4, np.nan)
-        self.without = self.without + 1 if self.adds(STILL) else 0
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == "right/compensator":
-                self.message, self.values = status.message, {item.key: item.value for item in status.values}
-
-    def set(self, **values: object) -> list[str]:
-        """Set parameters (`__` for a dot) and return why each was refused, '' if it was not."""
-        changes = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
-        return [result.reason for result in self.node.set_parameters(changes)]
-
-    def wait_until(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < end, (self.added, self.message, self.values)
-            self.executor.spin_once(timeout_sec=0.01)
-
-    def close(self) -> None:
-        self._closing = True
-        self._thread.join()
-        self.node.close()
-        self._of_node.shutdown()
-        self.executor.shutdown()
-        self.user.destroy_node()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
 
     def adds(self, torque: tuple[float, ...], tolerance: float = 1e-6) -> bool:
         return bool(np.allclose(self.added, torque, atol=tolerance))

@@ -11,9 +11,9 @@ import pytest
 
 from exo_gravity.tools import launcher
 
-from ..hardware.simulated_rig import wait_until
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
+from ..support.waiting import wait_until
 
 pytestmark = pytest.mark.real_time
 
@@ -32,7 +32,7 @@ def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down_by_the_launche
     (watchdog,) = children(bridge)
     os.kill(watchdog, signal.SIGKILL)
     os.kill(bridge, signal.SIGKILL)
-    wait_until(lambda: nodes.have_ended, 90.0)
+    wait_until(lambda: nodes.have_ended)
     assert nodes.ended_node == ("/right/can_bridge", -signal.SIGKILL)
     assert nodes.launcher.maybe_powered == []
     assert any("the arm is down, its motors are off" in line for line in nodes.log)
@@ -46,7 +46,7 @@ def test_the_launcher_states_that_motors_may_still_be_powered(nodes, probe, monk
     (watchdog,) = children(nodes.process("can_bridge").pid)
     assert probe.set_parameters("simulator", fault__bus_silent=True).successful
     nodes.stopping.set()
-    wait_until(lambda: nodes.have_ended, 90.0)
+    wait_until(lambda: nodes.have_ended)
     assert nodes.launcher.maybe_powered == ["/right/can_bridge"]
     with suppress(ProcessLookupError):  # it ended once the launcher had asked for the bus
         os.kill(watchdog, signal.SIGKILL)

@@ -19,7 +19,8 @@ from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.node import CanBridge
 from exo_gravity.nodes.can_bridge.operation import BridgeReport
 
-from ..hardware.simulated_rig import NoWatchdog, SimulatedRig, wait_until
+from ..hardware.simulated_rig import NoWatchdog, SimulatedRig
+from ..support.waiting import wait_until
 
 pytestmark = pytest.mark.real_time
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE

@@ -7,14 +7,15 @@ from collections.abc import Iterator
 
 import pytest
 import yaml
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
+from rclpy.parameter import Parameter
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
-from ..support.random_parameters import parameter_message
 from ..support.ros_probe import RosProbe
 
 NODE = "/right/compensator"
@@ -24,7 +25,7 @@ SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 @pytest.fixture(scope="module")
 def compensator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
-    """A probe beside a compensator that no test changes."""
+    """A probe of a compensator that no test changes."""
     probe = RosProbe()
     nodes = LaunchedNodes(tmp_path_factory.mktemp("compensator"), without=OTHER_NODES, compensator=NO_IMU).start()
     yield probe
@@ -44,13 +45,26 @@ REFUSALS = [
     ({"suport": 0.5}, "suport = 0.5: must be one of "),
     ({"mode": "two_g"}, "one of one_g, zero_g"),
     ({"gain": [1.0] * 4, "gravity": -1.0}, "gravity out of range"),
+    ({"support": True}, "support"),
+    ({"gain": []}, "gain = []: must be 4 numbers"),
+    ({"gain": ["1.0"] * 4}, "gain"),
+    ({"robot.mass": None}, "robot.mass"),
+    ({"": 1.0}, "must be one of "),
+    ({"law": "anfis"}, "anfis_file"),
 ]
+
+
+def message_of(name: str, value: object) -> ParameterMessage:
+    """Return the message that sets a parameter, None to delete it."""
+    if value == []:  # rclpy cannot infer its type
+        return Parameter(name, Parameter.Type.DOUBLE_ARRAY, []).to_parameter_msg()
+    return Parameter(name, value=value).to_parameter_msg()
 
 
 def test_an_invalid_value_is_refused_with_one_sentence_and_changes_nothing(compensator):
     before = compensator.dump_parameters([NODE])
     for values, sentence in REFUSALS:
-        messages = [parameter_message(*item) for item in values.items()]
+        messages = [message_of(*item) for item in values.items()]
         request = SetParametersAtomically.Request(parameters=messages)
         result = compensator.call(SetParametersAtomically, f"{NODE}/set_parameters_atomically", request).result
         assert not result.successful

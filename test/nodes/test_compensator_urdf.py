@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rclpy
 import rtbdata
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
@@ -24,9 +19,10 @@ from exo_gravity.core.compensation import compensator, guidance
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
-from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
+
+from ..support.compensator_rig import CompensatorRig
 
 keep_to_this_machine()
 URDF = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
@@ -35,8 +31,9 @@ POSE = (0.3, -0.8, 1.1, 0.4, -0.6, 0.2)
 EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, (0.0, 0.0, -9.80665))
 PARAMETERS = {
     "law": "urdf",
-    "urdf.file": str(URDF),
-    "use_imu": False,
+    "joint_names": f"[{','.join(NAMES)}]",
+    "urdf.file": URDF,
+    "use_imu": "false",
     "command_interface": "multi_array",
     "multi_array.timeout": 0.15,
     "max_effort": [200.0] * 6,
@@ -45,20 +42,12 @@ PARAMETERS = {
 }
 
 
-class Rig:
+class Rig(CompensatorRig):
     """A compensator of six joints, and a node that plays ros2_control. commands: all so far, (n,) Nm each."""
 
     def __init__(self, **changes: object) -> None:
-        values = {**PARAMETERS, **{name.replace("__", "."): value for name, value in changes.items()}}
-        args = ["--ros-args", "-r", "__ns:=/arm", "-p", f"joint_names:=[{','.join(NAMES)}]"]
-        for name, value in values.items():
-            args += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
-        rclpy.init(args=args)
-        self.user = rclpy.create_node("controller")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.user)
+        super().__init__("/arm", {**PARAMETERS, **changes})
         self.commands: list[tuple[float, ...]] = []
-        self.status = DiagnosticStatus()
         self.lag, self.names, self.pose = 0.0, ["gripper", *NAMES[::-1]], (float("nan"), *POSE[::-1])
         self.applied = (0.0,) * 7  # Nm, in the order of `names`
         self.publisher = self.user.create_publisher(JointState, "joint_states", 1)
@@ -68,25 +57,13 @@ class Rig:
             lambda message: self.commands.append(tuple(message.data)),
             100,
         )
-        self.user.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.is_feeding = False
         self.user.create_timer(0.01, self._send)
-        self.node: Node | None = None
-        self._closing = False
-        self._thread = threading.Thread(target=self._spin)
 
     def start(self) -> Rig:
-        self.node = CompensatorNode()
-        self._thread.start()
+        super().start()
         self.is_feeding = True
         return self
-
-    def _spin(self) -> None:
-        executor = SingleThreadedExecutor()
-        executor.add_node(self.node)
-        while not self._closing:
-            executor.spin_once(timeout_sec=0.05)
-        executor.shutdown()
 
     def _send(self) -> None:
         if self.is_feeding:
@@ -94,19 +71,6 @@ class Rig:
             states = JointState(name=self.names, position=self.pose, velocity=still, effort=self.applied)
             states.header.stamp = Time(nanoseconds=time.time_ns() - round(self.lag * 1e9)).to_msg()
             self.publisher.publish(states)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self.status = message.status[0]
-
-    @property
-    def values(self) -> dict[str, str]:
-        return {item.key: item.value for item in self.status.values}
-
-    def wait_until(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + 20.0
-        while not condition():
-            assert time.monotonic() < end, (self.commands[-3:], self.status)
-            self.executor.spin_once(timeout_sec=0.01)
 
     def is_carried(self) -> bool:
         return bool(self.commands) and np.allclose(self.commands[-1], EXPECTED, rtol=0.0, atol=1e-9)
@@ -120,17 +84,6 @@ class Rig:
         future = client.call_async(Trigger.Request())
         self.wait_until(future.done)
         return future.result().success
-
-    def close(self) -> None:
-        self._closing = True
-        if self.node is not None:
-            if self._thread.ident is not None:
-                self._thread.join()
-            self.node.close()
-            self.node.destroy_node()
-        self.executor.shutdown()
-        self.user.destroy_node()
-        rclpy.try_shutdown()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -208,10 +161,10 @@ def test_six_joints_among_others_in_any_order_are_carried_in_the_order_of_the_co
 
 
 def test_gains_and_limits_change_live_and_the_law_does_not(rig):
-    results = rig.node.set_parameters([Parameter("gain", value=[0.9] * 6), Parameter("law", value="exact")])
-    assert [result.successful for result in results] == [True, False]
+    accepted, refused = rig.set(gain=[0.9] * 6, law="exact")
+    assert accepted == "" != refused
     carried(rig, lambda: np.allclose(rig.commands[-1], np.multiply(0.9, EXPECTED), rtol=0.0, atol=1e-9))
-    assert rig.node.set_parameters([Parameter("gain", value=[1.0] * 6)])[0].successful
+    assert rig.set(gain=[1.0] * 6) == [""]
 
 
 def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_cleared(rig):
@@ -230,7 +183,7 @@ def test_without_joint_states_the_torque_fades_to_zeros_until_the_fault_is_clear
     carried(rig)
 
 
-def test_joint_states_that_are_old_by_their_stamps_do_not_count(rig):
+def test_joint_states_that_are_old_by_their_stamps_are_ignored(rig):
     rig.lag = 1.0
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "no joint_states younger than 150 ms" in rig.status.message)

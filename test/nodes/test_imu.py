@@ -1,11 +1,10 @@
-"""The node `imu` as a process, over real DDS, with a recording and with impossible samples."""
+"""The node `imu` as a process, over real DDS, with a trunk that moves and with impossible samples."""
 
 from __future__ import annotations
 
 import math
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -22,7 +21,8 @@ from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.nodes.imu import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
-from ..support.handheld_imu import read_recording
+from ..support.imu_faults import bowing_and_walking
+from ..support.waiting import PATIENCE, wait_until
 
 G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -56,7 +56,7 @@ class ImuNode:
 
     def close(self):
         self.process.terminate()
-        self.process.wait(10)
+        self.process.wait(PATIENCE)
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
@@ -76,11 +76,9 @@ class ImuNode:
         values = {pair.key: pair.value for pair in self.reported[-1].values}
         self.received = max(self.received, int(values["received"]))
 
-    def wait_until(self, condition, timeout=20.0):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, f"{self.reported[-3:]}, {self.received} of {self.sent} samples received"
-            self.executor.spin_once(timeout_sec=0.05)
+    def wait_until(self, condition):
+        seen = lambda: f"{self.reported[-3:]}, {self.received} of {self.sent} samples received"  # noqa: E731
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.05), seen=seen)
 
     def reports(self, text, level=None, since=0):
         """Whether a status with `text` has come, not counting the first `since`."""
@@ -129,16 +127,16 @@ def imu(node):
     return node
 
 
-def test_every_sample_of_a_recording_gives_the_tilt_of_the_estimator_with_its_covariance(imu):
+def test_every_sample_gives_the_tilt_of_the_estimator_with_its_covariance(imu):
     messages = {}
     imu.node.create_subscription(Imu, "/imu/data", lambda m: messages.update({to_nanoseconds(m.header.stamp): m}), 1000)
-    estimator, expected = TrunkEstimator(UPRIGHT), {}
-    for moment, rate, acceleration in zip(*(column[:1000] for column in read_recording()), strict=True):
+    estimator, expected, motion = TrunkEstimator(UPRIGHT), {}, bowing_and_walking(10.0)
+    for moment, *values in zip(1000.0 + motion.times, motion.gyroscope, motion.accelerometer, strict=True):
         stamp = round(moment * 1e9)
-        answer = estimator.update(ImuSample(stamp * 1e-9, np.radians(rate).tolist(), (G * acceleration).tolist()))
+        answer = estimator.update(ImuSample(stamp * 1e-9, *(value.tolist() for value in values)))
         if answer is not None:
             expected[stamp] = answer
-        imu.send(moment, np.radians(rate), G * acceleration)
+        imu.send(moment, *values, noise=0.0)
     imu.wait_until(lambda: max(expected) in imu.tilts and max(expected) in messages)
     assert imu.tilts.keys() == expected.keys()
     for stamp, tilt in imu.tilts.items():

@@ -1,5 +1,9 @@
-"""An IMU on a serial port that the node reads itself: the device in virtual time, and the node over real DDS."""
+"""An IMU on a serial port that the node reads itself: the device in virtual time, and the node over real DDS.
 
+How a device is opened again: hardware/test_imu_reopening.py.
+"""
+
+import itertools
 import math
 import time
 
@@ -10,7 +14,6 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.time import Time
 
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.nodes.imu import ImuDevice, ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.run import keep_to_this_machine
@@ -18,13 +21,14 @@ from exo_gravity.nodes.ros.run import keep_to_this_machine
 from ..hardware.virtual_time import VirtualClock
 from ..support.fake_imu.chip import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
+from ..support.waiting import wait_until
 
 keep_to_this_machine()
 PERIOD = 0.01  # s
 
 
 class Rig:
-    """A BNO085 on a pseudo-terminal, the device that reads it, and the node of which it is a part."""
+    """A BNO085 on a pseudo-terminal, and the node that reads it."""
 
     def __init__(self, port):
         self.sensor = FakeSerialSensor(port)
@@ -32,16 +36,13 @@ class Rig:
         self.time = VirtualClock()
         self.received, self.published = [], []
 
-    def open(self, **values):
-        self.device = ImuDevice(self, self.values | values, "/imu/data_raw", self._on_imu, self.time)
-
-    def poll(self, count, sends=True):
-        """Poll `count` times; before each, the sensor sends a sample."""
+    def read(self, count):
+        """Open the device and read `count` samples."""
+        device = ImuDevice(self, self.values, "/imu/data_raw", self._on_imu, self.time)
         for _ in range(count):
             self.time.sleep(PERIOD)
-            if sends:
-                self.sensor.deliver(rvc_packet(len(self.received) + 1, (90, 0, 0), (0, 0, 1000)))
-            self.device.poll()
+            self.sensor.deliver(rvc_packet(len(self.received) + 1, (90, 0, 0), (0, 0, 1000)))
+            device.poll()
 
     def _on_imu(self, message, info):
         self.received.append((message, info["publication_sequence_number"]))
@@ -69,48 +70,18 @@ def rig(tmp_path):
 
 
 def test_each_sample_goes_to_the_callback_and_to_the_topic_once_and_in_order(rig):
-    rig.open()
-    rig.poll(20)
+    rig.read(20)
     messages, numbers = zip(*rig.received, strict=True)
     assert numbers == tuple(range(1, 21)) and rig.published == list(messages)
 
 
 def test_a_message_is_stamped_when_it_was_taken_and_states_what_is_not_measured(rig):
-    rig.open()
-    rig.poll(1)
+    rig.read(1)
     message, _ = rig.received[-1]
     age = rig.now().nanoseconds - to_nanoseconds(message.header.stamp)
     assert age == pytest.approx(0.5e9 * PERIOD, rel=0.01)
     assert message.angular_velocity_covariance[0] == -1.0 and message.orientation_covariance[0] == 0.0
     assert message.linear_acceleration.z == pytest.approx(G) and message.orientation.z == pytest.approx(0.5**0.5)
-
-
-def test_a_sensor_that_is_unplugged_is_named_and_comes_back_by_itself(rig):
-    rig.open()
-    rig.poll(1)
-    assert rig.device.reopening.problem == "" and rig.device.values["device"] == f"BNO085 on {rig.sensor.port}"
-    rig.sensor.unplug()
-    rig.poll(1, sends=False)
-    assert f"BNO085 on {rig.sensor.port}: cannot be" in rig.device.reopening.problem
-    rig.sensor.plug()
-    rig.poll(52, sends=False)
-    rig.poll(1)
-    assert len(rig.received) == 2 and rig.device.reopening.problem == "" and rig.device.values["opened"] == 2
-
-
-def test_a_sensor_that_is_missing_at_the_start_is_waited_for(rig):
-    rig.sensor.unplug()
-    rig.open()
-    assert "cannot be opened" in rig.device.reopening.problem
-    rig.sensor.plug()
-    rig.poll(52, sends=False)
-    rig.poll(1)
-    assert len(rig.received) == 1
-
-
-def test_a_parameter_that_does_not_suit_the_device_is_an_error_at_the_start(rig):
-    with pytest.raises(ParameterError, match=r"serial\.baud = 9600"):
-        rig.open(**{"source": "witmotion", "serial.baud": 9600})
 
 
 def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(rig):
@@ -124,25 +95,31 @@ def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_report
     listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", tilts.append, 50)
     listener.create_subscription(DiagnosticArray, "/diagnostics", lambda message: reports.extend(message.status), 50)
 
-    def wait_until(condition, sends=True):
-        end, due, counter = time.monotonic() + 20.0, time.monotonic(), 0
-        while not condition():
-            assert time.monotonic() < end, reports[-1]
-            if sends and time.monotonic() >= due:
-                due, counter = due + 0.01, counter + 1
-                # with noise, as every real one has
-                rig.sensor.send(rvc_packet(counter, (0, 20, 0), (0, 342, 940 + counter % 3)))
-            executor.spin_once(timeout_sec=0.002)
+    times = itertools.count(time.monotonic(), PERIOD)
+    counters, due = itertools.count(), [next(times)]
+
+    def spin():
+        executor.spin_once(timeout_sec=0.002)
+
+    def send_and_spin():
+        if time.monotonic() >= due[0]:
+            due[0] = next(times)
+            # with noise, as every real one has
+            rig.sensor.send(rvc_packet(next(counters), (0, 20, 0), (0, 342, 940 + round(due[0] / PERIOD) % 3)))
+        spin()
+
+    def wait(condition, meanwhile=send_and_spin):
+        wait_until(condition, meanwhile, seen=lambda: reports[-1])
 
     try:
-        wait_until(lambda: tilts)
+        wait(lambda: tilts)
         assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
-        wait_until(lambda: reports[-1].message == "publishing")
+        wait(lambda: reports[-1].message == "publishing")
         rig.sensor.unplug()
-        wait_until(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in reports[-1].message, sends=False)
+        wait(lambda: f"BNO085 on {rig.sensor.port}: cannot be" in reports[-1].message, spin)
         assert reports[-1].level == DiagnosticStatus.ERROR
         rig.sensor.plug()
-        wait_until(lambda: reports[-1].message == "publishing")
+        wait(lambda: reports[-1].message == "publishing")
         assert int({pair.key: pair.value for pair in reports[-1].values}["opened"]) >= 2
     finally:
         node.close()

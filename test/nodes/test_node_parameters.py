@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Callable
 from types import SimpleNamespace
 
 import pytest
@@ -14,6 +12,8 @@ from rclpy.node import Node
 from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
 from exo_gravity.nodes.ros.run import keep_to_this_machine
+
+from ..support.waiting import wait_until
 
 keep_to_this_machine()
 
@@ -28,13 +28,6 @@ def other_node(node: Node, value: float = 1.0) -> Node:
     other = rclpy.create_node("other", namespace="/right", context=node.context)
     other.declare_parameter("gain", value)
     return other
-
-
-def wait_until(condition: Callable[[], object], action: Callable[[], object]) -> None:
-    deadline = time.monotonic() + 30.0
-    while not condition():
-        assert time.monotonic() < deadline
-        action()
 
 
 def test_a_node_that_has_gone_and_returned_is_read_anew(node, executor):

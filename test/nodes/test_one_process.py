@@ -24,20 +24,13 @@ from ..hardware.simulated_rig import LIMITS
 from ..hardware.virtual_rig import Carried
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU
+from ..support.waiting import wait_until
 
 PARAMETERS = load(CONFIG / "sim.yaml")["/right/compensator"]
 ROBOT = ArmModel(*(PARAMETERS[name] for name in ("link_length", "robot.cog", "robot.mass")))
 NAMES = PARAMETERS["joint_names"]
 POSE = (0.1, 0.7, 0.6, 0.5)  # rad
 NO_EFFORT = (0.0,) * 4
-
-
-def wait_until(condition, action=lambda: None):
-    end = time.monotonic() + 20.0
-    while not condition():
-        action()
-        assert time.monotonic() < end, "the condition did not hold in time"
-        time.sleep(0.005)
 
 
 class Bridge:
@@ -109,7 +102,7 @@ def test_an_arm_whose_compensator_has_failed_is_let_down_as_one_whose_compensato
     arm = Carried(on_cycle=exchange.publish)
     torque.append(arm.rig.carrying)
     arm.run(0.1)
-    arm.loop._get_efforts = exchange.get_efforts
+    arm.get_efforts = exchange.get_efforts
     arm.run(1.0)
     assert arm.safety.state is State.ACTIVE
     torque.append(None)

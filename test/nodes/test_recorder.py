@@ -30,7 +30,10 @@ from exo_gravity.core.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
-NODE = [sys.executable, "-c", "from exo_gravity.nodes.recorder.node import main; main()", "--ros-args"]
+from ..support.waiting import PATIENCE, wait_until
+
+PROGRAM = "from exo_gravity.nodes.recorder import node; node.SILENCE = 3.0; node.main()"  # s: a busy machine sends late
+NODE = [sys.executable, "-c", PROGRAM, "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
 
@@ -67,12 +70,9 @@ class PublishingArm:
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
 
-    def wait_until(self, condition, timeout=60.0):
+    def wait_until(self, condition):
         """Spin until `condition()` holds."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, "the condition did not hold in time"
-            self.executor.spin_once(timeout_sec=0.01)
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01))
 
     def is_recorded(self):
         """Return whether every topic that is to be recorded has a subscriber."""
@@ -121,7 +121,7 @@ def session(tmp_path_factory):
         while not lines or "motor 2 is silent" not in lines[-1]:
             lines.append(process.stdout.readline())
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=PATIENCE)
         yield path, lines, process.returncode, known.topic_type_hash
     finally:
         process.kill()
@@ -149,7 +149,7 @@ def test_every_message_of_an_arm_is_in_the_recording(session, topic):
 def test_every_message_has_its_time_of_arrival(session):
     for stamp, message in recorded(session[0], "/right/joint_states"):
         sent = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        assert 0 < stamp - sent < 10**9
+        assert 0 < stamp - sent < PATIENCE * 10**9
 
 
 def test_a_best_effort_publisher_is_recorded_as_best_effort(session):
@@ -194,7 +194,7 @@ def test_the_session_and_the_markers_are_messages_of_the_recording(session):
 
 def test_a_name_as_the_subjects_code_ends_the_recorder_with_2(tmp_path):
     process = start(tmp_path / "bag", "-p", "subject:='Anna Meier'")
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2 and "must be a code" in errors and not (tmp_path / "bag").exists()
 
 
@@ -207,7 +207,7 @@ def test_a_live_line_has_joints_step_and_faults(session):
 
 def test_without_an_output_the_node_names_the_missing_parameter_and_ends_with_2():
     process = start(None)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 2 and "output" in errors
 
 
@@ -218,7 +218,7 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     k = 0
     while process.poll() is None and k < 20_000:
         arm.publish(k := k + 1)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
 
@@ -238,7 +238,7 @@ def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_re
         arm.publish(k)
     arm.wait_until(lambda: arm.publish(3050) or True)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0
     missed, unwritten = map(int, re.findall(r"messages lost so far: (\d+) did not arrive, (\d+) were not", errors)[-1])
     found = [
@@ -261,7 +261,7 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
         if now > death:
             process.stdin.close()  # the launcher has died
     assert process.poll() is None
-    assert process.wait(20) == 0
+    assert process.wait(PATIENCE) == 0
     assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0]) == k
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import threading
-import time
-
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.executors import SingleThreadedExecutor
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
@@ -24,6 +19,8 @@ from exo_gravity.tools.urdf import urdf_of
 from ..support import CONFIG
 from ..support.joint_state_feeder import PARTS
 from ..support.launched_nodes import LaunchedNodes
+from ..support.node_thread import NodeThread
+from ..support.waiting import wait_until
 
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
 EFFORT = (0.0, 1.5, 1.2, 0.2)
@@ -41,9 +38,9 @@ class Viewer:
     """A node that sends the joint states of both arms and the tilt, and keeps the newest of what robot_model sends."""
 
     def __init__(self):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("viewer", context=self.context)
+        self._thread = NodeThread("viewer")
+        (self.node,) = self._thread.nodes
+        self.close = self._thread.close
         self.sent = {side: self.node.create_publisher(JointState, f"/{side}/joint_states", 1) for side in READINGS}
         self.tilt = self.node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
         self.description, self.states, self.problem = "", JointState(), ""
@@ -55,22 +52,7 @@ class Viewer:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.sides = set(READINGS)
         self.node.create_timer(0.05, self._send)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._spin)
         self._thread.start()
-
-    def _spin(self):
-        while not self._closing.is_set():
-            self._executor.spin_once(timeout_sec=0.1)
-
-    def close(self):
-        self._closing.set()
-        self._thread.join()
-        self._executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
 
     def _send(self):
         stamp = self.node.get_clock().now().to_msg()
@@ -95,11 +77,8 @@ class Viewer:
     def _on_diagnostics(self, message):
         self.problem = next((s.message for s in message.status if s.name == "robot_model"), self.problem)
 
-    def wait_until(self, condition, timeout=60.0):
-        end = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < end, f"{self.problem!r}, joints {list(self.states.name)}"
-            self._closing.wait(0.05)
+    def wait_until(self, condition):
+        wait_until(condition, seen=lambda: f"{self.problem!r}, joints {list(self.states.name)}")
 
 
 @pytest.fixture(scope="module")

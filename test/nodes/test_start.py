@@ -15,6 +15,7 @@ from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.tools.trials.offline import simulated_trials
 
 from ..support.launched_nodes import NO_IMU, executable
+from ..support.waiting import PATIENCE
 
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
@@ -24,7 +25,7 @@ def test_a_bad_parameter_ends_the_launcher_with_one_sentence_and_no_motor_is_ena
     nodes = prepare(can_bridge={"home_tolerance": [0.2] * 4})  # test_validation.py has the other refusals
     listener = listen(nodes)
     command = [executable("launcher"), "--params", str(nodes.path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode in (1, 2)
     output = done.stdout + done.stderr
     (sentence,) = [line for line in output.splitlines() if "home_tolerance = [0.2" in line]
@@ -39,7 +40,7 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
         probe.wait_until(lambda: probe.status_contains("compensator", "waiting for joint_states"))
     finally:
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE) == 0
 
 
 @pytest.mark.thorough

@@ -18,6 +18,8 @@ from std_msgs.msg import String
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers
 
+from ..support.waiting import pause, wait_until
+
 keep_to_this_machine()
 
 NUMBERS = itertools.count(1)
@@ -52,12 +54,8 @@ class Pair:
         for text in texts:
             self.publisher.publish(String(data=text))
 
-    def wait_until(self, condition: Callable[[], Any], action: Callable[[], object] = lambda: None) -> None:
-        end = time.monotonic() + 20.0
-        while not condition():
-            action()
-            assert time.monotonic() < end, self.received
-            time.sleep(0.005)
+    def wait_until(self, condition: Callable[[], Any], meanwhile: Callable[[], object] = pause) -> None:
+        wait_until(condition, meanwhile, seen=lambda: self.received)
 
     def texts(self) -> list[str]:
         return [text for text, _, _ in self.received]
@@ -162,7 +160,9 @@ def test_raw_messages_are_passed_on_in_bytes_with_their_time_of_arrival(executor
     ],
     ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"],
 )
-def test_publishers_are_told_apart_and_their_losses_counted_by_the_numbers_of_their_messages(numbers, others, missed):
+def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of_their_messages(
+    numbers, others, missed
+):
     publishers = Publishers()
     changes = [publishers.is_another({"publication_sequence_number": number}) for number in numbers]
     assert [n for n, is_another in enumerate(changes) if is_another] == others

@@ -10,6 +10,7 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 
 from playwright.sync_api import Page
 
+from ..support import waiting
 from ..support.panel_browser import IN_BROWSER, PATIENCE, enable, wait_for_state
 
 pytestmark = IN_BROWSER
@@ -18,11 +19,7 @@ BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
 
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
     """Wait until `condition()` holds, while the page goes on."""
-    for _ in range(600):
-        if condition():
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError("the condition did not hold within a minute")
+    waiting.wait_until(condition, lambda: page.wait_for_timeout(100))
 
 
 def test_enable_asks_once_and_says_what_will_happen(visit, stage):
@@ -104,7 +101,7 @@ def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared(visit, stage):
     assert not page.is_visible('[data-arm="right"] .remedy')
 
 
-def test_after_a_fault_that_was_no_ones_one_press_carries_the_arm_again(visit, stage):
+def test_after_a_fault_that_leaves_nothing_to_repair_one_press_carries_the_arm_again(visit, stage):
     page = visit()
     assert not page.is_visible('[data-arm="right"] .resume')
     stage.arms.fail("right", "command_stale")

@@ -38,7 +38,7 @@ def test_a_check_that_waits_says_in_degrees_which_joint_to_turn_and_a_simulated_
 
 
 @pytest.mark.parametrize("width", [390, 1280])
-def test_the_cause_of_a_fault_stands_above_the_buttons_and_moves_none_of_them(visit, stage, width):
+def test_the_cause_of_a_fault_is_above_the_buttons_and_moves_none_of_them(visit, stage, width):
     page = visit()
     page.set_viewport_size({"width": width, "height": 800})
     sentence, button = page.locator('[data-arm="right"] .sentence'), page.locator('[data-arm="right"] .clear')

@@ -293,7 +293,7 @@ def test_taking_and_giving_up_control_reaches_the_arms(panel):
     assert panel.arms.leases == [("10.0.0.2 page 2", kind) for kind in ("take", "hold", "release")]
 
 
-def test_an_arm_that_somebody_else_holds_is_only_let_down(panel):
+def test_an_arm_that_another_name_holds_is_only_let_down(panel):
     panel.arms.others["left"] = "anna"
     assert panel.elsewhere == "anna"
     for body in ({"do": "enable"}, {"do": "clear_fault"}, {"do": "set", "values": {"support": 0.1}}):

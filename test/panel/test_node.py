@@ -5,23 +5,22 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from websockets.sync.client import ClientConnection, connect
 
 from ..support.launched_nodes import executable
+from ..support.node_thread import NodeThread
 from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
+from ..support.waiting import PATIENCE
 
 TOKEN = "a token for this test"
 NAMES = [f"joint_{n}" for n in range(4)]
@@ -60,11 +59,9 @@ class PlayedArm:
         self.leases: set[tuple[str, str]] = set()
         self.holder = "nobody"
         self.asked: list[tuple[str, Any]] = []
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.bridge, self.compensator = (
-            rclpy.create_node(name, namespace="right", context=self.context) for name in ("can_bridge", "compensator")
-        )
+        self._thread = NodeThread("can_bridge", "compensator", namespace="right")
+        self.bridge, self.compensator = self._thread.nodes
+        self.close = self._thread.close
         self.bridge.declare_parameter("max_effort", MAX_EFFORT)
         self.compensator.declare_parameter("support", 0.1)
         self.bridge.create_service(SetBool, "~/enable", self._on_enable)
@@ -73,24 +70,7 @@ class PlayedArm:
         self._states = self.bridge.create_publisher(JointState, "joint_states", 1)
         self._statuses = self.bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self.bridge.create_timer(0.05, self._publish)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        for node in (self.bridge, self.compensator):
-            self._executor.add_node(node)
-        self._closing = False
-        self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
-
-    def close(self) -> None:
-        self._closing = True
-        self._thread.join()
-        self._executor.shutdown()
-        for node in (self.bridge, self.compensator):
-            node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def _spin(self) -> None:
-        while not self._closing:
-            self._executor.spin_once(timeout_sec=0.1)
 
     def _publish(self) -> None:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
@@ -125,7 +105,7 @@ def panel(tmp_path: Path) -> Iterator[PanelProcess]:
 def message(connection: ClientConnection, kind: str, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
     """Return the first message of this type for which `condition` holds."""
     while True:
-        content = json.loads(connection.recv(timeout=30))
+        content = json.loads(connection.recv(timeout=PATIENCE))
         if content["type"] == kind and condition(content):
             return content
 
@@ -186,7 +166,7 @@ def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(tmp_path)
         assert values["port"] == panel.port
         assert "token" not in values
         panel.process.terminate()
-        assert panel.process.wait(30) == 0
+        assert panel.process.wait(PATIENCE) == 0
     finally:
         probe.close()
         panel.close()

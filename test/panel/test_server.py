@@ -17,6 +17,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.panel.server import PanelServer
 
 from ..support.panel_stage import Stage
+from ..support.waiting import PATIENCE
 
 TOKEN = "a token for this test"
 
@@ -62,7 +63,7 @@ def live(stage: Stage, page: str = "", **headers: str) -> Iterator[ClientConnect
 
 def first(connection: ClientConnection, kind: str) -> dict[str, Any]:
     """Return the first message of this type."""
-    while (message := json.loads(connection.recv(timeout=20)))["type"] != kind:
+    while (message := json.loads(connection.recv(timeout=PATIENCE)))["type"] != kind:
         pass
     return message
 
@@ -179,7 +180,7 @@ def test_a_copied_page_replaces_the_first(stage):
             first(other, "state")
             with pytest.raises(ConnectionClosed) as closed:
                 while True:
-                    one.recv(timeout=20)
+                    one.recv(timeout=PATIENCE)
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 4001
 
 
@@ -188,7 +189,7 @@ def test_a_live_connection_with_nonsense_ends_without_harm(stage, hello):
     with connect(stage.url.replace("http", "ws") + "live", origin=stage.url.rstrip("/")) as connection:
         connection.send(hello)
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=20)
+            connection.recv(timeout=PATIENCE)
     assert act(stage).status_code == 200
 
 

@@ -29,7 +29,7 @@ TRUNK = """
 @pytest.fixture(scope="module")
 def on_trunk():
     """Inverse dynamics: the arm's torque (4,) on a trunk that moves like this."""
-    xml = _mjcf(ArmConfig(**FRICTIONLESS, **WORN))
+    xml = _mjcf(ArmConfig(**FRICTIONLESS, **WORN))  # the trunk goes around the arm, and MuJoCo joins no two models
     xml = xml.replace("<worldbody>", TRUNK).replace("</worldbody>", "</body></body></worldbody>")
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)

@@ -184,32 +184,6 @@ def test_other_work_waits_until_every_command_has_been_answered(monkeypatch):
     assert sorted(bus.events[:-1]) == [1, 2, 3, 4]
 
 
-class LateBus:
-    """A bus without frames and its clock: each wait takes as long as the test sets."""
-
-    def __init__(self, waits):
-        self.now = 0.0
-        self.waits = list(waits)
-
-    def recv(self, timeout):
-        self.now += self.waits.pop(0)
-
-    def done(self):
-        return not self.waits
-
-
-@pytest.mark.parametrize(
-    ("waits", "simulated", "slip"),
-    [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
-)
-def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_count_as_slip(monkeypatch, waits, simulated, slip):
-    bus, device = LateBus(waits), make_device()
-    monkeypatch.setattr(device_module, "time", SimpleNamespace(monotonic=lambda: bus.now))
-    device.run(bus, bus.done)
-    assert device.time == pytest.approx(simulated, abs=1e-9)
-    assert device.slip == pytest.approx(slip)
-
-
 class ScriptedBus:
     """A bus on which each wait takes a time and ends with a frame, as `script` says: pairs of s and data, or None."""
 
@@ -223,6 +197,22 @@ class ScriptedBus:
 
     def send(self, message):
         pass
+
+    def run(self, device, monkeypatch):
+        clock = SimpleNamespace(monotonic=lambda: self.now, time=lambda: self.now)
+        monkeypatch.setattr(device_module, "time", clock)
+        device.run(self, lambda: not self.script)
+
+
+@pytest.mark.parametrize(
+    ("waits", "simulated", "slip"),
+    [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
+)
+def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_are_slip(monkeypatch, waits, simulated, slip):
+    device = make_device()
+    ScriptedBus((wait, None) for wait in waits).run(device, monkeypatch)
+    assert device.time == pytest.approx(simulated, abs=1e-9)
+    assert device.slip == pytest.approx(slip)
 
 
 REGULAR = [(0.002, command(0))] * 5
@@ -239,8 +229,6 @@ REGULAR = [(0.002, command(0))] * 5
     ids=["regular", "stalled", "no commands", "switched on again"],
 )
 def test_stalls_and_silence_are_measured_while_the_motors_are_on(monkeypatch, script, stall, silence):
-    bus, device = ScriptedBus(script), make_device()
-    clock = SimpleNamespace(monotonic=lambda: bus.now, time=lambda: bus.now)
-    monkeypatch.setattr(device_module, "time", clock)
-    device.run(bus, lambda: not bus.script)
+    device = make_device()
+    ScriptedBus(script).run(device, monkeypatch)
     assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))

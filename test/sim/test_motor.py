@@ -44,18 +44,11 @@ def test_current_noise_spoils_the_replied_torque_and_not_the_torque():
     assert motor.torque(0.0, 0.0) == pytest.approx(5.0, abs=TORQUE_CODE / 2)
 
 
-def test_torque_flows_between_enter_and_exit():
-    motor = entered()
-    motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
-    motor.receive(EXIT, 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == 0.0
-
-
 def test_enter_executes_the_last_command_again():
     motor = entered()
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     motor.receive(EXIT, 0.0, 0.0, 0.0)
+    assert motor.torque(0.0, 0.0) == 0.0
     motor.receive(ENTER, 0.0, 0.0, 0.0)
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
 

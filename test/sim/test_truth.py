@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, truth
 from exo_gravity.sim.truth import RECORD, TruthLog
 
 from ..support.truth import Truth
@@ -37,16 +37,18 @@ def device(tmp_path):
     return device
 
 
-def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_motor_state(device, tmp_path):
+def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_motor_state(
+    device, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(truth, "time", SimpleNamespace(time=lambda: 5000.0))
     device.arm.reset((0.0, 1.0, 0.0, 0.0))
     device.exchange(2, JOINTS[1].command(2.0, 1.5))
     device.exchange(2, ENTER)
-    before = time.time()
     device.advance(0.5)
     records = Truth(tmp_path / "truth.bin").since(0.0)
     assert len(records) >= 450
     np.testing.assert_allclose(np.diff(records["time"]), 0.001, atol=1e-5)
-    assert abs(records["time"][-1] - before) < 0.1
+    assert abs(records["time"][-1] - 5000.0) < 0.1
     assert records["on"][-1].tolist() == [False, True, False, False]
     assert records["frames"][-1].tolist() == [0, 2, 0, 0]
     assert records["damping"][-1, 1] == pytest.approx(1.5, abs=0.01)
@@ -56,17 +58,17 @@ def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_m
 
 
 def test_a_reader_sees_the_newest_state_while_the_file_grows(device, tmp_path):
-    truth = Truth(tmp_path / "truth.bin")
-    assert truth.newest() is None
+    log = Truth(tmp_path / "truth.bin")
+    assert log.newest() is None
     device.exchange(3, ENTER)
     device.advance(0.1)
-    assert not truth.motors_are_off()
+    assert not log.motors_are_off()
     device.exchange(3, EXIT)
     device.advance(0.1)
-    assert truth.motors_are_off()
-    count = truth.count
+    assert log.motors_are_off()
+    count = log.count
     device.advance(0.1)
-    assert 80 <= truth.count - count <= 120
+    assert 80 <= log.count - count <= 120
 
 
 def test_what_was_written_survives_a_kill(tmp_path):

@@ -141,7 +141,7 @@ class LaunchedNodes:
         self._end_watchdogs()
 
     def _end_watchdogs(self) -> None:
-        """End watchdogs that retry without end, because their simulated motors are gone, and remove their notes."""
+        """End watchdogs that retry forever, because their simulated motors are gone, and remove their notes."""
         port = self.bus["port"]
         own = ((GROUP, port), (SECOND_GROUP, port + 1))
         names = [f"{group}_{port}.bus" for group, port in own]

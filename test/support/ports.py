@@ -1,24 +1,43 @@
-"""Ports that other test runs, and the other workers of this one, leave alone."""
+"""Ports and ROS domains that other test runs, and the other workers of this one, leave alone."""
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 import socket
 from collections.abc import Iterator
 
 BLOCKS, BLOCK = 25, 400  # blocks, and ports in each
-WORKERS = 4  # whose blocks are certain to differ
+DOMAINS = 100
+
+
+@functools.cache
+def _claim(kind: str, count: int) -> tuple[int, socket.socket | None]:
+    """Return a number below `count`, and the lock that keeps other processes from it until this one ends."""
+    start = os.getpid()
+    for number in (n % count for n in range(start, start + count)):
+        lock = socket.socket(socket.AF_UNIX)
+        try:
+            lock.bind(f"\0exo_gravity_tests/{kind}/{number}")
+        except OSError:
+            lock.close()
+        else:
+            return number, lock
+    return start % count, None  # shared with a process that may be of another test run
+
+
+def own_domain() -> int:
+    """Return the ROS domain of this process."""
+    return 1 + _claim("domain", DOMAINS)[0]
 
 
 def own_ports(first: int) -> Iterator[int]:
     """Return every second port of a block of this process's own, from `first` on; the ones between are free too."""
-    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
-    run, number = (os.getppid(), int(worker[2:])) if worker else (os.getpid(), 0)
-    return itertools.count(first + BLOCK * ((WORKERS * run + number) % BLOCKS), 2)
+    return itertools.count(first + BLOCK * _claim("ports", BLOCKS)[0], 2)
 
 
 def free_port() -> int:
-    """Return a TCP port of loopback that no one uses."""
+    """Return a TCP port of loopback that is free."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])

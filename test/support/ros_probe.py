@@ -7,15 +7,12 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -24,10 +21,10 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from . import CONFIG
+from .node_thread import NodeThread
 
 keep_to_this_machine()
 
-InvalidHandle = rclpy_implementation.InvalidHandle
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which config/home.yaml holds the arm: a joint with little friction swings out of its limits
 
@@ -45,11 +42,9 @@ class RosProbe:
 
     def __init__(self, arm: str = "/right") -> None:
         self.arm = arm
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("ros_probe", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        self._thread = NodeThread("ros_probe", after_spin=self._notify)
+        self.context, self.executor, (self.node,) = self._thread.context, self._thread.executor, self._thread.nodes
+        self.close = self._thread.close
         self.joint_states: list[JointState] = []
         self.effort_commands: list[JointState] = []
         self.wearer_steps: list[String] = []
@@ -62,23 +57,11 @@ class RosProbe:
         self._clients: dict[str, Any] = {}
         self._deadline = float("inf")
         self._news = threading.Condition()
-        self._closing = False
-        self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        self._closing = True
-        self._thread.join()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def _spin(self) -> None:
-        while not self._closing:
-            with suppress(InvalidHandle):  # a test has just destroyed a publisher
-                self.executor.spin_once(timeout_sec=0.1)
-            with self._news:
-                self._news.notify_all()
+    def _notify(self) -> None:
+        with self._news:
+            self._news.notify_all()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -17,18 +17,20 @@ from exo_gravity.core.numbers import Vector
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from .active_wearer import Joints, attach
+
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 UPRIGHT = Tilt.of("right")
 COULOMB = (0.2, 0.4, 0.2, 0.2)  # Nm of the simulated arm, by default
 
-Push = Callable[[float, Sequence[float], Sequence[float]], Vector]  # time, angles, velocities -> (4,) Nm
+Push = Callable[[float, Joints, Joints], Vector]  # time, angles, velocities -> (4,) Nm
 
 
 POSE = (0.2, 0.7, 0.6, 0.7)  # rad
 
 
-def no_push(_time: float, _theta: Sequence[float], _velocity: Sequence[float]) -> Sequence[float]:
+def no_push(_time: float, _theta: Joints, _velocity: Joints) -> Joints:
     return (0.0,) * 4
 
 
@@ -38,7 +40,7 @@ def sines(seed: int, until: float, strength: float = 2.0, stiffness: float = 2.0
     frequency, phase = rng.uniform(0.2, 3.0, (3, 4)), rng.uniform(0.0, 6.0, (3, 4))
     size = strength * rng.uniform(0.1, 0.5, (3, 4)) * (1.0, 2.0, 1.0, 0.5)
 
-    def push(time: float, theta: Sequence[float], _velocity: Sequence[float]) -> Vector:
+    def push(time: float, theta: Joints, _velocity: Joints) -> Vector:
         elastic = stiffness * np.subtract(POSE, theta)
         if time > until:
             return elastic
@@ -73,16 +75,19 @@ class TermsRun:
         self._gravity: deque[Sequence[float]] = deque([LAWS["exact"](self.links, self.pose, UPRIGHT)])
         self._extra: deque[Sequence[float]] = deque([(0.0,) * 4])
         self._late = max(1, round(self.delay / self.period))
+        self._push: Push = no_push
+        attach(self.device, lambda *state: np.asarray(self._push(*state)).tolist())
         for motor in MOTORS_OF_ARM:
             self.device.exchange(motor.can_id, motor.command(0.0, 0.0))
             self.device.exchange(motor.can_id, ENTER)
 
     def run(self, seconds: float, push: Push = no_push) -> None:
         """Advance; `push` is another torque on the joints, that of a wearer."""
+        self._push = push
         for _ in range(round(seconds / self.period)):
-            self._cycle(push)
+            self._cycle()
 
-    def _cycle(self, push: Push) -> None:
+    def _cycle(self) -> None:
         device, theta, velocity = self.device, [], []
         extra = np.array(self._extra[0])
         for joint, motor in enumerate(MOTORS_OF_ARM):
@@ -97,8 +102,7 @@ class TermsRun:
             self._extra.popleft()
             self._gravity.popleft()
         before = np.array(device.arm.positions)
-        outside = np.asarray(push(device.time, device.arm.positions, device.arm.velocities))
-        self._advance(outside)
+        device.advance(self.period)
         moved = np.array(device.arm.positions) - before
         self.given += float(extra @ moved)
         viscous = np.abs(moved) / self.period * self.config.viscous_friction
@@ -107,15 +111,6 @@ class TermsRun:
         self.worst_balance = max(self.worst_balance, self.given - self.rubbed)
         self.positions.append(device.arm.positions)
         self.applied.append(extra)
-
-    def _advance(self, outside: np.ndarray) -> None:
-        """Advance the device by one period, with the torque of a wearer."""
-        device = self.device
-        for _ in range(round(self.period / 0.001)):
-            state = device.arm.positions, device.arm.velocities
-            motors = [m.torque(q, v) for m, q, v in zip(device.motors, *state, strict=True)]
-            device.arm.step((outside + motors).tolist())
-            device._steps += 1
 
     def comes_to_rest(self, push: Push, seconds: float = 15.0) -> bool:
         """Return whether no joint moves by 0.05 degrees in half a second, at some time in the next `seconds`."""

@@ -21,10 +21,10 @@ from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from .active_wearer import attach
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 MOTORS_AS_MOUNTED = tuple(
@@ -33,22 +33,6 @@ MOTORS_AS_MOUNTED = tuple(
 START_TIMEOUT, LONGEST = 30.0, 400.0  # s
 
 Disturb = Callable[[float, SimulatedDevice], Sequence[float] | None]
-
-
-class Hand(VirtualWearer):
-    """A wearer who applies the torque that `disturb(time, device)` returns, (4,) Nm."""
-
-    def __init__(self, disturb: Disturb, device: SimulatedDevice) -> None:
-        super().__init__(TrialScript.parse({"name": "hand", "steps": [{"hold": 3600.0}]}))
-        self._disturb, self._device = disturb, device
-
-    def idle(self, time: float, duration: float) -> bool:
-        """Return that the torque may change at any time."""
-        return False
-
-    def torque(self, time: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
-        """Return the torque on the joints (4,) in Nm."""
-        return tuple(self._disturb(time, self._device) or (0.0,) * 4)
 
 
 @dataclass
@@ -96,8 +80,8 @@ class TourRun:
                 position, velocity = [row.position for row in samples], [row.velocity for row in samples]
                 began = began or safety.state is State.ACTIVE
                 if began and safety.state is State.ACTIVE:
-                    if not self.log and self.disturb:
-                        device.start(Hand(self.disturb, device))
+                    if not self.log and (disturb := self.disturb):
+                        attach(device, lambda time, *_: disturb(time, device) or (0.0,) * 4)
                     self.fastest = max(self.fastest, *map(abs, device.arm.velocities))
                     effort = tour.step(now, position, velocity, tilt)
                     tour.plan()

@@ -7,7 +7,6 @@ from pathlib import Path
 import matplotlib.image
 import pytest
 import yaml
-from matplotlib.figure import Figure
 
 from exo_gravity.tools.budget import main
 
@@ -34,9 +33,8 @@ def run(tmp_path, capsys):
 
 @pytest.fixture
 def plain(monkeypatch):
-    """Figures take longest: draw blank ones in tests that do not look at them."""
-    blank = Figure(figsize=(1, 1))
-    monkeypatch.setattr("exo_gravity.tools.budget._joint_figure", lambda *_: blank)
+    """Figures take longest: tests that do not look at them run as without matplotlib."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
 
 
 @pytest.mark.usefixtures("plain")
@@ -47,12 +45,6 @@ def test_full_zero_g_of_75_kg_is_reported_as_beyond_the_papers_motors_and_by_how
     (row,) = (line.split() for line in text.splitlines() if "2 shoulder abduction" in line)
     assert (row[3:7], row[-1]) == (["AK80-9", "9", "18", "19.63"], "AK80-64")
     assert "The largest support within rated torque everywhere is 0.068." in text
-
-
-@pytest.mark.usefixtures("plain")
-def test_the_support_that_it_recommends_is_within_rated_torque_everywhere(run):
-    code, text = run("--body-mass", 75, "--support", 0.068)
-    assert code == 0 and "within rated torque everywhere on /right" in text
 
 
 @pytest.mark.usefixtures("plain")
@@ -81,7 +73,7 @@ def test_mirrored_arms_share_one_table(tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("plain")
-def test_a_motor_that_gives_three_quarters_of_its_torque_counts_as_three_quarters(run):
+def test_the_limits_of_a_motor_that_gives_three_quarters_of_its_torque_are_three_quarters(run):
     _, text = run("--body-mass", 75, changes={BRIDGE: {"torque_scale": [1.0, 0.75, 1.0, 1.0]}})
     (row,) = (line.split() for line in text.splitlines() if "2 shoulder abduction" in line)
     assert row[3:6] == ["AK80-9", "6.75", "13.5"]
@@ -101,14 +93,6 @@ def test_a_wearer_whose_forearm_does_not_fit_the_robot_ends_with_one_sentence(ru
 def test_an_arm_without_a_bridge_is_refused(run):
     code, text = run("--body-mass", 75, without=(BRIDGE,))
     assert code == 2 and BRIDGE in text
-
-
-@pytest.mark.parametrize(
-    "arguments", [("--body-mass", 75_000), ("--body-mass", 75, "--support", 2), ("--body-mass", "nan")]
-)
-def test_an_impossible_wearer_ends_with_exit_code_2(run, arguments):
-    code, text = run(*arguments)
-    assert code == 2 and "must be a number from" in text
 
 
 def test_without_matplotlib_the_table_is_printed_and_the_missing_package_is_named(run, monkeypatch, tmp_path):

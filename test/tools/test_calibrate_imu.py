@@ -88,14 +88,3 @@ def test_the_samples_of_a_recording_are_read_in_order(tmp_path: Path) -> None:
     assert read.time == pytest.approx(samples.time, abs=1e-6)
     assert read.acceleration == pytest.approx(samples.acceleration)
     assert read.angular_velocity == pytest.approx(samples.angular_velocity)
-
-
-def test_wrong_use_ends_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert calibrate(tmp_path, "--bag", str(tmp_path / "none")) == 2
-    assert "must be a recording that exists" in capsys.readouterr().err
-    (tmp_path / "new.html").touch()
-    assert calibrate(tmp_path, "--bag", str(tmp_path)) == 2
-    assert "new.html': must be a new file" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as stop:
-        main(["motor"])
-    assert stop.value.code == 2

@@ -31,7 +31,7 @@ POSES = np.radians(
 
 
 def true_arm() -> ArmModel:
-    """An arm with the links of the configured one, a fifth heavier, and with centres of gravity beside the links."""
+    """An arm with the links of the configured one, a fifth heavier, and with centres of gravity off the links' axes."""
     robot = configured_arm().robot
     return ArmModel.from_moments(robot.length, 1.2 * np.array(robot.first_moment), (0.004, -0.006, 0.003, 0.002))
 

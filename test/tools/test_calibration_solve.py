@@ -1,4 +1,4 @@
-"""From what a tour or a recording shows to the values of the new parameter file, or the reason why there are none."""
+"""From what a tour or a recording shows to the values of the new parameter file, or the reason for having none."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ def test_an_interface_as_docs_first_arming_sets_it_up_is_fine(computer):
         ({"restart_ms": 0}, "restart", Level.WARNING, "restart-ms 100"),
     ],
 )
-def test_what_ip_tells_of_an_interface(computer, change, what: str, level: Level, command: str):
+def test_what_ip_reports_of_an_interface(computer, change, what: str, level: Level, command: str):
     tells(computer, {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}})
     bad, worst = of_interface(computer)
     assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].mend
@@ -252,7 +252,7 @@ def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
     assert code == 2 and "/right/can_bridge rate = 500.0: must be at most 400 Hz" in text
 
 
-def test_it_measures_in_a_process_of_its_own_at_the_rate_of_the_file():
+def test_it_measures_in_a_separate_process_at_the_rate_of_the_file():
     woken = doctor.measured(0.01, 0.2, 0)
     assert woken.lateness.shape == (20,) and (woken.lateness > -1e-6).all() and not woken.refused
 

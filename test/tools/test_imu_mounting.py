@@ -73,7 +73,7 @@ def test_a_crooked_posture_is_part_of_the_result_and_a_lean_counts_into_its_erro
         ({"upright": 0.0}, "must begin and end upright"),
     ],
 )
-def test_a_bow_that_tells_nothing_is_refused(changes: dict[str, object], sentence: str) -> None:
+def test_a_bow_that_shows_nothing_is_refused(changes: dict[str, object], sentence: str) -> None:
     if "lean" in changes:  # leans first, then bows: no single axis
         time = np.arange(0.0, 9.0, 1.0 / RATE)
         first = np.clip((time - 2.0) / 0.7, 0.0, 1.0) - np.clip((time - 5.5) / 0.7, 0.0, 1.0)

@@ -9,8 +9,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -71,13 +71,13 @@ def test_the_end_of_ros2_launch_stops_its_launcher_and_no_program_below_it(monke
     try:
         with open(reading) as held:
             monkeypatch.setattr(sys, "stdin", held)
-            trial, launcher = stop_on_signals(), threading.Event()
-            owner = threading.Thread(target=stop_with_owner, args=(launcher,))
+            trial, stopping = stop_on_signals(), threading.Event()
+            owner = threading.Thread(target=stop_with_owner, args=(stopping,))
             owner.start()
-            assert not launcher.wait(0.1)
+            assert not stopping.wait(0.1)
             os.close(writing)
             owner.join(10.0)
-            assert launcher.is_set()
+            assert stopping.is_set()
             assert not trial.is_set()  # the page starts it with a standard input that has ended
     finally:
         for number, handler in zip(numbers, handlers, strict=True):
@@ -126,15 +126,6 @@ def test_an_option_of_the_bus_without_an_entry_for_each_motor_is_named(refused):
     assert error.startswith("launcher: /right/can_bridge can.options.bitrate = [500000, 1000000]: must be one value")
 
 
-def test_without_rclpy_one_line_says_how_to_get_it(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rclpy", None)
-    with pytest.raises(SystemExit) as ended:
-        main([])
-    error = capsys.readouterr().err
-    assert ended.value.code == 2 and error.startswith("launcher: the Python package rclpy is not found: ")
-    assert "exo_gravity[ros]" in error and error.count("\n") == 1
-
-
 def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
     for theirs in ("can_bridge", "can.py", "yaml.py"):  # python-can installs a can_bridge of its own
         (tmp_path / theirs).write_text(f"#!{sys.executable}\nraise SystemExit('another program')\n")
@@ -146,43 +137,67 @@ def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, 
     assert ended.returncode == 2 and "can.interface" in ended.stderr, ended.stderr
 
 
-def test_only_a_part_of_the_nodes_is_started(monkeypatch):
-    started: list[Launcher] = []
-    monkeypatch.setattr(Launcher, "run", lambda launcher, stopping: started.append(launcher))
-    main(["--params", str(SIM), "--only", "*/can_bridge", "/imu"])
-    launcher = started[0]
-    monkeypatch.setattr(Launcher, "_start", lambda launcher, node, variables: (node, None))
-    launcher.start()
-    assert [launcher.process(node) for node in ("/imu", "/right/can_bridge")] == ["/imu", "/right/can_bridge"]
-    with pytest.raises(KeyError):
-        launcher.process("/right/compensator")
+class Process:
+    """A node's process that has printed `log`, and ends when it is terminated."""
+
+    def __init__(self, log: Sequence[str]) -> None:
+        self.stdout, self._code = log, None
+
+    def poll(self) -> int | None:
+        return self._code
+
+    def wait(self, timeout: float) -> int | None:
+        return self._code
+
+    def terminate(self) -> None:
+        self._code = 0
 
 
-def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_is_told_apart(monkeypatch):
-    def processes(*words):
-        started = []
-        monkeypatch.setattr(Launcher, "run", lambda launcher, stopping: started.append(launcher))
-        main(["--params", str(SIM), "--namespace", "lab", "--one-process", *words])
-        return started[0]
+@pytest.fixture
+def launched(monkeypatch, capsys):
+    """A function that launches the simulated arm with `words`; it returns the commands by node, and what is printed.
 
-    launcher = processes()
-    assert list(launcher._commands) == ["/imu", "/right/can_bridge", "/right/simulator"]
-    words = launcher._commands["/right/can_bridge"]
+    log: the lines of the bridge's process.
+    """
+
+    def launched(*words: str, log: Sequence[str] = ()) -> tuple[dict[str, list[str]], list[str]]:
+        commands: dict[str, list[str]] = {}
+
+        def start(command: list[str], **_: object) -> Process:
+            node = command[command.index("--enclave") + 1]
+            commands[node] = command
+            return Process(log if node.endswith("/can_bridge") else ())
+
+        ended = threading.Event()
+        ended.set()
+        monkeypatch.setattr(launcher, "stop_on_signals", lambda: ended)
+        monkeypatch.setattr(subprocess, "Popen", start)
+        main(["--params", str(SIM), *words])
+        return commands, [line.partition(" ")[2] for line in capsys.readouterr().out.splitlines()]
+
+    return launched
+
+
+def test_only_a_part_of_the_nodes_is_started(launched):
+    assert list(launched("--only", "*/can_bridge", "/imu")[0]) == ["/imu", "/right/can_bridge"]
+
+
+def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_names(launched):
+    log = ("lab.right.compensator INFO compensating\n", "lab.right.can_bridge WARN late\n", "ERROR of a watchdog\n")
+    one_process = ("--namespace", "lab", "--one-process")
+    commands, lines = launched(*one_process, log=log)
+    assert list(commands) == ["/lab/imu", "/lab/right/can_bridge", "/lab/right/simulator"]
+    words = commands["/lab/right/can_bridge"]
     first, second = words[: words.index("--")], words[words.index("--") + 1 :]
     assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[2]
     assert {"--ros-args", "__node:=compensator", "__ns:=/lab/right", "/lab/right/compensator"} <= set(second)
-
-    lines = []
-    launcher._on_line = lambda *line: lines.append(line)
-    log = ("lab.right.compensator INFO compensating\n", "lab.right.can_bridge WARN late\n", "ERROR of a watchdog\n")
-    launcher._read("/right/can_bridge", SimpleNamespace(stdout=log))
-    assert lines == [
-        ("/right/compensator", "INFO compensating"),
-        ("/right/can_bridge", "WARN late"),
-        ("/right/can_bridge", "ERROR of a watchdog"),
+    assert [" ".join(line.split()) for line in lines] == [
+        "right/compensator INFO compensating",
+        "right/can_bridge WARN late",
+        "right/can_bridge ERROR of a watchdog",
     ]
-    alone = processes("--only", "*/can_bridge", "/imu")._commands
-    assert "--" not in alone["/right/can_bridge"] and "/right/compensator" not in alone
+    alone, _ = launched(*one_process, "--only", "*/can_bridge", "/imu")
+    assert list(alone) == ["/lab/imu", "/lab/right/can_bridge"] and "--" not in alone["/lab/right/can_bridge"]
 
 
 NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]
@@ -217,10 +232,8 @@ def test_a_namespace_is_put_in_front_of_every_node_and_changes_no_parameter():
     assert in_namespace(SIM, "") == SIM
 
 
-def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(monkeypatch):
-    started: dict[str, list[str]] = {}
-    monkeypatch.setattr(Launcher, "run", lambda launcher, stopping: started.update(launcher._commands))
-    main(["--params", str(SIM), "--namespace", "lab/", "--log-level", "warn"])
-    words = started["/right/compensator"]
+def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
+    commands, _ = launched("--namespace", "lab/", "--log-level", "warn")
+    words = commands["/lab/right/compensator"]
     assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", "warn"} <= set(words)
-    assert list(load(words[words.index("--params-file") + 1])) == [f"/lab{node}" for node in started]
+    assert list(load(words[words.index("--params-file") + 1])) == list(commands)

@@ -7,7 +7,6 @@ import dataclasses
 import io
 import math
 import re
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -230,15 +229,6 @@ def short_bag(tmp_path_factory):
     return made.write_bag(tmp_path_factory.mktemp("bags") / "short", made.messages(recording))
 
 
-@pytest.mark.parametrize("option", ["--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold"])
-@pytest.mark.parametrize("value", ["nan", "-1", "half"])
-def test_a_limit_that_is_not_a_number_of_0_or_more_is_refused(short_bag, capsys, option, value):
-    with pytest.raises(SystemExit) as caught:
-        main([str(short_bag), f"{option}={value}"])
-    assert caught.value.code == 2
-    assert f"argument {option}: {value}: must be a number, 0 or more" in capsys.readouterr().err
-
-
 def test_no_hold_is_reported_with_figures_and_1(tmp_path, capsys):
     moving = made.trial(made.POSES, hold=0.5, rate=100.0)
     bag = made.write_bag(tmp_path / "moving", made.messages(moving, script=False))
@@ -294,12 +284,6 @@ def test_a_limit_that_is_wide_enough_holds(short_bag, tmp_path):
     assert main([str(short_bag), "--output", str(tmp_path), "--max-drift=0.5", "--max-rate=7"]) == 0
 
 
-def test_a_wrong_file_is_2_and_one_sentence(tmp_path, capsys):
-    assert main([str(tmp_path / "nothing")]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == "" and captured.err.count("\n") == 1 and "nothing: no such file" in captured.err
-
-
 def test_a_folder_that_cannot_be_written_is_named(held, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="file"):
@@ -316,21 +300,6 @@ def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, caps
     assert len(csv_rows(tmp_path / "out" / "holds.csv")) >= 4
 
 
-def test_without_the_bag_library_the_missing_extra_is_named_and_help_still_works(short_bag, capsys, monkeypatch):
-    for module in ("exo_gravity.bag.reader", "exo_gravity.bag.storage"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.setitem(sys.modules, "rosbags.serde", None)
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(SystemExit) as ended:
-        main([str(short_bag)])
-    assert ended.value.code == 2
-    expected = "report: the Python package rosbags is not installed: pip install 'exo_gravity[report]'\n"
-    assert capsys.readouterr().err == expected
-    with pytest.raises(SystemExit) as ended:
-        main(["--help"])
-    assert ended.value.code == 0
-
-
 # What stands on top
 
 COMPENSATOR = """/right/compensator:
@@ -340,7 +309,7 @@ SESSION = Session("P01", "pilot", "first visit", "1.2.3")
 FAULT = "right/can_bridge: letting down: over_speed: right_elbow_flexion turns too fast"
 
 
-def told(recording, *events, **more):
+def report_of(recording, *events, **more):
     """Return the report of a recording with the compensator's parameters and the session."""
     more = {"parameters": {"/right/compensator": COMPENSATOR}, "session": SESSION, **more}
     return analyse(made.bag_of(recording, events=events, **more))
@@ -350,7 +319,7 @@ def told(recording, *events, **more):
 def changed():
     """A trial in Zero-G that goes on in One-G from 9 s on."""
     setting = ("/right/compensator", "mode", "one_g")
-    return told(made.trial(made.POSES, hold=6.0), Event(9.0, "/right/compensator: mode = one_g", setting))
+    return report_of(made.trial(made.POSES, hold=6.0), Event(9.0, "/right/compensator: mode = one_g", setting))
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -366,8 +335,8 @@ def test_every_row_says_of_whom_and_under_what_settings_it_is(changed, tmp_path)
 def test_the_page_begins_with_verdict_subject_settings_and_criteria(changed, tmp_path):
     write(changed, tmp_path)
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
-    told = ("It held.", "P01", "pilot", "first visit", "Zero-G, One-G from 9.0 s", "30 %", "75 kg, female", "Criteria:")
-    places = [text.index(part) for part in (*told, "1.2.3", "Arm: right")]
+    top = ("It held.", "P01", "pilot", "first visit", "Zero-G, One-G from 9.0 s", "30 %", "75 kg, female", "Criteria:")
+    places = [text.index(part) for part in (*top, "1.2.3", "Arm: right")]
     assert places == sorted(places)
     assert "no joint moves more than 0.5 degrees, 2 after a push" in text
 
@@ -375,7 +344,7 @@ def test_the_page_begins_with_verdict_subject_settings_and_criteria(changed, tmp
 def test_a_support_that_one_g_does_not_use_is_not_shown(held):
     given = COMPENSATOR.replace("zero_g", "one_g")
     assert "right: One-G, support none in One-G" in printed(
-        told(*held.bag.recordings, parameters={"/right/compensator": given})
+        report_of(*held.bag.recordings, parameters={"/right/compensator": given})
     )
 
 
@@ -386,7 +355,7 @@ def fall(end, **more):
 
 
 def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it():
-    report = told(fall(12.5), Event(12.6, FAULT))
+    report = report_of(fall(12.5), Event(12.6, FAULT))
     text, good = report.verdict
     lowest = np.abs(np.degrees(made.POSES[1])).max()  # rotates back to 0
     moved = re.search(r"joint 4 moved ([\d.]+) degrees, at up to (\d+) deg/s", text)
@@ -398,24 +367,24 @@ def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it():
 def test_a_planned_let_down_is_not_the_worst_event():
     whole = made.trial(made.POSES, hold=6.0)
     held = dataclasses.replace(whole, carried=((0.0, whole.steps[-1].end),))
-    assert told(held).verdict[1] and "let down" not in told(held).verdict[0]
+    text, good = report_of(held).verdict
+    assert good and "let down" not in text
     unscripted = dataclasses.replace(fall(12.5), steps=())
-    assert (
-        "let down" not in told(unscripted).verdict[0] and "let down" in told(unscripted, Event(12.5, FAULT)).verdict[0]
-    )
+    assert "let down" not in report_of(unscripted).verdict[0]
+    assert "let down" in report_of(unscripted, Event(12.5, FAULT)).verdict[0]
 
 
 def test_a_motion_after_a_change_of_load_names_the_change():
     setting = ("/right/compensator", "mode", "one_g")
     fell = dataclasses.replace(made.trial(made.POSES, hold=6.0), steps=())
-    text, good = told(fell, Event(7.5, "/right/compensator: mode = one_g", setting)).verdict
+    text, good = report_of(fell, Event(7.5, "/right/compensator: mode = one_g", setting)).verdict
     assert not good and re.match(r"Right: moved at 8.0 s after mode = one_g: joint 2 moved 22\.\d\d degrees", text)
 
 
 def test_a_parameter_that_is_set_again_to_its_value_is_no_change():
     setting = ("/right/compensator", "mode", "zero_g")
     fell = dataclasses.replace(made.trial(made.POSES, hold=6.0), steps=())
-    report = told(fell, Event(7.5, "/right/compensator: mode = zero_g", setting))
+    report = report_of(fell, Event(7.5, "/right/compensator: mode = zero_g", setting))
     assert "after mode" not in report.verdict[0] and "right: Zero-G, support 30 %" in printed(report)
 
 
@@ -436,7 +405,7 @@ def test_where_nothing_moved_the_resolution_is_stated():
     for step in whole.steps:
         within = (whole.time >= step.start) & (whole.time < step.end)
         codes[within] = codes[within][-1] if step.action == "hold" else codes[within]
-    report = told(dataclasses.replace(whole, position=codes * made.POSITION_CODE))
+    report = report_of(dataclasses.replace(whole, position=codes * made.POSITION_CODE))
     code = math.degrees(made.POSITION_CODE)
     assert f"no joint moved by one position code ({code:.3f} degrees)" in report.verdict[0]
     bound = f"<{60.0 * code / report.arms[0][1].holds[0].duration:.2f}"
@@ -448,7 +417,7 @@ def test_lines_of_the_start_are_left_out_and_markers_are_listed(tmp_path):
     whole = dataclasses.replace(made.trial(made.POSES, hold=6.0), carried=((1.0, 16.0),))
     starting = [Event(0.1 * n, f"right/can_bridge: checking: waiting for {n}") for n in range(5)]
     starting += [Event(0.6, "right/can_bridge: OK, active"), Event(0.7, "imu: WARN that lasts")]
-    report = told(whole, *starting, Event(3.0, FAULT), markers=(Event(2.0, "cramp"),))
+    report = report_of(whole, *starting, Event(3.0, FAULT), markers=(Event(2.0, "cramp"),))
     write(report, tmp_path)
     text = Page((tmp_path / "report.html").read_text(encoding="utf-8")).text
     listed = re.findall(r"\d\.\d s  [^\n]*", text[text.index("Markers, faults") :])

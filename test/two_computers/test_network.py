@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ..hardware.simulated_rig import wait_until
+from ..support.waiting import PATIENCE, wait_until
 from .network import ADDRESSES, Network, Wire
 
 COUNT = 300
@@ -21,7 +21,7 @@ def round_trips(wire: Wire) -> list[tuple[int, float]]:
         echo = network.start("desk", [*ECHO, "echo", ADDRESSES["desk"]], {})
         assert echo.stdout is not None and echo.stdout.readline() == "ready\n"
         counting = network.start("robot", [*ECHO, "count", ADDRESSES["desk"], str(COUNT)], {})
-        output, _ = counting.communicate(timeout=30)
+        output, _ = counting.communicate(timeout=PATIENCE)
         echo.kill()
     return [(number, time) for number, time in json.loads(output)]
 
@@ -45,8 +45,8 @@ def test_the_stated_share_is_lost_each_way():
 def test_a_computer_has_no_interface_but_the_wire():
     with Network(Wire()) as network:
         listing = network.start("robot", ["ip", "-json", "link"], {})
-        names = {link["ifname"] for link in json.loads(listing.communicate(timeout=10)[0])}
-        routes = network.start("robot", ["ip", "route"], {}).communicate(timeout=10)[0]
+        names = {link["ifname"] for link in json.loads(listing.communicate(timeout=PATIENCE)[0])}
+        routes = network.start("robot", ["ip", "route"], {}).communicate(timeout=PATIENCE)[0]
     assert names == {"lo", "eth0"} and "default" not in routes
 
 

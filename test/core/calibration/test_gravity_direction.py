@@ -91,7 +91,7 @@ def test_two_leans_of_the_stand_show_the_heading_of_the_imu_and_one_does_not(see
 def test_the_heading_is_corrected_only_if_it_shows(tmp_path):
     params, arm = tmp_path / "exo.yaml", ARM
     params.write_text(FILE, encoding="utf-8")
-    for pitches, is_told in (((0.07, 0.07), False), ((0.07, -0.09), True)):
+    for pitches, is_shown in (((0.07, 0.07), False), ((0.07, -0.09), True)):
         observations = tours(Device(2), pitches)
         outcome = with_mounting(moments_from(arm, observations), params)
         (mounting,) = [change.value for change in outcome.changes if change.name == "rotation_trunk_from_imu"]
@@ -101,5 +101,5 @@ def test_the_heading_is_corrected_only_if_it_shows(tmp_path):
             wrong = np.linalg.norm(moved - gravity_in_trunk(pitch, 0.2))
             assert wrong < np.radians(0.3)
         heading = np.arctan2(rotation_matrix(mounting)[1, 0], rotation_matrix(mounting)[0, 0])
-        assert (abs(heading) > HEADING / 2.0) == is_told
-        assert (NO_HEADING in outcome.lines) != is_told
+        assert (abs(heading) > HEADING / 2.0) == is_shown
+        assert (NO_HEADING in outcome.lines) != is_shown

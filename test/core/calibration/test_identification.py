@@ -1,4 +1,4 @@
-"""Identification from held poses: right on random devices, honest about its errors and about what it cannot tell."""
+"""Identification from held poses: right on random devices, with stated errors, and with what it cannot show."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_a_weight_shows_an_error_of_joint_3s_zero():
     assert not any("The weight shows" in sentence for sentence in identify(Device(17).tour(), LENGTH).unknown)
 
 
-def test_the_next_pose_tells_more_than_a_repeated_or_a_random_one():
+def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
     rng = np.random.default_rng(16)
     device = Device(16)
 

@@ -13,6 +13,7 @@ from exo_gravity.core.calibration.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.model.arm import ModelError
+from exo_gravity.core.model.gravity import LAWS
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -25,7 +26,7 @@ from exo_gravity.sim.offline import ArmSetup, OfflineTrial
 
 NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
 POSE = (0.0, 0.2, 0.0, 0.8)  # rad
-HANGING = (0.0, 0.0, 0.0, 0.0)
+HANGING, ELSEWHERE = (0.0, 0.0, 0.0, 0.0), (0.0, 1.2, 0.0, 0.3)
 STILL = (0.0,) * 4
 RATE = 100.0  # Hz
 MOVE, HELD = 7.0, 9.2  # s in which the hand leads the arm to POSE, and time at which it holds it there
@@ -138,18 +139,23 @@ def test_a_load_that_falls_while_it_is_weighed_is_seen_by_the_arm_that_rises():
     assert weighing.is_thrown and "was the load dropped?" in weighing.trouble
 
 
+def lever(theta: Sequence[float]) -> np.ndarray:
+    """Return the torques (4,) of 1 kg in the hand."""
+    return np.array(LAWS["exact"](SETTINGS.unit_load, theta, TILT))
+
+
 def test_with_the_empty_hand_weighed_before_the_error_of_the_model_is_left_out():
     first = Weighing(SETTINGS, JOINTS, RATE)
     first.torque(0.01, POSE, STILL, TILT, STILL)
-    first.result = Weighed(0.06, 0.004, first._lever)
+    first.result = Weighed(0.06, 0.004, lever(POSE))
     assert first.text.endswith(": the hand is empty")
     second = Weighing(SETTINGS, JOINTS, RATE, first.empty)
     second.torque(0.01, POSE, STILL, TILT, STILL)
-    second.result = Weighed(1.05, 0.004, second._lever)
+    second.result = Weighed(1.05, 0.004, lever(POSE))
     assert "1.050 +- " in second.text and "; 0.990 +- " in second.text
     assert second.text.endswith(": payload.mass = 0.990 carries it")
     assert second.empty is first.result  # 1.05 kg is no empty hand
     elsewhere = Weighing(SETTINGS, JOINTS, RATE, first.empty)
-    elsewhere.torque(0.01, (0.0, 1.2, 0.0, 0.3), STILL, TILT, STILL)
-    elsewhere.result = Weighed(1.05, 0.004, elsewhere._lever)
+    elsewhere.torque(0.01, ELSEWHERE, STILL, TILT, STILL)
+    elsewhere.result = Weighed(1.05, 0.004, lever(ELSEWHERE))
     assert "empty" not in elsewhere.text

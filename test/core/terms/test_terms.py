@@ -221,7 +221,7 @@ def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the
     assert ALL.on_arm(DEFAULT_LINKS) == ALL
 
 
-def test_soft_limits_are_no_stiffer_than_the_arm_can_bear():
+def test_soft_limits_are_no_stiffer_than_is_stable():
     stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
     most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))

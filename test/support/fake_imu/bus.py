@@ -39,7 +39,7 @@ class FakeBus:
         self.closed = False
         self.longest = 0  # bytes of a read
         self._device = device
-        self._address = address
+        self.address = address
 
     def read_byte_data(self, i2c_addr: int, register: int) -> int:
         """Return one register."""
@@ -64,6 +64,6 @@ class FakeBus:
         if self.closed:
             raise OSError(errno.EBADF, "Bad file descriptor")
         self.disturbed = max(self.disturbed - 1, -1)
-        if self.disturbed >= 0 or not self.plugged or self._device is None or address != self._address:
+        if self.disturbed >= 0 or not self.plugged or self._device is None or address != self.address:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")  # errno 121
         return self._device

@@ -42,7 +42,7 @@ class FakeSerialSensor:
         os.write(self._ours, data)
 
     def deliver(self, data: bytes) -> None:
-        """Send bytes, and return when they are there: the kernel passes them on later. Nobody may read meanwhile."""
+        """Send bytes and return when they have arrived, which the kernel delays. No other thread may read meanwhile."""
         assert self._theirs is not None
         expected = self._waiting() + len(data)
         self.send(data)

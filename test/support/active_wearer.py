@@ -23,7 +23,7 @@ ANY = TrialScript("active wearer", (Step("hold", 3600.0),))
 
 
 class ActiveWearer(VirtualWearer):
-    """Behaves as `behaviour` says, without end."""
+    """Behaves as `behaviour` says, for as long as the device runs."""
 
     def __init__(self, behaviour: Behaviour) -> None:
         super().__init__(ANY)
@@ -88,7 +88,8 @@ def shake(torque: Joints, duration: float, frequency: float = 2.0) -> Behaviour:
 
 def hand(lead: Lead, duration: float, joints: Sequence[int] = ALL) -> Behaviour:
     """A hand, compliant as a human one, that leads `joints` along a path for `duration` s and lets go."""
-    wearer, start, last = VirtualWearer(ANY), [], [0.0]
+    wearer, last = VirtualWearer(ANY), [0.0]
+    start: list[float] = []
 
     def behave(since: float, theta: Joints, velocity: Joints) -> Joints:
         start.extend(theta if not start else ())

@@ -1,0 +1,26 @@
+"""Waiting for a condition as long as a busy machine may take."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+PATIENCE = 100.0  # s, after which a process or a condition is taken for stuck; pytest ends a test after 120 s
+PAUSE = 0.005  # s between two looks
+
+
+def pause() -> None:
+    time.sleep(PAUSE)
+
+
+def wait_until(
+    condition: Callable[[], object],
+    meanwhile: Callable[[], object] = pause,
+    timeout: float = PATIENCE,
+    seen: Callable[[], object] = lambda: "",
+) -> None:
+    """Do `meanwhile` again and again until `condition()` holds; if it does not in `timeout` s, fail with `seen()`."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, f"the condition did not hold in {timeout:.0f} s; {seen()}"
+        meanwhile()

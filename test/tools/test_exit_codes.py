@@ -1,0 +1,90 @@
+"""Wrong use of each tool ends with exit code 2, and a sentence that names what is wrong in place of a traceback."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ..support import CONFIG
+
+EXO = str(CONFIG / "exo.yaml")
+NO_FILE = ["--params", "nowhere.yaml"]
+LAW = ["--output", "law.json"]
+IMU = ["imu", "--params", EXO, "--output"]
+LIMITS = ("--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold")
+WRONG = [
+    ("budget", ["--body-mass", "75", *NO_FILE], "nowhere.yaml"),
+    *(("budget", ["--params", EXO, "--body-mass", mass], "must be a number from") for mass in ("75000", "nan")),
+    ("budget", ["--params", EXO, "--body-mass", "75", "--support", "2"], "must be a number from"),
+    ("calibrate", ["motor"], "invalid choice"),
+    ("calibrate", [*IMU, "new.yaml", "--bag", "none"], "must be a recording that exists"),
+    ("calibrate", [*IMU, "taken.yaml", "--bag", "."], "taken.html': must be a new file"),
+    ("doctor", NO_FILE, "nowhere.yaml"),
+    ("report", ["nothing"], "nothing: no such file"),
+    ("report", ["--repair", "nothing"], "no such file"),
+    *(("report", ["b", f"{o}={v}"], f"{o}: {v}: must be a num") for o in LIMITS for v in ("nan", "-1", "half")),
+    ("train_anfis", [*LAW, *NO_FILE], "nowhere.yaml"),
+    ("train_anfis", [*LAW, "--bag", "nowhere"], "nowhere"),
+    ("train_anfis", [*LAW, "--side", "middle"], "middle"),
+    ("train_anfis", [*LAW, "--functions", "1"], "functions"),
+    ("trial", ["no_such_trial"], "no_such_trial"),
+    ("trial", ["demo", *NO_FILE], "nowhere.yaml"),
+    ("trial", ["demo", "--offline", "--params", EXO], "a file with a simulator"),
+    ("urdf", NO_FILE, "nowhere.yaml"),
+    ("urdf", ["--params", EXO, "--output", "missing/arm.urdf"], "arm.urdf"),
+    ("validate", NO_FILE, "nowhere.yaml"),
+    ("validate", ["--side", "up"], "invalid choice"),
+    ("validate", ["--output", "taken.html/folder"], "taken.html"),
+]
+WITHOUT = {
+    "report": (
+        "rosbags.rosbag2",
+        ["b"],
+        "the Python package rosbags is not installed: pip install 'exo_gravity[report]'",
+    ),
+    "train_anfis": (
+        "threadpoolctl",
+        LAW,
+        "threadpoolctl is not installed: apt install python3-threadpoolctl, or pip ins",
+    ),
+    "launcher": (
+        "rclpy",
+        [],
+        "the Python package rclpy is not found: source /opt/ros/jazzy/setup.bash, or without ROS: ",
+    ),
+}
+MAIN = """
+import sys
+sys.modules[{module!r}] = None
+from exo_gravity.tools import {tool}
+sys.exit({tool}.main({words!r}))
+"""
+
+
+@pytest.mark.parametrize(("tool", "words", "sentence"), WRONG)
+def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("taken.html").touch()
+    try:
+        code = importlib.import_module(f"exo_gravity.tools.{tool}").main(words)
+    except SystemExit as ended:
+        code = ended.code
+    said = capsys.readouterr().err
+    assert code == 2 and sentence in said
+    assert f"{tool}: " in said.splitlines()[-1]
+
+
+@pytest.mark.parametrize("tool", WITHOUT)
+def test_a_missing_package_is_named_with_what_installs_it_and_help_still_works(tool, tmp_path):
+    module, words, sentence = WITHOUT[tool]
+    for given, code in ((words, 2), (["--help"], 0)):
+        program = MAIN.format(module=module, tool=tool, words=given)
+        ended = subprocess.run(
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100
+        )
+        assert ended.returncode == code, ended.stderr
+        assert not code or (sentence in ended.stderr and ended.stderr.count("\n") == 1)
