@@ -8,17 +8,15 @@ Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong us
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import ExoGravityError, named
+from exo_gravity.core.errors import named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import (
     USUAL_TILT,
@@ -27,13 +25,12 @@ from exo_gravity.core.model.budget import (
     largest_support,
     motor_for,
     motor_torques,
-    rounded_down,
     torque_at,
     workspace,
 )
 from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
-from exo_gravity.core.numbers import one_float
-from exo_gravity.tools.cli import missing
+from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.tools.cli import exit_code
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms
 
 if TYPE_CHECKING:
@@ -99,10 +96,10 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
             f"{joint.rated:.3g}",
             f"{joint.peak:.3g}",
             f"{joint.torque:.2f}",
-            f"{100 * rounded_down(joint.within_rated):.1f} %",
-            f"{100 * rounded_down(joint.within_peak):.1f} %",
+            f"{100 * joint.within_rated:.1f} %",
+            f"{100 * joint.within_peak:.1f} %",
             f"{', '.join(pose)}; {pitch}, {roll}",
-            "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
+            "none" if joint.support is None else f"{joint.support:.3f}",
             motor_for(joint.torque) or "none",
         )
 
@@ -134,19 +131,6 @@ def verdict(arm: ArmBudget, wearer: Wearer) -> Iterator[str]:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
     yield f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{moments}]  # kg m"
-
-
-def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
-    """Draw a figure of each joint into `folder`; return a line on what was written."""
-    if not find_spec("matplotlib"):
-        return f"No figures: {missing('matplotlib', 'report')}"
-    names = []
-    folder.mkdir(parents=True, exist_ok=True)
-    for arm in arms:
-        for joint in range(len(arm.joints)):
-            names.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-            _joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
-    return f"Written: {', '.join(names)} in {folder}"
 
 
 def _joint_figure(arm: ArmBudget, joint: int) -> "Figure":
@@ -196,22 +180,27 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    try:
-        wearer = Wearer(options.body_mass, options.sex, options.table, options.lengths)
-        support = one_float("support", options.support, 0.0, 1.0)
-        tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
-        arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
-        written = _write_figures(arms, Path(options.output))
-    except (ExoGravityError, OSError) as error:
-        print(f"budget: {error}", file=sys.stderr)
-        return 2
+def _run(options: argparse.Namespace) -> int:
+    """Draw a figure of each joint, and print the budget of each arm; return 1 if a motor is overloaded somewhere."""
+    wearer = Wearer(options.body_mass, options.sex, options.table, options.lengths)
+    support = one_float("support", options.support, 0.0, 1.0)
+    tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
+    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
+    folder, written = Path(options.output), []
+    folder.mkdir(parents=True, exist_ok=True)
+    for arm, joint in product(arms, range(JOINT_COUNT)):
+        written.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
+        _joint_figure(arm, joint).savefig(folder / written[-1], dpi=DPI)
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
     for alike in _mirrored(arms):
         print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
-    print(f"\n{written}")
+    print(f"\nWritten: {', '.join(written)} in {folder}")
     return int(any(arm.is_beyond for arm in arms))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    options = _arguments(args)
+    return exit_code("budget", "report", lambda: _run(options))

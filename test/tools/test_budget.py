@@ -111,9 +111,10 @@ def test_an_impossible_wearer_ends_with_exit_code_2(run, arguments):
     assert code == 2 and "must be a number from" in text
 
 
-def test_without_matplotlib_the_table_is_printed_and_the_missing_package_is_named(run, monkeypatch, tmp_path):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    code, text = run("--body-mass", 75, "--support", 0.068)
-    assert code == 0 and "within rated torque everywhere on /right" in text
+def test_a_missing_package_is_named_with_the_extra_that_installs_it(run, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(SystemExit) as ended:
+        run("--body-mass", 75, "--support", 0.068)
+    assert ended.value.code == 2
+    text = capsys.readouterr().err
     assert "matplotlib is not installed" in text and "exo_gravity[report]" in text
-    assert not (tmp_path / "out").exists()

@@ -30,9 +30,8 @@ def quick(tmp_path_factory):
         patch.setattr(anfis, "MAX_EVALUATIONS", 4)
         patch.setattr(comparison, "evaluate", lambda *given: parts.append(evaluate(*given)) or parts[-1])
         patch.setattr("builtins.print", lambda *parts, sep=" ", **_: lines.append(sep.join(map(str, parts))))
-        with pytest.raises(SystemExit) as ended:
-            validate.main(["--quick", "--output", str(folder)])
-    return ended.value.code, "\n".join(lines), folder, parts
+        code = validate.main(["--quick", "--output", str(folder)])
+    return code, "\n".join(lines), folder, parts
 
 
 def write_params(folder, arm, bridge=None):
@@ -186,23 +185,22 @@ def test_an_anfis_worse_than_the_papers_on_one_joint_fails_its_check(quick, kind
     assert sentence.startswith("ANFIS")
 
 
-def test_a_failed_check_ends_with_1(monkeypatch):
-    monkeypatch.setattr(validate, "_run", lambda options: False)
-    with pytest.raises(SystemExit) as ended:
-        validate.main([])
-    assert ended.value.code == 1
+def test_a_failed_check_ends_with_1(monkeypatch, tmp_path):
+    monkeypatch.setattr(comparison, "evaluate", lambda *_: None)
+    monkeypatch.setattr(comparison, "tables", lambda *_: ())
+    monkeypatch.setattr(comparison, "write", lambda *_: ())
+    monkeypatch.setattr(comparison, "checks", lambda *_: [(True, "one"), (False, "two")])
+    assert validate.main(["--output", str(tmp_path)]) == 1
 
 
 @pytest.mark.parametrize("arguments", [["--params", "nowhere.yaml"], ["--side", "up"], ["--more"]], ids=" ".join)
 def test_wrong_use_ends_with_2(arguments, tmp_path):
     with pytest.raises(SystemExit) as ended:
-        validate.main([*arguments, "--output", str(tmp_path)])
+        raise SystemExit(validate.main([*arguments, "--output", str(tmp_path)]))
     assert ended.value.code == 2
 
 
 def test_an_output_folder_that_cant_be_made_ends_with_2(tmp_path, capsys):
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(SystemExit) as ended:
-        validate.main(["--output", str(tmp_path / "file" / "folder")])
-    assert ended.value.code == 2
+    assert validate.main(["--output", str(tmp_path / "file" / "folder")]) == 2
     assert "file" in capsys.readouterr().err

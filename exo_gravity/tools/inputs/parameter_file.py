@@ -9,7 +9,7 @@ stops them in order: bridges first, because they need the others while they let 
 
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -76,11 +76,6 @@ def load(path: str | Path) -> Nodes:
 def node_of(arm: str, executable: str) -> str:
     """Return the full name of a node of an arm: '/right/can_bridge'; an arm without a namespace is called 'arm'."""
     return f"/{executable}" if arm == "arm" else f"/{arm}/{executable}"
-
-
-def recorded_of(parameters: Mapping[str, str], node: str) -> dict[str, Any] | None:
-    """Return the parameters of `node` in a recording's `parameters`, YAML text by node; None if it has none."""
-    return yaml.load(parameters[node], Loader)[node]["ros__parameters"] if node in parameters else None
 
 
 def _parameters(node: str, entry: Any) -> dict[str, Any]:

@@ -1,26 +1,29 @@
-"""What stands on top of a report: of whom and under what settings it was recorded, and the worst that happened."""
+"""What stands on top of a report: the verdict, the worst that happened, and the settings it was recorded under."""
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime, timezone
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.core.compensation.settings import COMPENSATOR
-from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
+from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.session import Session
-from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
+from exo_gravity.tools.inputs.arms import recorded_of
+from exo_gravity.tools.inputs.parameter_file import node_of
 from exo_gravity.tools.reporting import html, table
+from exo_gravity.tools.reporting.wearer_share import WearerPart
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 NEAR = 1.0  # s between a let-down and the fault that caused it
 LOAD = ("mode", "support", "wearer.", "payload.")  # beginnings of the parameters that change the load
 MODES = {"one_g": "One-G", "zero_g": "Zero-G"}
+TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
 
 Worst = tuple[bool, float, str]  # whether it is worse than a small drift; rad; a sentence
 
@@ -34,14 +37,12 @@ class Conditions:
 
     @classmethod
     def of(cls, bag: Bag, arm: str) -> "Conditions":
-        """Return the conditions of the arm `arm`; a parameter that was not recorded has its default."""
-        node = node_of(arm, "compensator")
-        recorded = recorded_of(bag.parameters, node)
-        start = {**{param.name: param.default for param in COMPENSATOR}, **recorded} if recorded else {}
+        """Return the conditions of the arm `arm`."""
+        start = recorded_of(bag.parameters, arm, "compensator")
         in_force, changes = dict(start), []
         for event in bag.events:
             of, name, value = event.setting or ("", "", None)
-            if of == node and in_force.get(name) != value:  # what is set again to its value changes nothing
+            if of == node_of(arm, "compensator") and in_force.get(name) != value:  # set again to its value: no change
                 in_force[name] = value
                 changes.append((event.time, name, value))
         return cls(start, tuple(changes))
@@ -62,45 +63,97 @@ class Conditions:
         return ", ".join(values if len(values) < 6 else [values[0], f"{len(values) - 2} changes", values[-1]])
 
     @property
-    def wearer(self) -> str:
-        """The wearer whose arm Zero-G carries."""
-        if any(self.start.get("wearer.mass", ())):
-            return f"arm of {sum(self.start['wearer.mass']):.2f} kg"
-        mass = self.start.get("wearer.body_mass", 0.0)
-        return f"{mass:g} kg, {self.start['wearer.sex']}" if mass else "no data"
+    def shown(self) -> tuple[str, str, str]:
+        """Mode, support, and the wearer whose arm Zero-G carries."""
+        mode = self.history("mode", lambda mode: MODES.get(mode, mode))
+        support = self.history("support", lambda share: f"{100.0 * share:g} %")
+        mass, body_mass = sum(self.start.get("wearer.mass", ())), self.start.get("wearer.body_mass", 0.0)
+        body = f"{body_mass:g} kg, {self.start['wearer.sex']}" if body_mass else "no data"
+        wearer = f"arm of {mass:.2f} kg" if mass else body
+        return mode, "none in One-G" if mode == "One-G" else support, wearer
 
 
-def columns(bag: Bag, conditions: Conditions, trial: str, arm: str) -> Callable[[float], dict[str, str]]:
-    """Return a function from a time in s to the first columns of a row about the arm at that time."""
+@dataclass(frozen=True)
+class Report:
+    """A recording, the analysis of each arm, and the verdict."""
 
-    def at(time: float) -> dict[str, str]:
-        in_force = conditions.at(time)
+    bag: Bag
+    criteria: HoldCriteria
+    arms: tuple[tuple[Recording, TrialAnalysis], ...]
+    settings: dict[str, Conditions]  #: by the arm's name
+    wearers: dict[str, WearerPart]  #: by the arm's name, where what the wearer did is known
+    notes: tuple[str, ...]  #: what limits the trust in the verdict
+    trouble: str = ""  #: why the trial ended before its script, or ''
+
+    @cached_property
+    def failures(self) -> list[str]:
+        """One sentence for each way in which an arm did not hold."""
+        return [sentence for arm in self.arms for sentence in failures(*arm, self.criteria)]
+
+    @property
+    def exit_code(self) -> int:
+        """0: held. 1: did not hold. 2: some of the recording could not be read."""
+        return 2 if self.bag.problems else int(bool(self.failures))
+
+    @property
+    def held(self) -> str:
+        """The verdict on arms that held, which covers no more than was recorded."""
+        if self.bag.problems:
+            return "It held, as far as the recording could be read."
+        if self.trouble:
+            return f"It held until the trial ended early: {self.trouble}."
+        return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
+
+    @cached_property
+    def verdict(self) -> tuple[str, bool]:
+        """The first sentences of the report, and whether they are good news: a bad event comes first."""
+        events = [event for arm in self.arms for event in (*_falls(self, *arm), *_strays(self, *arm))]
+        bad, _, event = max(events, default=(False, 0.0, ""))
+        early = f" The trial ended early: {self.trouble}." if self.trouble else ""
+        held = f"It did not hold.{early}" if self.failures else self.held
+        otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
+        text = f"{event[:1].upper()}{event[1:]}. {otherwise}" if bad else f"{held} Worst: {event}." if event else held
+        return text, not (bad or self.failures)
+
+    @property
+    def trial(self) -> str:
+        """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
+        path = self.bag.path.resolve()
+        return path.parent.name if path.stem == "bag" else path.stem
+
+    @property
+    def title(self) -> str:
+        """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
+        name = TIMESTAMP.sub("", self.trial)
+        sides = " and ".join(recording.name for recording in self.bag.recordings)
+        arms = sides if sides == "arm" else f"{sides} arm{'s' if len(self.bag.recordings) > 1 else ''}"
+        return f"{name.replace('_', ' ')}, {arms}, {self.start:%Y-%m-%d}"
+
+    @property
+    def start(self) -> datetime:
+        """Start of the recording, local time."""
+        return datetime.fromtimestamp(self.bag.start / 1e9, timezone.utc).astimezone()
+
+    def row_head(self, arm: str, time: float) -> dict[str, str]:
+        """Return the first columns of a row of the CSV files, about `arm` at `time` s."""
+        in_force = self.settings[arm].at(time)
         settings = {key: str(in_force.get(key, "")) for key in ("side", "mode", "support")}
-        return {"trial": trial, "subject": bag.session.subject, "arm": arm, **settings, "version": bag.session.version}
-
-    return at
-
-
-def lines(conditions: Mapping[str, Conditions]) -> list[tuple[str, ...]]:
-    """Return arm, mode, support and wearer of each arm, as text."""
-    found: list[tuple[str, ...]] = []
-    for arm, of_arm in conditions.items():
-        mode = of_arm.history("mode", lambda mode: MODES.get(mode, mode))
-        support = of_arm.history("support", lambda share: f"{100.0 * share:g} %")
-        found.append((arm, mode, "none in One-G" if mode == "One-G" else support, of_arm.wearer))
-    return found
+        session = self.bag.session
+        return {"trial": self.trial, "subject": session.subject, "arm": arm, **settings, "version": session.version}
 
 
-def section(session: Session, conditions: Mapping[str, Conditions], criteria: HoldCriteria) -> Iterator[str]:
+def section(report: Report) -> Iterator[str]:
     """Yield the page's section on the conditions and the criteria."""
+    session = report.bag.session
     given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
     yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
-    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines(conditions)])
+    lines = [(arm, *conditions.shown) for arm, conditions in report.settings.items()]
+    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
     recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
-    yield html.paragraph(f"{criteria_text(criteria)} {recorder}")
+    yield html.paragraph(f"{_criteria_text(report.criteria)} {recorder}")
 
 
-def criteria_text(criteria: HoldCriteria) -> str:
+def _criteria_text(criteria: HoldCriteria) -> str:
     """Say what "it held" means."""
     stray, after_push, rate, offset = np.degrees(
         (criteria.max_stray, criteria.max_stray_after_push, 60.0 * criteria.max_rate, criteria.max_offset)
@@ -112,89 +165,60 @@ def criteria_text(criteria: HoldCriteria) -> str:
     )
 
 
-def worst(
-    bag: Bag,
-    arms: Iterable[tuple[Recording, TrialAnalysis]],
-    conditions: Mapping[str, Conditions],
-    criteria: HoldCriteria,
-) -> tuple[str, bool]:
-    """Return the worst event as a sentence, and whether it is worse than a small drift; ('', False) for none."""
-    found = [
-        event
-        for recording, analysis in arms
-        for event in (
-            *_falls(bag.events, conditions[recording.name], recording, analysis, criteria),
-            *_strays(recording, analysis, criteria),
-        )
-    ]
-    bad, _, text = max(found, default=(False, 0.0, ""))
-    return text, bad
-
-
-def _falls(
-    events: Iterable[Event],
-    conditions: Conditions,
-    recording: Recording,
-    analysis: TrialAnalysis,
-    criteria: HoldCriteria,
-) -> Iterator[Worst]:
+def _falls(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:
     """Yield each let-down that was not planned, and each motion that no step of the script explains."""
-    time = recording.time
-    spans, planned = recording.carried or (), recording.steps[-1].end - EARLY if recording.steps else time[-1] - EARLY
-    for n, (_, end) in enumerate(spans):
-        fault = fault_near(events, recording.name, end)
-        again = spans[n + 1][0] if n + 1 < len(spans) else float(time[-1])
-        within = (time >= end) & (time <= again)
-        is_planned = end >= planned or (not recording.steps and n + 1 == len(spans))
+    conditions, steps, time = report.settings[recording.name], recording.steps, recording.time
+    spans, planned = recording.carried or (), (steps[-1].end if steps else time[-1]) - EARLY
+    for (_, end), (again, _) in zip(spans, (*spans[1:], (time[-1], 0.0)), strict=False):
+        fault = _fault_near(report.bag, recording.name, end)
+        is_planned = end >= planned or (not steps and end == spans[-1][1])
         if end < time[-1] - EARLY and (fault or not is_planned):
+            within = (time >= end) & (time <= again)
             moved = recording.position[within] - recording.position[within][0]
             peak, speed = np.abs(moved).max(axis=0), np.abs(recording.velocity[within]).max(axis=0)
             what = f"let down at {end:.1f} s{f' ({fault})' if fault else ''}{conditions.change_before(end)}: "
-            yield _event(recording, what, peak, speed, True)
+            yield _event(recording, what, peak, True, speed)
     for motion in analysis.motions:
         change = conditions.change_before(motion.start)
-        if motion.kind == "slip" or (motion.kind in ("push", "move") and not recording.steps and change):
-            bad = bool(np.max(np.abs(motion.peak)) > criteria.max_stray)
-            what = f"{'slipped' if recording.steps else 'moved'} at {motion.start:.1f} s{change}: "
-            yield _event(recording, what, np.abs(motion.peak), motion.speed, bad)
+        if motion.kind == "slip" or (motion.kind in ("push", "move") and not steps and change):
+            bad = bool(np.max(np.abs(motion.peak)) > report.criteria.max_stray)
+            what = f"{'slipped' if steps else 'moved'} at {motion.start:.1f} s{change}: "
+            yield _event(recording, what, np.abs(motion.peak), bad, motion.speed)
     for release in analysis.releases:
-        offset = np.abs(release.offset)
-        if not release.still or (release.after != "push" and offset.max() > criteria.max_offset):
+        if not (release.still and report.criteria.stayed(release)):
             how = "did not stay where it was let go" if release.still else "was still moving at the end of a hold"
-            change = conditions.change_before(release.start)
-            yield _event(recording, f"{how}, {release.start:.1f}-{release.end:.1f} s{change}: ", offset, None, True)
+            what = f"{how}, {release.start:.1f}-{release.end:.1f} s{conditions.change_before(release.start)}: "
+            yield _event(recording, what, np.abs(release.offset), True)
 
 
-def _strays(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Iterator[Worst]:
+def _strays(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:
     for number, hold in enumerate(analysis.holds, 1):
-        most = criteria.max_stray_after_push if hold.after == "push" else criteria.max_stray
         if hold.stray.max() > table.UNMOVED:
-            bad = bool(hold.stray.max() > most)
-            yield _event(recording, f"within 10 s of hold {number}, ", hold.stray, None, bad)
+            bad = bool(hold.stray.max() > report.criteria.stray_allowed(hold))
+            yield _event(recording, f"within 10 s of hold {number}, ", hold.stray, bad)
         else:
             code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
             size = f" ({code:.3f} degrees)" if math.isfinite(code) else ""
             yield False, 0.0, f"{recording.name}: no joint moved by one position code{size} in a hold"
 
 
-def _event(recording: Recording, what: str, angle: np.ndarray, speed: np.ndarray | None, bad: bool) -> Worst:
+def _event(recording: Recording, what: str, angle: np.ndarray, bad: bool, speed: np.ndarray | None = None) -> Worst:
     joint = int(np.argmax(angle))
     fast = "" if speed is None else f", at up to {table.shown(math.degrees(speed[joint]), 0)} deg/s"
     moved = f"{table.joint_labels(recording)[joint]} moved {table.shown(math.degrees(angle[joint]), 2)} degrees{fast}"
     return bad, float(angle[joint]), f"{recording.name}: {what}{moved}"
 
 
-def fault_near(events: Iterable[Event], arm: str, time: float) -> str:
+def _fault_near(bag: Bag, arm: str, time: float) -> str:
     """Return the fault that the arm's bridge reported at about `time` s, without its state, or ''."""
     reported = re.compile(rf"{re.escape(arm)}(?:/can_bridge)?: (?:letting down|fault): (.*)")
-    found = (reported.match(event.text) for event in events if abs(event.time - time) <= NEAR)
+    found = (reported.match(event.text) for event in bag.events if abs(event.time - time) <= NEAR)
     return next((match[1] for match in found if match), "")
 
 
 def after_start(bag: Bag) -> list[Event]:
     """Return markers and events in order, of those before an arm was carried only the last of each node."""
-    begins = [recording.carried[0][0] for recording in bag.recordings if recording.carried]
-    began = min(begins, default=-math.inf)
+    began = min((recording.carried[0][0] for recording in bag.recordings if recording.carried), default=-math.inf)
     last = {event.text.partition(":")[0]: event for event in bag.events if event.time < began and not event.setting}
     kept = [event for event in last.values() if ": OK, " not in event.text]
     changed = [event for event in bag.events if event.time >= began or event.setting]
