@@ -43,13 +43,9 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     found = {recording.name: recording for recording in bag.recordings}
     if arm.name not in found:
         raise DataError(f"{path}: no arm {arm.name}; it has {', '.join(found)}")
-    recording = found[arm.name]
-    if sorted(recording.joint_names) != sorted(arm.joint_names):
-        raise DataError(f"joints = {', '.join(recording.joint_names)}: must be {', '.join(arm.joint_names)}")
-    order = [recording.joint_names.index(name) for name in arm.joint_names]
+    recording = found[arm.name].in_order(arm.joint_names)
     effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
-    position = recording.position[:, order].astype(float)
-    recording = replace(recording, joint_names=arm.joint_names, position=position, effort=effort[:, order])
+    recording = replace(recording, position=recording.position.astype(float), effort=effort)
     down = _down(path, arm, recording.time + bag.start / 1e9)
     observations = list(_sweeps(recording, down))
     if with_held:
