@@ -1,9 +1,7 @@
 """An ANFIS of joints 2 to 4 of an upright arm: the samples it is trained on, and a hybrid learning that converges.
 
-Samples are torques in Nm at gain 1, not scaled. Computed: `gravload` torques at the paper's 1,053 positions, 13 x 9 x 9
-over joints 2, 3, 4, checked half-way between them. Recorded: the mean measured torque of each hold of a rosbag2, of
-which every fifth is held out. A measured torque lacks the part that stiction carries, so approach each pose from both
-sides.
+Samples are torques in Nm at gain 1, not scaled. A measured torque lacks what stiction carries, so approach each pose from
+both sides.
 
 In each epoch, Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient.
 Variable projection completes this split: the consequents are a function of the premises (the least-squares solution),
@@ -63,7 +61,7 @@ def axes_of(configured: ConfiguredArm, counts: Sequence[int]) -> list[np.ndarray
 
 
 def from_gravload(configured: ConfiguredArm) -> Samples:
-    """Return the upright arm's torques by the Robotics Toolbox, on the grid and half-way between its positions."""
+    """Return the upright arm's torques by the Robotics Toolbox at the paper's positions, and half-way between them."""
     axes = axes_of(configured, GRID)
     reference = gravload(replace(configured.robot, gain=np.ones(4)))
     middles = [(axis[1:] + axis[:-1]) / 2 for axis in axes]
@@ -74,7 +72,7 @@ def from_gravload(configured: ConfiguredArm) -> Samples:
 
 
 def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Samples:
-    """Return the mean measured torque of each hold of a rosbag2 during which the trunk was upright.
+    """Return the mean measured torque of each hold of a rosbag2 with an upright trunk; every fifth is held out.
 
     The box spans the held poses within the joint limits. Raises DataError, one sentence, if they are too few for
     `functions` membership functions per input.

@@ -1,8 +1,6 @@
 """The paper's comparison: every law against every reference, the checks of the result, its tables, CSV and figures.
 
-Each arm is compared over the 1,053 positions with an upright trunk, and over random poses whose pitch and sideways tilt
-are uniform within a limit. The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the
-compensator.
+The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the compensator.
 """
 
 import csv
@@ -35,7 +33,6 @@ FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
 # Overlapping lines stay visible, because the first are wider.
 STYLES = {"EQ2-EQ5": ("s-", 4.0), "EQ1m-EQ4m": ("D-", 2.0), "ANFIS": ("^--", 1.5), "exact": ("o-", 1.5)}
-COLUMNS = ("cog", "positions", "limit", "count", "law", "reference", "joint", "rmse", "largest", "rms_torque")
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +174,7 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(COLUMNS)
+        writer.writerow((*Row._fields[:6], "joint", *Row._fields[6:]))
         for *head, rmse, largest, rms_torque in rows:
             numbers = zip(rmse.tolist(), largest.tolist(), rms_torque.tolist(), strict=True)
             writer.writerows((*head, joint, *line) for joint, line in enumerate(numbers, start=1))

@@ -133,7 +133,7 @@ def budget(
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
         return own, with_all - own
 
-    points = np.random.default_rng(0).uniform(*bounds, (SAMPLES, JOINT_COUNT + 2))
+    points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
 
     def need(at: np.ndarray) -> np.ndarray:
@@ -153,11 +153,11 @@ def budget(
         worst, torque = _worst(need, joint, bounds, starts, needs[:, joint])
         _, short = _worst(shortage, joint, bounds, starts, shortages[:, joint])
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
-        within = (
+        low, high = (
             _rounded_down(min(float(np.mean(needs[-SAMPLES:, joint] <= limit)), 0.9999 if torque > limit else 1.0))
             for limit in limits
         )
-        joints.append(JointBudget(*limits, torque, worst, *within, None if short > 0.0 else _rounded_down(-short)))
+        joints.append(JointBudget(*limits, torque, worst, low, high, None if short > 0.0 else _rounded_down(-short)))
     return tuple(joints)
 
 

@@ -1,15 +1,4 @@
-"""The script of a trial: a list of timed steps for the wearer.
-
-    name: demo
-    steps:
-      - {move: [0.0, 0.5, 0.6, 0.5], over: 2.0}      bring the arm to this pose (rad), then let go
-      - {hold: 10.0}                                 leave it alone
-      - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
-      - {bow: 0.5, over: 3.0}                        bow to this pitch of the trunk (rad), and leave the arm alone
-      - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
-      - {walk: 60.0}                                 walk
-      - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
-      - {load: 2.0, over: 1.0}                       take 2 kg into the hand (0: let go of it), and leave the arm alone
+"""The script of a trial: a list of timed steps for the wearer, as `docs/trials.md` lists them.
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """

@@ -20,7 +20,7 @@ from exo_gravity.bag.content import Bag
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.view.scene import LINE, TEXT, ArmView, Shape, arm_shapes
+from exo_gravity.core.view.scene import LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import COLOURS as MATERIALS
 from exo_gravity.core.view.urdf import ArmDescription, arm_pose, described, joint_names, urdf
 from exo_gravity.tools.inputs.arms import recorded_of
@@ -39,7 +39,7 @@ AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on th
 BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
 CENTRE = 0.24  # m below the shoulders, what the camera looks at
 FIELD_OF_VIEW = 38.0  # deg
-CAPSULE = mujoco.mjtGeom.mjGEOM_CAPSULE
+GEOMS = {LINE: mujoco.mjtGeom.mjGEOM_CAPSULE, SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE}
 BODY, LIMB = (0.80, 0.76, 0.70, 1.0), (0.80, 0.70, 0.62, 0.3)  # the wearer, and the arms that are worn
 # Parts of the wearer between two points in m, relative to the middle of the shoulders, and their diameters. Those that
 # have a breadth stand on both sides.
@@ -215,12 +215,13 @@ def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
 
 
 def _add(scene: Any, shape: Shape) -> None:
-    """Add a line or a sphere, a line without length, to MuJoCo's scene; a text is drawn on the picture instead."""
+    """Add a shape to MuJoCo's scene; a text is drawn on the picture instead."""
     if shape.kind == TEXT:
         return
-    for start, end in pairwise(shape.points if len(shape.points) > 1 else np.repeat(shape.points, 2, axis=0)):
+    kind, radius, colour = GEOMS[shape.kind], shape.size / 2, np.array(shape.colour, np.float32)
+    for start, *end in [shape.points] if shape.kind == SPHERE else pairwise(shape.points):
         geom = scene.geoms[scene.ngeom]
         scene.ngeom += 1
-        colour = np.array(shape.colour, np.float32)
-        mujoco.mjv_initGeom(geom, CAPSULE, np.zeros(3), np.zeros(3), np.eye(3).ravel(), colour)
-        mujoco.mjv_connector(geom, CAPSULE, shape.size / 2, start, end)
+        mujoco.mjv_initGeom(geom, kind, np.full(3, radius), start, np.eye(3).ravel(), colour)
+        if end:
+            mujoco.mjv_connector(geom, kind, radius, start, *end)

@@ -1,4 +1,4 @@
-"""What stands on top of a report: the verdict, the worst that happened, and the settings it was recorded under."""
+"""The verdict of a report: under what settings each arm was recorded, whether it held, and the worst that happened."""
 
 import math
 import re
@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.bag.content import Bag, Event
+from exo_gravity.bag.content import Bag
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis, failures
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.inputs.arms import recorded_of
 from exo_gravity.tools.inputs.parameter_file import node_of
-from exo_gravity.tools.reporting import html, table
+from exo_gravity.tools.reporting import table
 from exo_gravity.tools.reporting.wearer_share import WearerPart
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
@@ -142,29 +142,6 @@ class Report:
         return {"trial": self.trial, "subject": session.subject, "arm": arm, **settings, "version": session.version}
 
 
-def section(report: Report) -> Iterator[str]:
-    """Yield the page's section on the conditions and the criteria."""
-    session = report.bag.session
-    given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
-    yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
-    lines = [(arm, *conditions.shown) for arm, conditions in report.settings.items()]
-    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
-    recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
-    yield html.paragraph(f"{_criteria_text(report.criteria)} {recorder}")
-
-
-def _criteria_text(criteria: HoldCriteria) -> str:
-    """Say what "it held" means."""
-    stray, after_push, rate, offset = np.degrees(
-        (criteria.max_stray, criteria.max_stray_after_push, 60.0 * criteria.max_rate, criteria.max_offset)
-    )
-    rated = f"no joint drifts more than {rate:g} degrees per minute, " if math.isfinite(rate) else ""
-    return (
-        f"Criteria: within any 10 s of a hold no joint moves more than {stray:g} degrees, {after_push:g} after a push; "
-        f"{rated}at the end of a hold the arm is still, and within {offset:g} degrees of where it was let go."
-    )
-
-
 def _falls(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:
     """Yield each let-down that was not planned, and each motion that no step of the script explains."""
     conditions, steps, time = report.settings[recording.name], recording.steps, recording.time
@@ -214,13 +191,3 @@ def _fault_near(bag: Bag, arm: str, time: float) -> str:
     reported = re.compile(rf"{re.escape(arm)}(?:/can_bridge)?: (?:letting down|fault): (.*)")
     found = (reported.match(event.text) for event in bag.events if abs(event.time - time) <= NEAR)
     return next((match[1] for match in found if match), "")
-
-
-def after_start(bag: Bag) -> list[Event]:
-    """Return markers and events in order, of those before an arm was carried only the last of each node."""
-    began = min((recording.carried[0][0] for recording in bag.recordings if recording.carried), default=-math.inf)
-    last = {event.text.partition(":")[0]: event for event in bag.events if event.time < began and not event.setting}
-    kept = [event for event in last.values() if ": OK, " not in event.text]
-    changed = [event for event in bag.events if event.time >= began or event.setting]
-    markers = [Event(event.time, f"marker: {event.text}") for event in bag.markers]
-    return sorted((*kept, *changed, *markers), key=lambda event: event.time)

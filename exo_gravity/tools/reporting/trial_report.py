@@ -1,18 +1,20 @@
 """The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from html import escape
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape as marked
 
-from exo_gravity.bag.content import Bag
+from exo_gravity.bag.content import Bag, Event
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
-from exo_gravity.tools.reporting import conditions, figures, html, table, wearer_share
+from exo_gravity.tools.reporting import figures, html, table, wearer_share
 from exo_gravity.tools.reporting.conditions import EARLY, Conditions, Report
 
 MAX_EVENTS = 200
@@ -20,7 +22,8 @@ WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
     "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
-    "wearer": wearer_share.CAPTION,
+    "wearer": "The wearer's torque at each joint, and his share of the torque that carries his arm, each with its 95 % "
+    "band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
 }
 
 
@@ -77,7 +80,7 @@ def write(
             if analysis.holds:
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if part := report.wearers.get(recording.name):
-                drawn["wearer"] = wearer_share.figure(recording, part)
+                drawn["wearer"] = figures.wearer(recording, part)
             pictures = []
             for name, figure in drawn.items():
                 png = html.png_of(figure)
@@ -125,7 +128,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     length = max(float(recording.time[-1]) for recording in bag.recordings)
-    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in conditions.after_start(bag)]
+    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in _after_start(bag)]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
     parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
     ending = [
@@ -136,6 +139,39 @@ def _page(report: Report, sections: Sequence[str]) -> str:
     if parameters:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
     text, good = report.verdict
-    head = [html.verdict(text, report.failures, good), *conditions.section(report)]
+    head = [html.verdict(text, report.failures, good), *_conditions(report)]
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {'/'.join(bag.path.parts[-2:])}"
     return html.document(report.title, when, [*head, *sections, *ending])
+
+
+def _conditions(report: Report) -> Iterator[str]:
+    """Yield the page's section on the conditions and the criteria."""
+    session = report.bag.session
+    given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
+    yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
+    lines = [(arm, *conditions.shown) for arm, conditions in report.settings.items()]
+    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
+    recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
+    yield f"<p>{escape(f'{_criteria_text(report.criteria)} {recorder}')}</p>"
+
+
+def _criteria_text(criteria: HoldCriteria) -> str:
+    """Say what "it held" means."""
+    stray, after_push, rate, offset = np.degrees(
+        (criteria.max_stray, criteria.max_stray_after_push, 60.0 * criteria.max_rate, criteria.max_offset)
+    )
+    rated = f"no joint drifts more than {rate:g} degrees per minute, " if math.isfinite(rate) else ""
+    return (
+        f"Criteria: within any 10 s of a hold no joint moves more than {stray:g} degrees, {after_push:g} after a push; "
+        f"{rated}at the end of a hold the arm is still, and within {offset:g} degrees of where it was let go."
+    )
+
+
+def _after_start(bag: Bag) -> list[Event]:
+    """Return markers and events in order, of those before an arm was carried only the last of each node."""
+    began = min((recording.carried[0][0] for recording in bag.recordings if recording.carried), default=-math.inf)
+    last = {event.text.partition(":")[0]: event for event in bag.events if event.time < began and not event.setting}
+    kept = [event for event in last.values() if ": OK, " not in event.text]
+    changed = [event for event in bag.events if event.time >= began or event.setting]
+    markers = [Event(event.time, f"marker: {event.text}") for event in bag.markers]
+    return sorted((*kept, *changed, *markers), key=lambda event: event.time)

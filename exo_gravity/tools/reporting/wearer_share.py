@@ -8,7 +8,6 @@ from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from exo_gravity.bag.content import Bag
 from exo_gravity.core.compensation.settings import settings_of
@@ -20,14 +19,6 @@ from exo_gravity.core.observer.momentum import COVER
 from exo_gravity.core.observer.share import WINDOW, Share, WearerCurve, observed, share_of, while_between
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.inputs.arms import recorded_of
-from exo_gravity.tools.reporting import html
-from exo_gravity.tools.reporting.figures import WIDTH
-from exo_gravity.tools.reporting.table import joint_labels
-
-CAPTION = (
-    "The wearer's torque at each joint, and his share of the torque that carries his arm, each with its 95 % band. A "
-    "band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md."
-)
 
 
 class WearerPart(NamedTuple):
@@ -71,22 +62,3 @@ def sentence(part: WearerPart) -> str:
     value = f"{100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
     doubt = "" if abs(share.value) > band else ": not distinguishable from zero"
     return f"The wearer carried {value}{doubt}."
-
-
-def figure(recording: Recording, part: WearerPart) -> Figure:
-    """Return torques and share over time, with their bands."""
-    drawn, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
-    axes = drawn.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
-    rows = [*curve.torque.T, 100.0 * part.sliding.value]
-    bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
-    names = [f"{label} (Nm)" for label in joint_labels(recording)]
-    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*html.JOINT_COLOURS, html.INK], strict=True)
-    for axis, values, band, name, colour in columns:
-        axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
-        axis.plot(curve.time, values, color=colour, lw=1.0)
-        axis.axhline(0.0, color=html.FAINT, lw=0.6, zorder=0)
-        axis.set_title(name, loc="left", fontsize=9, color=colour)
-        html.make_plain(axis)
-    axes[-1].set_ylim(-60.0, 160.0)
-    axes[-1].set_xlabel("Time (s)")
-    return drawn
