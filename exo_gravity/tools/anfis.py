@@ -1,6 +1,6 @@
 """An ANFIS of joints 2 to 4 of an upright arm: the samples it is trained on, and a hybrid learning that converges.
 
-Samples are torques in Nm at gain 1, not scaled. A measured torque lacks what stiction carries, so approach each pose from
+Samples are torques in Nm at gain 1, not scaled. A measured torque lacks what stiction carries: approach each pose from
 both sides.
 
 In each epoch, Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient.

@@ -9,7 +9,7 @@ Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong us
 import argparse
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -55,7 +55,6 @@ class ArmBudget:
     name: str  #: of the arm's namespace
     carrying: ArmModel  #: with its share of the wearer's arm
     support: float  #: 0..1, that share
-    payload: float  #: kg in the hand
     motors: Sequence[str]
     bounds: np.ndarray  #: of its workspace, (2, 6) rad
     joints: tuple[JointBudget, ...]
@@ -66,9 +65,7 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(
-    configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float = 0.0
-) -> ArmBudget:
+def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
     max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
@@ -81,12 +78,11 @@ def arm_budget(
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
         joints = budget(robot, load, support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, carrying, support, payload, motors, bounds, joints)
+    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
     """Yield the lines of a table with one row per joint."""
-    yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.bounds[1, 4]):g} deg"
     yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
@@ -104,33 +100,21 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
         )
 
 
-def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
-    """Return the arms whose tables differ; one table names all arms that share it."""
-    tables: dict[tuple[str, ...], ArmBudget] = {}
-    for arm in arms:
-        table = tuple(table_lines(replace(arm, name="")))
-        tables[table] = replace(arm, name=f"{tables[table].name} and {arm.name}") if table in tables else arm
-    return list(tables.values())
-
-
-def verdict(arm: ArmBudget, wearer: Wearer) -> Iterator[str]:
-    """Yield the conclusion: whether it is beyond the motors, which support fits, and can_bridge's parameter for it."""
-    support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
-    held = f" with {arm.payload:g} kg in the hand" if arm.payload else ""
-    what = f"{support} of a wearer of {wearer.body_mass:g} kg{held}"
+def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
+    """Yield the conclusion on `what` the arms `names` carry, the support that fits, and can_bridge's parameter."""
     if arm.is_beyond:
-        yield f"{what} is beyond the motors of {arm.name}."
+        yield f"{what} is beyond the motors of {names}."
         yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
         yield "The wearer can hardly move an AK80-64 by hand: its gear is 64:1."
     else:
-        yield f"{what} is within rated torque everywhere on {arm.name}."
+        yield f"{what} is within rated torque everywhere on {names}."
     fits = largest_support(arm.joints)
     if fits is None:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
     else:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
-    yield f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{moments}]  # kg m"
+    yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
 
 
 def _joint_figure(arm: ArmBudget, joint: int) -> "Figure":
@@ -194,8 +178,15 @@ def _run(options: argparse.Namespace) -> int:
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
-    for alike in _mirrored(arms):
-        print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
+    zero_g = "Full Zero-G" if support == 1.0 else f"Support {support:g}"
+    held = f" with {options.payload:g} kg in the hand" if options.payload else ""
+    alike: dict[str, list[ArmBudget]] = {}  # one table names all arms that share it, as mirrored ones do
+    for arm in arms:
+        alike.setdefault("\n".join(table_lines(arm)), []).append(arm)
+    for table, (arm, *others) in alike.items():
+        names = " and ".join(one.name for one in (arm, *others))
+        print(f"\n{names} at support {support:g}, trunk tilt up to {options.max_tilt:g} deg", table, "", sep="\n")
+        print(*verdict(arm, names, f"{zero_g} of a wearer of {wearer.body_mass:g} kg{held}"), sep="\n")
     print(f"\nWritten: {', '.join(written)} in {folder}")
     return int(any(arm.is_beyond for arm in arms))
 
