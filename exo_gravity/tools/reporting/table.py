@@ -16,7 +16,7 @@ from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
 
 if TYPE_CHECKING:
-    from exo_gravity.tools.reporting.conditions import Report
+    from exo_gravity.tools.reporting.verdict import Report
 
 ROWS = 100_000  # of a time series, that are written at once
 UNMOVED = 1e-9  # rad; the means of equal positions differ by less

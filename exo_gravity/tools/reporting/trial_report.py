@@ -15,7 +15,7 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
 from exo_gravity.tools.reporting import figures, html, table, wearer_share
-from exo_gravity.tools.reporting.conditions import EARLY, Conditions, Report
+from exo_gravity.tools.reporting.verdict import EARLY, Conditions, Report
 
 MAX_EVENTS = 200
 WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
@@ -119,7 +119,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for sentence in report.failures:
         console.print(f"[red]{marked(sentence)}.[/]")
     for arm, settings in report.settings.items():
-        mode, support, wearer = settings.shown
+        mode, support, wearer = settings.in_words
         console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}")
     text, good = report.verdict
     console.print(f"[{'green' if good else 'red'} bold]{marked(text)}[/]")
@@ -149,7 +149,7 @@ def _conditions(report: Report) -> Iterator[str]:
     session = report.bag.session
     given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
     yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
-    lines = [(arm, *conditions.shown) for arm, conditions in report.settings.items()]
+    lines = [(arm, *conditions.in_words) for arm, conditions in report.settings.items()]
     yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
     recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
     yield f"<p>{escape(f'{_criteria_text(report.criteria)} {recorder}')}</p>"

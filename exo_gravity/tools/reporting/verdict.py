@@ -63,7 +63,7 @@ class Conditions:
         return ", ".join(values if len(values) < 6 else [values[0], f"{len(values) - 2} changes", values[-1]])
 
     @property
-    def shown(self) -> tuple[str, str, str]:
+    def in_words(self) -> tuple[str, str, str]:
         """Mode, support, and the wearer whose arm Zero-G carries."""
         mode = self.history("mode", lambda mode: MODES.get(mode, mode))
         support = self.history("support", lambda share: f"{100.0 * share:g} %")
