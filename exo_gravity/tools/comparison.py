@@ -31,6 +31,7 @@ ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
+COLUMNS = ("cog", "positions", "limit", "count", "law", "reference", "joint", "rmse", "largest", "rms_torque")
 # Overlapping lines stay visible, because the first are wider.
 STYLES = {"EQ2-EQ5": ("s-", 4.0), "EQ1m-EQ4m": ("D-", 2.0), "ANFIS": ("^--", 1.5), "exact": ("o-", 1.5)}
 
@@ -64,12 +65,12 @@ class Case:
 
 
 class Row(NamedTuple):
-    """The error in Nm of `law` against `reference` over the `count` poses of a case."""
+    """The error in Nm of `law` against `reference` over the poses of a case."""
 
     cog: str
     positions: str
     limit: int
-    count: int
+    poses: int  #: how many
     law: str
     reference: str
     rmse: np.ndarray  #: (4,) Nm, of each joint
@@ -127,7 +128,7 @@ def checks(link_ends: Part, as_configured: Part) -> Iterator[tuple[bool, str]]:
     """Yield (held, sentence) for each check; link_ends: the results under the paper's assumption d_n = l_n."""
     exact = [row for row in link_ends.rows + as_configured.rows if row.law == "exact"]
     largest = max(row.largest.max() for row in exact)
-    compared = sum(row.count for row in exact)
+    compared = sum(row.poses for row in exact)
     names = " and ".join(REFERENCES)
     within = f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons"
     yield largest <= ROUNDING, f"{within}: largest {largest:.1e} Nm"
@@ -174,7 +175,7 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow((*Row._fields[:6], "joint", *Row._fields[6:]))
+        writer.writerow(COLUMNS)
         for *head, rmse, largest, rms_torque in rows:
             numbers = zip(rmse.tolist(), largest.tolist(), rms_torque.tolist(), strict=True)
             writer.writerows((*head, joint, *line) for joint, line in enumerate(numbers, start=1))

@@ -88,8 +88,10 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
     rates = per_minute([hold.drift_rate for hold in analysis.holds])
     errors = per_minute([hold.drift_rate_uncertainty for hold in analysis.holds])
     for joint, name in enumerate(joint_labels(recording)):
-        at, look = numbers + 0.12 * (joint - 1.5), {"fmt": "o", "ms": 4.5, "lw": 1.2, "capsize": 2}
-        axis.errorbar(at, rates[:, joint], errors[:, joint], color=JOINT_COLOURS[joint], label=name, **look)
+        axis.errorbar(
+            numbers + 0.12 * (joint - 1.5), rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2,
+            color=JOINT_COLOURS[joint], label=name,
+        )  # fmt: skip
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
     if math.isfinite(criteria.max_rate):
         bound = per_minute(criteria.max_rate)

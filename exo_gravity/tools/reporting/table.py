@@ -27,7 +27,8 @@ def per_minute(values: Any) -> Any:
     return 60.0 * np.degrees(values)
 
 
-IN_UNIT = {"deg": np.degrees, "deg/s": np.degrees, "deg/min": per_minute, "Nm": np.asarray}  # from SI units
+# From SI units
+UNITS: dict[str, Callable[[Any], Any]] = {"deg": np.degrees, "deg/s": np.degrees, "deg/min": per_minute, "Nm": np.array}
 
 
 class Column(NamedTuple):
@@ -43,7 +44,7 @@ class Column(NamedTuple):
 
     def of(self, one: Any) -> np.ndarray:
         """Return the numbers (4,) of a hold or motion in the column's unit."""
-        return np.asarray(IN_UNIT[self.heading.partition("\n")[2]](getattr(one, self.field)))
+        return np.asarray(UNITS[self.heading.partition("\n")[2]](getattr(one, self.field)))
 
     def texts(self, one: Any) -> list[str]:
         """Return the numbers of a hold or motion as text."""
@@ -194,7 +195,7 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
         if not rows:
             continue
         shared = zip(*(kind.texts(number, one) for number, one in enumerate(rows, 1)), strict=True)
-        cells = dict(zip(kind.headings.values(), shared, strict=True))
+        cells: dict[str, Sequence[str]] = dict(zip(kind.headings.values(), shared, strict=True))
         cells |= {column.heading: _cells(rows, column) for column in kind.columns}
         for column in sorted(kind.columns, key=lambda column: -column.spare):
             used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
