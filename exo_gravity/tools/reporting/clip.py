@@ -7,6 +7,7 @@ dummy. A GIF has one palette for all frames, which keeps it small.
 from collections.abc import Sequence
 from contextlib import closing
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import imageio.v3 as iio
@@ -26,7 +27,6 @@ from exo_gravity.core.view.urdf import ArmDescription, arm_pose, described, join
 from exo_gravity.tools.inputs.arms import recorded_of
 from exo_gravity.tools.inputs.parameter_file import node_of
 from exo_gravity.tools.reporting.table import shown
-from exo_gravity.tools.reporting.video import Clip
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
 COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
@@ -56,13 +56,16 @@ LIMB_SIZE = 0.075  # m, the diameter of an arm
 SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
 
 
-def write_clip(bag: Bag, clip: Clip, console: Console) -> None:
-    """Write the clip of a recording. Raises DataError if that does not describe its arms, or it cannot be drawn."""
+def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Console) -> None:
+    """Write a clip with a frame for every `step` s of a recording, `frame_rate` of them per second.
+
+    Raises DataError if the recording does not describe its arms, or the clip cannot be drawn or written.
+    """
     end = min(float(recording.time[-1]) for recording in bag.recordings)
-    times = [clip.step * n for n in range(int(end / clip.step) + 1)]
+    times = [step * n for n in range(int(end / step) + 1)]
     hidden = not console.is_terminal
-    drawn = track(times, f"drawing {clip.path.name}", console=console, transient=True, disable=hidden)
-    is_gif = clip.path.suffix.lower() == ".gif"
+    drawn = track(times, f"drawing {path.name}", console=console, transient=True, disable=hidden)
+    is_gif = path.suffix.lower() == ".gif"
     try:
         with closing(Stage(bag, *(GIF_SIZE if is_gif else SIZE))) as stage:
             if is_gif:
@@ -70,17 +73,17 @@ def write_clip(bag: Bag, clip: Clip, console: Console) -> None:
                 found = np.unique(np.reshape(few, (1, -1, 3)), axis=1)  # each once: a torque is drawn by few pixels
                 palette = Image.fromarray(found).quantize(COLOURS)
                 first, *others = (stage.picture(t).quantize(palette=palette, dither=Image.Dither.NONE) for t in drawn)
-                duration = round(1000 / clip.frame_rate)  # ms
-                first.save(clip.path, save_all=True, append_images=others, duration=duration, loop=0)
+                duration = round(1000 / frame_rate)  # ms
+                first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
                 return
-            with iio.imopen(clip.path, "w", plugin="pyav") as file:
-                file.init_video_stream("libx264", fps=clip.frame_rate)
+            with iio.imopen(path, "w", plugin="pyav") as file:
+                file.init_video_stream("libx264", fps=frame_rate)
                 for time in drawn:
                     file.write_frame(np.asarray(stage.picture(time)))
     except ParameterError as error:
         raise DataError(f"{bag.path}: {error}") from None
     except OSError as error:
-        raise DataError(f"{clip.path}: cannot be written ({error.strerror or error})") from None
+        raise DataError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
 class Stage:

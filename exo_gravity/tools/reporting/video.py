@@ -77,5 +77,5 @@ def write(bag: Bag, clip: Clip, console: "Console") -> None:
     os.environ["MUJOCO_GL"] = backend()
     from exo_gravity.tools.reporting.clip import write_clip
 
-    write_clip(bag, clip, console)
+    write_clip(bag, *clip, console)
     console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)
