@@ -77,7 +77,7 @@ KINDS = (
     Kind(
         "holds",
         "Holds",
-        lambda number, hold: dict(hold=number, start_s=hold.start, duration_s=hold.duration, after=hold.after),
+        lambda n, hold: {"hold": n, "start_s": hold.start, "duration_s": hold.duration, "after": hold.after},
         {"hold": "Hold", "start_s": "At\ns", "duration_s": "For\ns"},
         (
             Column("pose", "pose_deg", "Pose\ndeg", 1),
@@ -93,7 +93,7 @@ KINDS = (
     Kind(
         "motions",
         "Motions between holds",
-        lambda number, one: dict(motion=number, kind=one.kind, start_s=one.start, until_still_s=one.until_still),
+        lambda n, one: {"motion": n, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still},
         {"kind": "Motion", "start_s": "At\ns", "until_still_s": "Still after\ns"},
         (
             Column("peak", "peak_deg", "Peak\ndeg", 1),
