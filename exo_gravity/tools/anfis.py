@@ -1,9 +1,7 @@
 """An ANFIS of joints 2 to 4 of an upright arm: the samples it is trained on, and a hybrid learning that converges.
 
-Samples are torques in Nm at gain 1, not scaled. Computed: `gravload` torques at the paper's 1,053 positions, 13 x 9 x 9
-over joints 2, 3, 4, checked half-way between them. Recorded: the mean measured torque of each hold of a rosbag2, of
-which every fifth is held out. A measured torque lacks the part that stiction carries, so approach each pose from both
-sides.
+Samples are torques in Nm at gain 1, not scaled. A measured torque lacks what stiction carries: approach each pose from
+both sides.
 
 In each epoch, Jang's hybrid learning solves the consequents by least squares and moves the premises down the gradient.
 Variable projection completes this split: the consequents are a function of the premises (the least-squares solution),
@@ -12,6 +10,7 @@ after Kaufman 1975). 100 evaluations achieve what thousands of epochs do not.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -54,24 +53,25 @@ class Samples:
     source: str  #: what the samples are from, in words
 
 
+def axes_of(configured: ConfiguredArm, counts: Sequence[int]) -> list[np.ndarray]:
+    """Return `counts` (3,) angles in rad of joints 2 to 4, evenly spaced from one limit of the joint to the other."""
+    box = zip(configured.low[1:], configured.high[1:], counts, strict=True)
+    return [np.linspace(low, high, count) for low, high, count in box]
+
+
 def from_gravload(configured: ConfiguredArm) -> Samples:
-    """Return the upright arm's torques by the Robotics Toolbox, on the grid and half-way between its positions."""
-    low, high = configured.low[1:], configured.high[1:]
-    axes = [np.linspace(a, b, count) for a, b, count in zip(low, high, GRID, strict=True)]
+    """Return the upright arm's torques by the Robotics Toolbox at the paper's positions, and half-way between them."""
+    axes = axes_of(configured, GRID)
     reference = gravload(replace(configured.robot, gain=np.ones(4)))
-
-    def torques(angle: np.ndarray) -> np.ndarray:
-        theta = np.column_stack((np.zeros(len(angle)), angle))
-        return reference(theta, np.tile((0.0, 0.0, 1.0), (len(theta), 1)))[:, 1:]
-
-    angle = np.array(list(product(*axes)))
-    between = np.array(list(product(*((axis[1:] + axis[:-1]) / 2 for axis in axes))))
-    source = f"gravload of the Robotics Toolbox, {len(angle)} positions"
-    return Samples(angle, torques(angle), between, torques(between), low, high, source)
+    middles = [(axis[1:] + axis[:-1]) / 2 for axis in axes]
+    theta, between = (np.array(list(product((0.0,), *angles))) for angles in (axes, middles))
+    torque, torque_between = (reference(at, np.tile((0.0, 0.0, 1.0), (len(at), 1)))[:, 1:] for at in (theta, between))
+    box, source = (configured.low[1:], configured.high[1:]), f"gravload of the Robotics Toolbox, {len(theta)} positions"
+    return Samples(theta[:, 1:], torque, between[:, 1:], torque_between, *box, source)
 
 
 def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Samples:
-    """Return the mean measured torque of each hold of a rosbag2 during which the trunk was upright.
+    """Return the mean measured torque of each hold of a rosbag2 with an upright trunk; every fifth is held out.
 
     The box spans the held poses within the joint limits. Raises DataError, one sentence, if they are too few for
     `functions` membership functions per input.
@@ -82,8 +82,8 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     tilted = np.array([stamp - bag.start / 1e9 for stamp, tilt in tilts if not tilt.axis_angle <= UPRIGHT])
     holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
     spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
-    angle = np.array([hold.pose for hold in holds]).reshape(-1, JOINT_COUNT)
-    torque = np.array([recording.effort[span].mean(axis=0) for span in spans]).reshape(-1, JOINT_COUNT)
+    angle = np.reshape([hold.pose for hold in holds], (-1, JOINT_COUNT))
+    torque = np.reshape([recording.effort[span].mean(axis=0) for span in spans], (-1, JOINT_COUNT))
     kept = np.all(np.isfinite(torque) & (angle >= configured.low) & (angle <= configured.high), axis=1)
     angle, torque = angle[kept, 1:], torque[kept, 1:]
     checked = np.arange(len(angle)) % HELD_OUT == HELD_OUT - 1

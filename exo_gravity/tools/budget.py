@@ -8,17 +8,15 @@ Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong us
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import ExoGravityError, named
+from exo_gravity.core.errors import named
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.budget import (
     USUAL_TILT,
@@ -27,13 +25,12 @@ from exo_gravity.core.model.budget import (
     largest_support,
     motor_for,
     motor_torques,
-    rounded_down,
     torque_at,
     workspace,
 )
 from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
-from exo_gravity.core.numbers import one_float
-from exo_gravity.tools.cli import missing
+from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.tools.cli import exit_code
 from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms
 
 if TYPE_CHECKING:
@@ -58,7 +55,6 @@ class ArmBudget:
     name: str  #: of the arm's namespace
     carrying: ArmModel  #: with its share of the wearer's arm
     support: float  #: 0..1, that share
-    payload: float  #: kg in the hand
     motors: Sequence[str]
     bounds: np.ndarray  #: of its workspace, (2, 6) rad
     joints: tuple[JointBudget, ...]
@@ -69,9 +65,7 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(
-    configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float = 0.0
-) -> ArmBudget:
+def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
     max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
@@ -84,12 +78,11 @@ def arm_budget(
         torques = motor_torques(motors, configured.can_bridge["torque_scale"])
         joints = budget(robot, load, support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, carrying, support, payload, motors, bounds, joints)
+    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
     """Yield the lines of a table with one row per joint."""
-    yield f"{arm.name} at support {arm.support:g}, trunk tilt up to {math.degrees(arm.bounds[1, 4]):g} deg"
     yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
@@ -99,54 +92,29 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
             f"{joint.rated:.3g}",
             f"{joint.peak:.3g}",
             f"{joint.torque:.2f}",
-            f"{100 * rounded_down(joint.within_rated):.1f} %",
-            f"{100 * rounded_down(joint.within_peak):.1f} %",
+            f"{100 * joint.within_rated:.1f} %",
+            f"{100 * joint.within_peak:.1f} %",
             f"{', '.join(pose)}; {pitch}, {roll}",
-            "none" if joint.support is None else f"{rounded_down(joint.support):.3f}",
+            "none" if joint.support is None else f"{joint.support:.3f}",
             motor_for(joint.torque) or "none",
         )
 
 
-def _mirrored(arms: Sequence[ArmBudget]) -> list[ArmBudget]:
-    """Return the arms whose tables differ; one table names all arms that share it."""
-    tables: dict[tuple[str, ...], ArmBudget] = {}
-    for arm in arms:
-        table = tuple(table_lines(replace(arm, name="")))
-        tables[table] = replace(arm, name=f"{tables[table].name} and {arm.name}") if table in tables else arm
-    return list(tables.values())
-
-
-def verdict(arm: ArmBudget, wearer: Wearer) -> Iterator[str]:
-    """Yield the conclusion: whether it is beyond the motors, which support fits, and can_bridge's parameter for it."""
-    support = "Full Zero-G" if arm.support == 1.0 else f"Support {arm.support:g}"
-    held = f" with {arm.payload:g} kg in the hand" if arm.payload else ""
-    what = f"{support} of a wearer of {wearer.body_mass:g} kg{held}"
+def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
+    """Yield the conclusion on `what` the arms `names` carry, the support that fits, and can_bridge's parameter."""
     if arm.is_beyond:
-        yield f"{what} is beyond the motors of {arm.name}."
+        yield f"{what} is beyond the motors of {names}."
         yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
         yield "The wearer can hardly move an AK80-64 by hand: its gear is 64:1."
     else:
-        yield f"{what} is within rated torque everywhere on {arm.name}."
+        yield f"{what} is within rated torque everywhere on {names}."
     fits = largest_support(arm.joints)
     if fits is None:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
     else:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
-    yield f"For the can_bridge of {arm.name}, if it never carries more: largest_moment: [{moments}]  # kg m"
-
-
-def _write_figures(arms: Sequence[ArmBudget], folder: Path) -> str:
-    """Draw a figure of each joint into `folder`; return a line on what was written."""
-    if not find_spec("matplotlib"):
-        return f"No figures: {missing('matplotlib', 'report')}"
-    names = []
-    folder.mkdir(parents=True, exist_ok=True)
-    for arm in arms:
-        for joint in range(len(arm.joints)):
-            names.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-            _joint_figure(arm, joint).savefig(folder / names[-1], dpi=DPI)
-    return f"Written: {', '.join(names)} in {folder}"
+    yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
 
 
 def _joint_figure(arm: ArmBudget, joint: int) -> "Figure":
@@ -196,22 +164,34 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code."""
-    options = _arguments(args)
-    try:
-        wearer = Wearer(options.body_mass, options.sex, options.table, options.lengths)
-        support = one_float("support", options.support, 0.0, 1.0)
-        tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
-        arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
-        written = _write_figures(arms, Path(options.output))
-    except (ExoGravityError, OSError) as error:
-        print(f"budget: {error}", file=sys.stderr)
-        return 2
+def _run(options: argparse.Namespace) -> int:
+    """Draw a figure of each joint, and print the budget of each arm; return 1 if a motor is overloaded somewhere."""
+    wearer = Wearer(options.body_mass, options.sex, options.table, options.lengths)
+    support = one_float("support", options.support, 0.0, 1.0)
+    tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
+    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
+    folder, written = Path(options.output), []
+    folder.mkdir(parents=True, exist_ok=True)
+    for arm, joint in product(arms, range(JOINT_COUNT)):
+        written.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
+        _joint_figure(arm, joint).savefig(folder / written[-1], dpi=DPI)
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
-    for alike in _mirrored(arms):
-        print("", *table_lines(alike), "", *verdict(alike, wearer), sep="\n")
-    print(f"\n{written}")
+    zero_g = "Full Zero-G" if support == 1.0 else f"Support {support:g}"
+    held = f" with {options.payload:g} kg in the hand" if options.payload else ""
+    alike: dict[str, list[ArmBudget]] = {}  # one table names all arms that share it, as mirrored ones do
+    for arm in arms:
+        alike.setdefault("\n".join(table_lines(arm)), []).append(arm)
+    for table, (arm, *others) in alike.items():
+        names = " and ".join(one.name for one in (arm, *others))
+        print(f"\n{names} at support {support:g}, trunk tilt up to {options.max_tilt:g} deg", table, "", sep="\n")
+        print(*verdict(arm, names, f"{zero_g} of a wearer of {wearer.body_mass:g} kg{held}"), sep="\n")
+    print(f"\nWritten: {', '.join(written)} in {folder}")
     return int(any(arm.is_beyond for arm in arms))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
+    options = _arguments(args)
+    return exit_code("budget", "report", lambda: _run(options))

@@ -7,9 +7,11 @@ without them, and a missing one ends the tool with one line instead of a traceba
 import argparse
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
+
+from exo_gravity.core.errors import ExoGravityError
 
 # Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
 APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl", "yaml")
@@ -43,6 +45,16 @@ def extras(tool: str, extra: str) -> Iterator[None]:
             raise  # not a package that an extra installs
         print(f"{tool}: {missing(error.name, extra)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
+    """Return the exit code of `work`; where that raises an error, print it as one line and return 2."""
+    try:
+        with extras(tool, extra):
+            return work()
+    except (ExoGravityError, OSError) as error:
+        print(f"{tool}: {error}", file=sys.stderr)
+        return 2
 
 
 def require_ros(tool: str) -> None:

@@ -1,16 +1,15 @@
 """The paper's comparison: every law against every reference, the checks of the result, its tables, CSV and figures.
 
-Each arm is compared over the 1,053 positions with an upright trunk, and over random poses whose pitch and sideways tilt
-are uniform within a limit. The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the
-compensator.
+The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the compensator.
 """
 
 import csv
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from itertools import groupby, product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -22,7 +21,7 @@ from exo_gravity.core.model.anfis import AnfisLaw
 from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.model.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.anfis import GRID, Trained, from_gravload, rms, train_law
+from exo_gravity.tools.anfis import GRID, Trained, axes_of, from_gravload, rms, train_law
 from exo_gravity.tools.inputs.arms import ConfiguredArm
 from exo_gravity.tools.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload
 from exo_gravity.tools.reporting.html import JOINT_COLOURS, make_plain
@@ -32,8 +31,9 @@ ROUNDING = 1e-12  # Nm; the exact law may differ this much from a reference
 LINK_ENDS, CONFIGURED = "at the link ends", "as configured"
 FLOOR, CEILING = 1e-7, 1.0  # Nm, ends of the colour scale
 FIGURE_GRID = (56, 56, 7)  # positions of joints 2, 3, 4 in the workspace figure
+COLUMNS = ("cog", "positions", "limit", "count", "law", "reference", "joint", "rmse", "largest", "rms_torque")
 # Overlapping lines stay visible, because the first are wider.
-STYLES = {"EQ2-EQ5": "s-", "EQ1m-EQ4m": "D-", "ANFIS": "^--", "exact": "o-"}
+STYLES = {"EQ2-EQ5": ("s-", 4.0), "EQ1m-EQ4m": ("D-", 2.0), "ANFIS": ("^--", 1.5), "exact": ("o-", 1.5)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,25 +64,23 @@ class Case:
         }
 
 
-@dataclass(frozen=True)
-class Row:
-    """The error in Nm of `law` against `reference` on one joint (1..4) over the `count` poses of a case."""
+class Row(NamedTuple):
+    """The error in Nm of `law` against `reference` over the poses of a case."""
 
     cog: str
     positions: str
     limit: int
-    count: int
+    poses: int  #: how many
     law: str
     reference: str
-    joint: int
-    rmse: float
-    largest: float
-    rms_torque: float
+    rmse: np.ndarray  #: (4,) Nm, of each joint
+    largest: np.ndarray  #: (4,) Nm
+    rms_torque: np.ndarray  #: (4,) Nm, of the reference
 
 
 def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
     """Yield the 1,053 positions, then `count` random poses for each of `TILTS`."""
-    yield _upright(cog, configured, GRID)[0]
+    yield _upright(cog, configured, axes_of(configured, GRID))
     for limit in TILTS:
         rng, bound = np.random.default_rng(limit), math.radians(limit)
         theta = rng.uniform(configured.low, configured.high, (count, 4))
@@ -90,24 +88,17 @@ def cases(cog: str, configured: ConfiguredArm, count: int) -> Iterator[Case]:
         yield Case(cog, "random", limit, configured.robot, theta, tilts)
 
 
-def _upright(cog: str, configured: ConfiguredArm, counts: Sequence[int]) -> tuple[Case, list[np.ndarray]]:
-    """Return a grid of positions of joints 2 to 4 with the trunk upright, and the angles of each joint."""
-    box = zip(configured.low[1:], configured.high[1:], counts, strict=True)
-    angles = [np.linspace(low, high, n) for low, high, n in box]
-    theta = np.array(list(product((0.0,), *angles)))
-    return Case(cog, "workspace", 0, configured.robot, theta, [Tilt.of(configured.side)] * len(theta)), angles
+def _upright(cog: str, configured: ConfiguredArm, axes: Sequence[np.ndarray]) -> Case:
+    """Return every combination of the angles `axes` of joints 2 to 4, with the trunk upright."""
+    theta = np.array(list(product((0.0,), *axes)))
+    return Case(cog, "workspace", 0, configured.robot, theta, [Tilt.of(configured.side)] * len(theta))
 
 
-def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> list[Row]:
-    """Return a row per law and joint; torque: of each law (n, 4) Nm; expected: of the reference (n, 4) Nm."""
-    rows = []
+def compare(case: Case, torque: dict[str, np.ndarray], reference: str, expected: np.ndarray) -> Iterator[Row]:
+    """Yield a row for each law; torque: of each law (n, 4) Nm; expected: of the reference (n, 4) Nm."""
     for law, given in torque.items():
-        error = given - expected
-        figures = zip(rms(error), np.abs(error).max(axis=0), rms(expected), strict=True)
-        for joint, numbers in enumerate(figures, start=1):
-            head = case.cog, case.positions, case.limit, len(case.theta), law, reference, joint
-            rows.append(Row(*head, *map(float, numbers)))
-    return rows
+        error, head = given - expected, (case.cog, case.positions, case.limit, len(case.theta))
+        yield Row(*head, law, reference, rms(error), np.abs(error).max(axis=0), rms(expected))
 
 
 @dataclass(frozen=True)
@@ -125,23 +116,23 @@ def evaluate(cog: str, configured: ConfiguredArm, count: int) -> Part:
     references = {name: build(configured.robot) for name, build in REFERENCES.items()}
     law, trained = train_law(from_gravload(configured), configured.robot)
     rows: list[Row] = []
-    runs = list(product(cases(cog, configured, count), references))
-    for case, name in track(runs, f"comparing, CoGs {cog}", console=Console(stderr=True), transient=True):
-        rows += compare(case, case.torques(law), name, references[name](case.theta, case.direction))
+    runs = list(cases(cog, configured, count))
+    for case in track(runs, f"comparing, CoGs {cog}", console=Console(stderr=True), transient=True):
+        torque = case.torques(law)
+        for name, reference in references.items():
+            rows += compare(case, torque, name, reference(case.theta, case.direction))
     return Part(configured, rows, law, trained)
 
 
 def checks(link_ends: Part, as_configured: Part) -> Iterator[tuple[bool, str]]:
     """Yield (held, sentence) for each check; link_ends: the results under the paper's assumption d_n = l_n."""
     exact = [row for row in link_ends.rows + as_configured.rows if row.law == "exact"]
-    largest = max(row.largest for row in exact)
-    compared = sum(row.count for row in exact if row.joint == 1)
+    largest = max(row.largest.max() for row in exact)
+    compared = sum(row.poses for row in exact)
     names = " and ".join(REFERENCES)
-    yield (
-        largest <= ROUNDING,
-        f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons: largest {largest:.1e} Nm",
-    )
-    largest = max(row.largest for row in link_ends.rows if row.law.startswith("EQ") and not row.limit)
+    within = f"exact law within {ROUNDING:g} Nm of {names} in {compared:,} comparisons"
+    yield largest <= ROUNDING, f"{within}: largest {largest:.1e} Nm"
+    largest = max(row.largest.max() for row in link_ends.rows if row.law.startswith("EQ") and not row.limit)
     yield largest <= ROUNDING, f"EQ2-EQ5 and EQ1m-EQ4m too, with d_n = l_n, trunk upright: largest {largest:.1e} Nm"
     for kind, where in (("training", "at the training positions"), ("held_out", "between them")):
         ratios = [paper / ours for ours, paper in zip(link_ends.law.error[kind], PAPER_ANFIS, strict=True)]
@@ -153,22 +144,19 @@ def tables(link_ends: Part, as_configured: Part) -> Iterator[str]:
     """Yield the lines of all tables."""
     yield f"{'RMSE of law - reference, Nm':<28}" + "".join(f"{f'joint {joint}':>10}" for joint in range(1, 5))
     rows = link_ends.rows + as_configured.rows
-    for (cog, positions, limit, count), case in groupby(rows, lambda r: (r.cog, r.positions, r.limit, r.count)):
+    for (cog, positions, limit, count), case in groupby(rows, lambda row: row[:4]):
         tilt = f"trunk tilted by up to {limit} degrees" if limit else "trunk upright"
         yield f"CoGs {cog}; {count:,} {positions} positions; {tilt}"
-        for (law, reference), line in groupby(case, lambda r: (r.law, r.reference)):
-            if reference == "gravload" or law == "exact":
-                yield f"{f'  {law} - {reference}':<28}" + "".join(f"{row.rmse:>10.1e}" for row in line)
+        for row in case:
+            if row.reference == "gravload" or row.law == "exact":
+                yield f"{f'  {row.law} - {row.reference}':<28}" + "".join(f"{value:>10.1e}" for value in row.rmse)
     yield "\nThe paper's comparison (d_n = l_n, g = 9.8 m/s^2, torques in Nm, not scaled)"
     yield from _paper_table(link_ends)
 
 
 def _paper_table(part: Part) -> Iterator[str]:
     """Yield the lines of the paper's comparison, its figures next to ours; part: with its assumption d_n = l_n."""
-    ours = {
-        name: [r.rmse for r in part.rows if (r.positions, r.law, r.reference) == ("workspace", name, "gravload")]
-        for name in ("exact", "EQ2-EQ5")
-    }
+    ours = {row.law: row.rmse for row in part.rows if (row.positions, row.reference) == ("workspace", "gravload")}
     seconds = f"{sum(result.seconds for result in part.trained):.1f} s for all three"
     yield f"{'RMSE against gravload in Nm':<34}{'joint 2':>10}{'joint 3':>10}{'joint 4':>10}   training"
     for name, values, training in (
@@ -186,7 +174,11 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
     """Write the rows as CSV, one column per field in Nm (`limit` in degrees), and the figures; return the names."""
     rows = link_ends.rows + as_configured.rows
     with (output / "laws.csv").open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([[field.name for field in fields(Row)], *map(astuple, rows)])
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        for *head, rmse, largest, rms_torque in rows:
+            numbers = zip(rmse.tolist(), largest.tolist(), rms_torque.tolist(), strict=True)
+            writer.writerows((*head, joint, *line) for joint, line in enumerate(numbers, start=1))
     _workspace_figure(as_configured).savefig(output / "workspace.png", dpi=130)
     _tilt_figure(rows).savefig(output / "tilt.png", dpi=130)
     return ["laws.csv", "workspace.png", "tilt.png"]
@@ -194,7 +186,8 @@ def write(link_ends: Part, as_configured: Part, output: Path) -> list[str]:
 
 def _workspace_figure(part: Part) -> Figure:
     """Draw the RMSE over the elbow of joints 2 to 4 (rows) and each law (columns) over abduction and flexion."""
-    case, (abduction, flexion, _) = _upright(CONFIGURED, part.configured, FIGURE_GRID)
+    axes = axes_of(part.configured, FIGURE_GRID)
+    case, (abduction, flexion) = _upright(CONFIGURED, part.configured, axes), map(np.degrees, axes[:2])
     expected, torques = gravload(case.arm)(case.theta, case.direction), case.torques(part.law)
     figure = Figure(figsize=(3.2 * len(torques) + 1.6, 8.4), layout="constrained")
     grid = figure.subplots(3, len(torques), sharex=True, sharey=True)
@@ -202,7 +195,7 @@ def _workspace_figure(part: Part) -> Figure:
         error = rms(np.moveaxis((torque - expected).reshape(*FIGURE_GRID, 4), 2, 0))
         for joint, axis in enumerate(column, start=2):
             image = axis.pcolormesh(
-                np.degrees(abduction), np.degrees(flexion), np.clip(error[..., joint - 1].T, FLOOR, CEILING),
+                abduction, flexion, np.clip(error[..., joint - 1].T, FLOOR, CEILING),
                 norm=LogNorm(FLOOR, CEILING), cmap="viridis", rasterized=True,
             )  # fmt: skip
             axis.set_title(f"{name}: joint {joint}", fontsize=10)
@@ -215,14 +208,15 @@ def _workspace_figure(part: Part) -> Figure:
 
 def _tilt_figure(rows: Sequence[Row]) -> Figure:
     """Draw the RMSE of each law over the tilt limit: one column per joint, one row per set of centres of gravity."""
-    rows = [row for row in rows if row.positions == "random" and row.reference == "gravload"]
     figure = Figure(figsize=(13, 6.4), layout="constrained")
     grid = figure.subplots(2, 4, sharex=True, sharey="col")
     for cog, line in zip((LINK_ENDS, CONFIGURED), grid, strict=True):
+        for (law, (style, width)), colour in zip(STYLES.items(), JOINT_COLOURS, strict=True):
+            chosen = ("random", cog, law, "gravload")
+            rmse = [row.rmse for row in rows if (row.positions, row.cog, row.law, row.reference) == chosen]
+            for axis, values in zip(line, np.transpose(rmse), strict=True):
+                axis.plot(TILTS, values, style, color=colour, label=law, linewidth=width)
         for joint, axis in enumerate(line, start=1):
-            for (law, style), width, colour in zip(STYLES.items(), (4, 2, 1.5, 1.5), JOINT_COLOURS, strict=True):
-                chosen = [(row.limit, row.rmse) for row in rows if (row.cog, row.joint, row.law) == (cog, joint, law)]
-                axis.plot(*zip(*chosen, strict=True), style, color=colour, label=law, linewidth=width)
             axis.set_title(f"joint {joint}, CoGs {cog}", fontsize=10)
             make_plain(axis)
     figure.supxlabel("Tilt up to (deg)")

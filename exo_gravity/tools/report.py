@@ -8,13 +8,11 @@ use, or part of the recording could not be read; the rest is reported first.
 
 import argparse
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
-from exo_gravity.tools.cli import extras, non_negative
+from exo_gravity.tools.cli import exit_code, non_negative
 from exo_gravity.tools.reporting import video
 
 
@@ -29,14 +27,13 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
     formats = "also write each figure in this format; twice for both"
     option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
-
-    def limit(name: str, default: float, unit: str, description: str) -> None:
+    for name, default, unit, description in (
+        ("--max-drift", 0.5, "DEG", "drift allowed within any 10 s of a hold (%(default)s)"),
+        ("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)"),
+        ("--max-rate", math.inf, "DEG/MIN", "drift rate allowed over a whole hold (no limit)"),
+        ("--min-hold", MIN_HOLD, "S", "shortest still phase that is a hold (%(default)s)"),
+    ):
         option(name, type=non_negative, default=default, metavar=unit, help=description)
-
-    limit("--max-drift", 0.5, "DEG", "drift allowed within any 10 s of a hold (%(default)s)")
-    limit("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)")
-    limit("--max-rate", math.inf, "DEG/MIN", "drift rate allowed over a whole hold (no limit)")
-    limit("--min-hold", MIN_HOLD, "S", "shortest still phase that is a hold (%(default)s)")
     video.add_arguments(parser)
     return parser.parse_args(args)
 
@@ -44,21 +41,17 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
-    with extras("report", "report"):
-        return _repair(Path(options.bag)) if options.repair else _run(options)
+    return exit_code("report", "report", lambda: (_repair if options.repair else _run)(options))
 
 
-def _repair(path: Path) -> int:
+def _repair(options: argparse.Namespace) -> int:
     from exo_gravity.bag.writer import is_complete, repair
 
-    try:
-        if is_complete(path):
-            print(f"{path} is complete: nothing to repair")
-            return 0
-        folder, count = repair(path)
-    except DataError as error:
-        print(f"report: {error}", file=sys.stderr)
-        return 2
+    path = Path(options.bag)
+    if is_complete(path):
+        print(f"{path} is complete: nothing to repair")
+        return 0
+    folder, count = repair(path)
     print(f"Written: {folder}, complete, with {count} messages")
     return 0
 
@@ -75,18 +68,14 @@ def _run(options: argparse.Namespace) -> int:
         max_rate=math.radians(options.max_rate) / 60.0,
     )
     path, screen = Path(options.bag), Console(stderr=True)
-    try:
-        clip = video.requested(options.video, options.video_speed)
-        with screen.status(f"reading {path.name}"):
-            bag = read_bag(path)
-        report = trial_report.analyse(bag, criteria, options.min_hold)
-        beside = path.resolve().with_name(f"{path.resolve().stem}_report")
-        written = trial_report.write(report, options.output or beside, options.figures, options.csv)
-        if clip:
-            video.write(bag, clip, screen)
-    except (ExoGravityError, OSError) as error:
-        print(f"report: {error}", file=sys.stderr)
-        return 2
+    clip = video.requested(options.video, options.video_speed)
+    with screen.status(f"reading {path.name}"):
+        bag = read_bag(path)
+    report = trial_report.analyse(bag, criteria, options.min_hold)
+    beside = path.resolve().with_name(f"{path.resolve().stem}_report")
+    written = trial_report.write(report, options.output or beside, options.figures, options.csv)
+    if clip:
+        video.write(bag, clip, screen)
     trial_report.print_report(report)
     print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}")
     return report.exit_code

@@ -7,14 +7,12 @@ Exit code 0: saved. 2: wrong use, wrong file, or too few samples.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.anfis import JOINTS
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.tools.cli import extras
+from exo_gravity.tools.cli import exit_code
 from exo_gravity.tools.inputs.arms import configured_arm
 from exo_gravity.tools.inputs.references import PAPER_ANFIS
 
@@ -33,8 +31,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def _run(options: argparse.Namespace) -> None:
-    """Train, save the law and print its errors."""
+def _run(options: argparse.Namespace) -> int:
+    """Train, save the law and print its errors; return 0."""
     from exo_gravity.tools.anfis import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)
@@ -53,14 +51,10 @@ def _run(options: argparse.Namespace) -> None:
         figures = f"{law.error['training'][i]:>13.2e} Nm{law.error['held_out'][i]:>13.2e} Nm{PAPER_ANFIS[i]:>13.2e} Nm"
         print(f"{joint:<6}{figures}{result.evaluations:>8}{result.seconds:>7.1f} s")
     print(f"saved {output}; it gives joint 1 no torque, which needs none while the trunk is upright")
+    return 0
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Entry point of the executable `train_anfis`."""
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
     options = _arguments(args)
-    try:
-        with extras("train_anfis", "report,validate"):
-            _run(options)
-    except (ExoGravityError, OSError) as error:
-        print(f"train_anfis: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+    return exit_code("train_anfis", "report,validate", lambda: _run(options))

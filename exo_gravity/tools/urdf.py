@@ -7,13 +7,13 @@ Exit code 0: written. 2: wrong use or wrong file.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError, named
+from exo_gravity.core.errors import named
 from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.view.urdf import described, urdf
+from exo_gravity.tools.cli import exit_code
 from exo_gravity.tools.inputs.arms import configured_arm, configured_arms
 
 
@@ -34,16 +34,16 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
+def _run(options: argparse.Namespace) -> int:
+    text = urdf_of(options.params, options.side, options.meshes)
+    if options.output:
+        Path(options.output).write_text(text, encoding="utf-8")
+    else:
+        print(text, end="")
+    return 0
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
-    try:
-        text = urdf_of(options.params, options.side, options.meshes)
-        if options.output:
-            Path(options.output).write_text(text, encoding="utf-8")
-        else:
-            print(text, end="")
-    except (ExoGravityError, OSError) as error:
-        print(f"urdf: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code("urdf", "report", lambda: _run(options))

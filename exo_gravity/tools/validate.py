@@ -8,14 +8,12 @@ Exit code 0: all checks held. 1: a check failed. 2: wrong use or wrong file.
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.tools.cli import extras
+from exo_gravity.tools.cli import exit_code
 from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt
@@ -31,8 +29,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(args)
 
 
-def _run(options: argparse.Namespace) -> bool:
-    """Run the comparison and print it; return whether all checks held."""
+def _run(options: argparse.Namespace) -> int:
+    """Run the comparison and print it; return 1 unless all checks held."""
     from exo_gravity.tools.comparison import CONFIGURED, LINK_ENDS, checks, evaluate, tables, write
 
     configured = configured_arm(options.params, options.side)
@@ -47,16 +45,10 @@ def _run(options: argparse.Namespace) -> bool:
     for held, sentence in verdicts:
         print(f"{'held' if held else 'FAILED':<7}{sentence}")
     print(f"Written: {', '.join(written)} in {output}")
-    return all(held for held, _ in verdicts)
+    return int(not all(held for held, _ in verdicts))
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Entry point of the executable `validate`."""
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code."""
     options = _arguments(args)
-    try:
-        with extras("validate", "report,validate"):
-            held = _run(options)
-    except (ExoGravityError, OSError) as error:
-        print(f"validate: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    raise SystemExit(0 if held else 1)
+    return exit_code("validate", "report,validate", lambda: _run(options))

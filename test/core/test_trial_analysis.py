@@ -269,3 +269,14 @@ def test_an_arm_that_was_never_carried_fails():
 def test_a_recording_without_a_hold_fails():
     moving = recording(smooth(POSE_A, POSE_B, 2.0))
     assert "never still" in failures(moving, analyse(moving), HoldCriteria())[0]
+
+
+def test_joints_are_put_in_the_order_asked_for_and_others_are_refused_by_name():
+    whole = two_poses()
+    names = whole.joint_names[::-1]
+    turned = whole.in_order(names)
+    assert turned.joint_names == names
+    for field in ("position", "velocity", "effort", "command"):
+        np.testing.assert_array_equal(getattr(turned, field), getattr(whole, field)[:, ::-1])
+    with pytest.raises(DataError, match="must be a, b, c, d"):
+        whole.in_order(("a", "b", "c", "d"))

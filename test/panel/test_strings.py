@@ -6,7 +6,7 @@ from pathlib import Path
 
 import exo_gravity.panel
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.trial.script import HANDS, TIMED, TURNS
+from exo_gravity.core.trial.script import TIMED, VALUED
 
 FOLDER = Path(exo_gravity.panel.__file__).parent
 CONTENT = json.loads((FOLDER / "strings.json").read_text(encoding="utf-8"))
@@ -24,7 +24,7 @@ def test_every_text_exists_in_every_language_with_the_same_values():
 def test_every_fault_state_and_step_of_a_trial_has_its_texts():
     assert {f"fault.{code}" for code in FaultCode} <= TEXTS.keys()
     assert {f"{kind}.{state.value}" for kind in ("state", "sentence") for state in State} <= TEXTS.keys()
-    assert {f"step.{action}" for action in (*TIMED, *TURNS, *HANDS, "move", "push")} <= TEXTS.keys()
+    assert {f"step.{action}" for action in (*TIMED, *VALUED)} <= TEXTS.keys()
 
 
 def test_the_page_asks_for_texts_that_exist():

@@ -16,9 +16,9 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.tools import launcher
 from exo_gravity.tools.inputs.parameter_file import load, stages
 from exo_gravity.tools.launcher import (
-    Launcher,
     chosen,
     command_of,
     in_namespace,

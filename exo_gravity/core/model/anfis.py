@@ -6,10 +6,9 @@ strength w of a rule is the product of its memberships, its consequent is f = p_
 output is sum(w f) / sum(w). On a grid partition sum(w) is the product of one sum per input. The memberships of each
 input can therefore be normalised separately, and the sum over the rules taken one input at a time.
 
-`AnfisLaw` is a control law of such models: learned torques for joints 2 to 4, valid inside the box of joint angles it
-was trained in, for one arm with an upright trunk. There joint 1 needs no torque, and the law gives it none. Outside the
-box, on a tilted trunk or with another arm the model would extrapolate with an unknown error. `outside` then returns the
-reason, and the caller uses the exact law instead. Gains c_n and gravity scale the torque as in every other law.
+`AnfisLaw` is a control law of such models. Outside the box of joint angles it was trained in, on a tilted trunk or with
+another arm it would extrapolate with an unknown error: `outside` then returns the reason, and the caller uses the exact
+law instead. An upright trunk needs no torque of joint 1. Gains c_n and gravity scale the torque as in every other law.
 """
 
 import json

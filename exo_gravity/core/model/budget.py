@@ -55,14 +55,7 @@ def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np
 
     position_min, position_max: the joint limits, (4,) rad. max_tilt: of the trunk, in either direction, rad.
     """
-    tilt = np.repeat(max_tilt, 2)
-    return np.array((np.append(position_min, -tilt), np.append(position_max, tilt)))
-
-
-def random_points(bounds: np.ndarray, count: int = SAMPLES) -> np.ndarray:
-    """Return points (count, 6), uniform over the workspace `bounds` (2, 6) and the same in every call."""
-    low, high = bounds
-    return np.random.default_rng(0).uniform(low, high, (count, JOINT_COUNT + 2))
+    return np.array(((*position_min, -max_tilt, -max_tilt), (*position_max, max_tilt, max_tilt)))
 
 
 @dataclass(frozen=True)
@@ -73,19 +66,20 @@ class JointBudget:
     peak: float  #: Nm
     torque: float  #: Nm, the largest needed in the workspace
     worst: np.ndarray  #: (6,) rad, the pose and the trunk's pitch and roll at which it is needed
-    within_rated: float  #: share 0..1 of the workspace in which the motor stays within its rated torque
+    within_rated: float  #: share 0..1 of the workspace in which the motor stays within its rated torque, rounded down
     within_peak: float  #: the same for peak torque
-    #: the largest support 0..1 at which the joint stays within rated torque everywhere; None: the robot needs more
+    #: the largest support 0..1 at which the joint stays within rated torque everywhere, rounded down; None: the robot
+    #: alone needs more
     support: float | None
 
 
 def largest_support(joints: Sequence[JointBudget]) -> float | None:
-    """Return the largest support 0..1 that keeps all joints within rated torque, rounded down; None if none does."""
+    """Return the largest support 0..1 that keeps all joints within rated torque; None if none does."""
     supports = [joint.support for joint in joints if joint.support is not None]
-    return rounded_down(min(supports)) if len(supports) == len(joints) else None
+    return min(supports) if len(supports) == len(joints) else None
 
 
-def rounded_down(share: float) -> float:
+def _rounded_down(share: float) -> float:
     """Return a share rounded down to a thousandth, so that the rounded value is still within the limit."""
     return math.floor(1000 * share + 1e-9) / 1000
 
@@ -124,10 +118,9 @@ def budget(
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
-    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`.
-    bounds: of the workspace, (2, 6) rad.
-    rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk of about a millisecond of
-    computation. Raises ParameterError if the load does not fit the robot.
+    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. bounds:
+    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk
+    of about a millisecond of computation. Raises ParameterError if the load does not fit the robot.
     """
     full = robot.with_wearer(*load)
 
@@ -140,7 +133,7 @@ def budget(
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
         return own, with_all - own
 
-    points = random_points(bounds)
+    points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
 
     def need(at: np.ndarray) -> np.ndarray:
@@ -156,16 +149,15 @@ def budget(
 
     needs, shortages = need(starts), shortage(starts)
     joints = []
-    for joint, limits in enumerate(zip(rated, peak, strict=True)):
+    for joint, limits in enumerate(zip(map(float, rated), map(float, peak), strict=True)):
         worst, torque = _worst(need, joint, bounds, starts, needs[:, joint])
         _, short = _worst(shortage, joint, bounds, starts, shortages[:, joint])
         # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
         low, high = (
-            min(float(np.mean(needs[-len(points) :, joint] <= limit)), 0.9999 if torque > limit else 1.0)
+            _rounded_down(min(float(np.mean(needs[-SAMPLES:, joint] <= limit)), 0.9999 if torque > limit else 1.0))
             for limit in limits
         )
-        largest = None if short > 0.0 else -short
-        joints.append(JointBudget(float(limits[0]), float(limits[1]), torque, worst, low, high, largest))
+        joints.append(JointBudget(*limits, torque, worst, low, high, None if short > 0.0 else _rounded_down(-short)))
     return tuple(joints)
 
 

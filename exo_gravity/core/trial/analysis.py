@@ -222,6 +222,14 @@ class HoldCriteria:
     #: s, shortest hold that is judged by its rate: over a shorter one, a single position code is already a large rate
     rated_from: float = 0.0
 
+    def stray_allowed(self, hold: Hold) -> float:
+        """Return how far a joint may stray within any 10 s of `hold`, rad."""
+        return self.max_stray_after_push if hold.after == "push" else self.max_stray
+
+    def stayed(self, release: Release) -> bool:
+        """Return whether the arm stayed where it was let go; after a push it may move."""
+        return release.after == "push" or bool(np.max(np.abs(release.offset)) <= self.max_offset)
+
 
 def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> list[str]:
     """Return one sentence for each criterion that the arm failed; an empty list if it held."""
@@ -230,7 +238,7 @@ def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria)
         never = "carried" if recording.carried == () else "still for long enough to count as a hold"
         found.append(f"the arm was never {never}")
     for hold in trial.holds:
-        most = criteria.max_stray_after_push if hold.after == "push" else criteria.max_stray
+        most = criteria.stray_allowed(hold)
         for name, stray, rate in zip(recording.joint_names, hold.stray, hold.drift_rate, strict=True):
             where = f"{hold.start:.1f}-{hold.end:.1f} s: {name}"
             if stray > most:
@@ -247,7 +255,7 @@ def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria)
         where = f"{release.start:.1f}-{release.end:.1f} s: the arm"
         if not release.still:
             found.append(f"{where} was still moving at the end of a hold")
-        elif release.after != "push" and np.max(np.abs(release.offset)) > criteria.max_offset:
+        elif not criteria.stayed(release):
             found.append(f"{where} moved {_degrees(np.max(np.abs(release.offset)))} from where it was let go")
     return [f"{recording.name}: {sentence}" for sentence in found]
 

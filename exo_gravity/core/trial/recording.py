@@ -4,8 +4,8 @@ Stillness is judged from position only. Motors report velocity in steps of 22 to
 motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_SPEED` over two blocks is ten of them.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ BLOCK = 0.1  # s, the time resolution of the analysis
 STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held
 MARGIN = 0.2  # s cut off at both ends of a still span, where a smooth motion can be slower than STILL_SPEED
 
+ARRAYS = ("position", "velocity", "effort", "command")  # of a recording, (n, 4) each
 Span = tuple[float, float]  # start and end in s
 CARRIED = (State.RAMPING_IN, State.ACTIVE)  # the states of an arm's bridge in which its motors carry it
 
@@ -50,7 +51,7 @@ class Recording:
         if len(self.joint_names) != JOINT_COUNT:
             raise DataError(f"{self.name}: joints = {', '.join(self.joint_names)}: must be {JOINT_COUNT} joints")
         shape = (len(self.time), JOINT_COUNT)
-        for field in ("position", "velocity", "effort", "command"):
+        for field in ARRAYS:
             if getattr(self, field).shape != shape:
                 raise DataError(f"{self.name}: shape of {field} = {getattr(self, field).shape}: must be {shape}")
         if len(self.time) < 2:
@@ -59,6 +60,14 @@ class Recording:
             raise DataError(f"{self.name}: time decreases between two samples: must be in ascending order")
         if not np.all(np.isfinite(self.position)):
             raise DataError(f"{self.name}: position has NaN or infinite values: must be finite")
+
+    def in_order(self, joint_names: Sequence[str]) -> "Recording":
+        """Return the recording with its joints in this order. Raises DataError if they are others."""
+        if sorted(self.joint_names) != sorted(joint_names):
+            raise DataError(f"{self.name}: joints = {', '.join(self.joint_names)}: must be {', '.join(joint_names)}")
+        order = [self.joint_names.index(name) for name in joint_names]
+        arrays = {name: getattr(self, name)[:, order] for name in ARRAYS}
+        return replace(self, joint_names=tuple(joint_names), **arrays)
 
     def while_carried(self, start: float, end: float) -> Iterator[Span]:
         """Yield the parts of the span from `start` to `end` (s) in which the arm was carried."""

@@ -1,25 +1,16 @@
-"""The script of a trial: a list of timed steps for the wearer.
-
-    name: demo
-    steps:
-      - {move: [0.0, 0.5, 0.6, 0.5], over: 2.0}      bring the arm to this pose (rad), then let go
-      - {hold: 10.0}                                 leave it alone
-      - {push: [0.0, 2.0, 1.5, 1.0], over: 0.4}      push it with these joint torques (Nm)
-      - {bow: 0.5, over: 3.0}                        bow to this pitch of the trunk (rad), and leave the arm alone
-      - {lean: 0.3, over: 3.0}                       lean to this roll of the trunk (rad, to the right)
-      - {walk: 60.0}                                 walk
-      - {sit: 2.0}                                   sit down hard, and wait for the rest of the time
-      - {load: 2.0, over: 1.0}                       take 2 kg into the hand (0: let go of it), and leave the arm alone
+"""The script of a trial: a list of timed steps for the wearer, as `docs/trials.md` lists them.
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from typing import Any
+
+import numpy as np
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.model.arm import MAX_PAYLOAD
@@ -27,9 +18,14 @@ from exo_gravity.core.numbers import four_floats, one_float
 
 MAX_DURATION = 3600.0  # s
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
-TURNS = {"bow": 1.6, "lean": 0.8}  # steps that turn the trunk, and the largest angle of each in rad
-TOUCHES = {"move": (3.5, "rad"), "push": (20.0, "Nm")}  # steps that touch the arm, the largest value and its unit
-HANDS = {"load": MAX_PAYLOAD}  # steps that change what the hand holds, and the most in kg
+# Steps with one number or four: how these are checked, the least, the largest, and their unit.
+VALUED: dict[str, tuple[Callable[..., Any], float, float, str]] = {
+    "move": (four_floats, -3.5, 3.5, "rad"),
+    "push": (four_floats, -20.0, 20.0, "Nm"),
+    "bow": (one_float, -1.6, 1.6, "rad"),
+    "lean": (one_float, -0.8, 0.8, "rad"),
+    "load": (one_float, 0.0, MAX_PAYLOAD, "kg"),
+}
 TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 
 
@@ -53,15 +49,10 @@ class Step:
         name = f"{where}.{action}"
         if action in TIMED and keys == {action}:
             return cls(action, one_float(name, entry[action], TIMED[action], MAX_DURATION, "s"))
-        if keys == {action, "over"} and action in (*TURNS, *TOUCHES, *HANDS):
-            if action in HANDS:
-                value: tuple[float, ...] = (one_float(name, entry[action], 0.0, HANDS[action], "kg"),)
-            elif action in TURNS:
-                value = (one_float(name, entry[action], -TURNS[action], TURNS[action], "rad"),)
-            else:
-                bound, unit = TOUCHES[action]
-                value = tuple(four_floats(name, entry[action], -bound, bound, unit).tolist())
-            return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), value)
+        if action in VALUED and keys == {action, "over"}:
+            checked, low, high, unit = VALUED[action]
+            value = np.ravel(checked(name, entry[action], low, high, unit)).tolist()
+            return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), tuple(value))
         expected = (
             "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
             "{walk: s}, {sit: s} or {load: kg, over: s}"

@@ -59,9 +59,7 @@ def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
     if recording is None:
         found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
         raise DataError(f"{bag.path}: the joints are {found}: must include {', '.join(arm.joint_names)}")
-    order = [recording.joint_names.index(name) for name in arm.joint_names]
-    arrays = {name: getattr(recording, name)[:, order] for name in ("position", "velocity", "effort", "command")}
-    return replace(recording, joint_names=arm.joint_names, **arrays)
+    return recording.in_order(arm.joint_names)
 
 
 def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError, named
@@ -17,7 +18,7 @@ from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
-from exo_gravity.tools.inputs.parameter_file import Nodes, load, packaged_config
+from exo_gravity.tools.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,3 +95,16 @@ def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, 
         raise ParameterError("params", sorted(nodes), f"a file with {node}")
     with named(f"{node} "):
         return values_of(table, nodes[node], OPTIONS)
+
+
+def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dict[str, Any]:
+    """Return every parameter of the compensator or can_bridge of `arm` in a recording, {} if it has none of that node.
+
+    parameters: YAML text by node. One that the recorded version lacked has its default.
+    """
+    node = node_of(arm, executable)
+    if node not in parameters:
+        return {}
+    given = yaml.load(parameters[node], Loader)[node]["ros__parameters"]
+    table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
+    return {param.name: param.default for param in table} | given

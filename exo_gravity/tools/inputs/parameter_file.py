@@ -52,11 +52,6 @@ def node_of(arm: str, executable: str) -> str:
     return f"/{executable}" if arm == "arm" else f"/{arm}/{executable}"
 
 
-def recorded_of(parameters: Mapping[str, str], node: str) -> dict[str, Any] | None:
-    """Return the parameters of `node` in a recording's `parameters`, YAML text by node; None if it has none."""
-    return yaml.load(parameters[node], Loader)[node]["ros__parameters"] if node in parameters else None
-
-
 def _parameters(node: str, entry: Any) -> dict[str, Any]:
     if not node.startswith("/") or node.endswith("/"):
         raise ParameterError("node name", node, f"fully qualified, as in {FORM}")

@@ -4,7 +4,7 @@ Everything is drawn in the trunk's axes, the arms from the parameters that the r
 dummy. A GIF has one palette for all frames, which keeps it small.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -14,17 +14,19 @@ import imageio.v3 as iio
 import mujoco
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from rich.console import Console
+from rich.progress import track
 
 from exo_gravity.bag.content import Bag
-from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
+from exo_gravity.core.view.scene import LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.core.view.urdf import COLOURS as MATERIALS
 from exo_gravity.core.view.urdf import ArmDescription, arm_pose, described, joint_names, urdf
-from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
+from exo_gravity.tools.inputs.arms import recorded_of
+from exo_gravity.tools.inputs.parameter_file import node_of
+from exo_gravity.tools.reporting.table import shown
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
 COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
@@ -37,11 +39,7 @@ AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on th
 BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
 CENTRE = 0.24  # m below the shoulders, what the camera looks at
 FIELD_OF_VIEW = 38.0  # deg
-GEOMS = {
-    LINE: mujoco.mjtGeom.mjGEOM_CAPSULE,
-    ARROW: mujoco.mjtGeom.mjGEOM_ARROW,
-    SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
-}
+GEOMS = {LINE: mujoco.mjtGeom.mjGEOM_CAPSULE, SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE}
 BODY, LIMB = (0.80, 0.76, 0.70, 1.0), (0.80, 0.70, 0.62, 0.3)  # the wearer, and the arms that are worn
 # Parts of the wearer between two points in m, relative to the middle of the shoulders, and their diameters. Those that
 # have a breadth stand on both sides.
@@ -58,12 +56,15 @@ LIMB_SIZE = 0.075  # m, the diameter of an arm
 SKY = ((0.97, 0.98, 1.0), (0.80, 0.84, 0.89))  # above and below
 
 
-def write_clip(bag: Bag, path: Path, times: Sequence[float], frame_rate: int, drawn: Iterable[float]) -> None:
-    """Write a clip with a frame for each of `times` (s) in the recording, `frame_rate` per second.
+def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Console) -> None:
+    """Write a clip with a frame for every `step` s of a recording, `frame_rate` of them per second.
 
-    drawn: the same times, iterated while the frames are drawn. Raises DataError if the arms are not described, or the
-    clip cannot be drawn or written.
+    Raises DataError if the recording does not describe its arms, or the clip cannot be drawn or written.
     """
+    end = min(float(recording.time[-1]) for recording in bag.recordings)
+    times = [step * n for n in range(int(end / step) + 1)]
+    hidden = not console.is_terminal
+    drawn = track(times, f"drawing {path.name}", console=console, transient=True, disable=hidden)
     is_gif = path.suffix.lower() == ".gif"
     try:
         with closing(Stage(bag, *(GIF_SIZE if is_gif else SIZE))) as stage:
@@ -72,7 +73,8 @@ def write_clip(bag: Bag, path: Path, times: Sequence[float], frame_rate: int, dr
                 found = np.unique(np.reshape(few, (1, -1, 3)), axis=1)  # each once: a torque is drawn by few pixels
                 palette = Image.fromarray(found).quantize(COLOURS)
                 first, *others = (stage.picture(t).quantize(palette=palette, dither=Image.Dither.NONE) for t in drawn)
-                first.save(path, save_all=True, append_images=others, duration=round(1000 / frame_rate), loop=0)
+                duration = round(1000 / frame_rate)  # ms
+                first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
                 return
             with iio.imopen(path, "w", plugin="pyav") as file:
                 file.init_video_stream("libx264", fps=frame_rate)
@@ -88,14 +90,18 @@ class Stage:
     """Draws frames of `width` x `height` pixels. Raises DataError if OpenGL does not work here."""
 
     def __init__(self, bag: Bag, width: int, height: int) -> None:
-        arms = [_description(bag.parameters, recording.name) for recording in bag.recordings]
-        self._arms = list(zip(arms, bag.recordings, strict=True))
+        arms = [_description(bag, recording.name) for recording in bag.recordings]
+        pairs = zip(arms, bag.recordings, strict=True)
+        self._arms = [(arm, recording.in_order(arm.limits.joint_names)) for arm, recording in pairs]
         self._model = _model(arms, width, height)
         self._dummy = _dummy(arms)
         self._data = mujoco.MjData(self._model)
         names = [name for four in joint_names(arms) for name in four]
         self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
-        self._camera = _camera(arms)
+        self._camera = mujoco.MjvCamera()
+        self._camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CENTRE)
+        self._camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else BOTH_SIDES
+        self._camera.elevation, self._camera.distance = ELEVATION, DISTANCE
         try:
             self._renderer = mujoco.Renderer(self._model, height, width, max_geom=MAX_SHAPES)
         except Exception as error:  # EGL, GLX and OSMesa raise what they like
@@ -108,11 +114,9 @@ class Stage:
         self._data.qpos[self._at] = [angle for view in views for angle in view.theta]
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
-        labels = []
         for view in views:
-            shapes = arm_shapes(view)
-            labels.append([shape for shape in shapes if shape.kind == TEXT and shape.group == "torques"])
-            for shape in (*shapes, *_worn(view)):
+            worn = Shape("wearer", LINE, arm_pose(view.arm, view.theta)[0][1:], LIMB_SIZE, LIMB)  # it shows through
+            for shape in (*arm_shapes(view), worn):
                 _add(self._renderer.scene, shape)
         for shape in self._dummy:
             _add(self._renderer.scene, shape)
@@ -120,18 +124,18 @@ class Stage:
         height = LINE_HEIGHT * picture.height
         font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
         draw.text((height / 2, height / 2), f"{time:.1f} s  {_step(self._arms[0][1], time)}", INK, font)
-        for view, texts in zip(views, labels, strict=True):
-            self._label(draw, font, view, texts)
+        for view in views:
+            self._label(draw, font, view)
         return picture
 
-    def _label(self, draw: ImageDraw.ImageDraw, font: Any, view: ArmView, texts: Sequence[Shape]) -> None:
+    def _label(self, draw: ImageDraw.ImageDraw, font: Any, view: ArmView) -> None:
         """Write the torque of each joint at the picture's edge on the arm's side of the trunk, with a line to it."""
         width, height = self._renderer.width, self._renderer.height
         places = [self._pixel(joint) for joint in arm_pose(view.arm, view.theta)[0][:4]]
         middle, _ = self._pixel(np.multiply(view.arm.base, (1.0, 0.0, 1.0)))
         is_left, below, line = places[0][0] < middle, 0.16 * height, 1.15 * LINE_HEIGHT * height
-        for name, shape, (x, y) in zip(view.arm.limits.joint_names, texts, places, strict=True):
-            label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shape.text}"
+        for name, effort, (x, y) in zip(view.arm.limits.joint_names, view.effort, places, strict=True):
+            label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shown(effort, 2)} Nm"
             top = max(below, y - line)
             below = top + 2.4 * line
             at, anchor = ((line / 2, top), "la") if is_left else ((width - line / 2, top), "ra")
@@ -160,26 +164,18 @@ def _dummy(arms: Sequence[ArmDescription]) -> list[Shape]:
     ]
 
 
-def _worn(view: ArmView) -> list[Shape]:
-    """Return the wearer's arm in the exoskeleton, which shows through."""
-    return [Shape("wearer", LINE, arm_pose(view.arm, view.theta)[0][1:], LIMB_SIZE, LIMB)]
-
-
 def _view(arm: ArmDescription, recording: Recording, time: float) -> ArmView:
     """Return what is known of an arm at `time` s."""
     at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
-    order = [recording.joint_names.index(name) for name in arm.limits.joint_names]
-    theta, velocity, effort = (
-        np.nan_to_num(row[at, order].astype(float)).tolist()
-        for row in (recording.position, recording.velocity, recording.effort)
-    )
+    rows = (recording.position, recording.velocity, recording.effort)
+    theta, velocity, effort = (np.nan_to_num(row[at].astype(float)).tolist() for row in rows)
     powered = State.LETTING_DOWN if max(map(abs, effort)) > NO_TORQUE else State.DISABLED
     state = State.ACTIVE if _is_carried(recording, time) else powered
     return ArmView(arm, theta, velocity, effort, state.value)
 
 
 def _is_carried(recording: Recording, time: float) -> bool:
-    return recording.carried is None or any(start <= time <= end for start, end in recording.carried)
+    return any(start <= time <= end for start, end in recording.while_carried(-np.inf, np.inf))
 
 
 def _step(recording: Recording, time: float) -> str:
@@ -192,22 +188,14 @@ def _step(recording: Recording, time: float) -> str:
     return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
 
 
-def _description(parameters: Mapping[str, str], name: str) -> ArmDescription:
-    """Return the arm `name` from the nodes' parameters in a recording; the default for one that their version lacked.
-
-    Raises DataError.
-    """
-    values: list[dict[str, Any]] = []
-    for executable, table in (("compensator", COMPENSATOR), ("can_bridge", CAN_BRIDGE)):
-        node = node_of(name, executable)
-        given = recorded_of(parameters, node)
-        if given is None:
+def _description(bag: Bag, name: str) -> ArmDescription:
+    """Return the arm `name` from the nodes' parameters in a recording. Raises DataError or ParameterError."""
+    values = {executable: recorded_of(bag.parameters, name, executable) for executable in ("compensator", "can_bridge")}
+    for executable, given in values.items():
+        if not given:
+            node = node_of(name, executable)
             raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
-        values.append({param.name: given.get(param.name, param.default) for param in table})
-    try:
-        return described(*values)
-    except ParameterError as error:
-        raise DataError(f"{name}: the recording's parameters do not describe the arm: {error}") from None
+    return described(**values)
 
 
 def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
@@ -229,22 +217,14 @@ def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
     return spec.compile()
 
 
-def _camera(arms: Sequence[ArmDescription]) -> Any:
-    camera = mujoco.MjvCamera()
-    camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CENTRE)
-    camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else BOTH_SIDES
-    camera.elevation, camera.distance = ELEVATION, DISTANCE
-    return camera
-
-
 def _add(scene: Any, shape: Shape) -> None:
     """Add a shape to MuJoCo's scene; a text is drawn on the picture instead."""
-    if shape.kind not in GEOMS:
+    if shape.kind == TEXT:
         return
     kind, radius, colour = GEOMS[shape.kind], shape.size / 2, np.array(shape.colour, np.float32)
-    for start, end in [(shape.points[0], None)] if shape.kind == SPHERE else pairwise(shape.points):
+    for start, *end in [shape.points] if shape.kind == SPHERE else pairwise(shape.points):
         geom = scene.geoms[scene.ngeom]
         scene.ngeom += 1
         mujoco.mjv_initGeom(geom, kind, np.full(3, radius), start, np.eye(3).ravel(), colour)
-        if end is not None:
-            mujoco.mjv_connector(geom, kind, radius, start, end)
+        if end:
+            mujoco.mjv_connector(geom, kind, radius, start, *end)

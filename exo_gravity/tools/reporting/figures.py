@@ -1,4 +1,4 @@
-"""The figures of a report: the paper's plot of positions, velocities and torques, and a closer look at the drift.
+"""The figures of a report: the paper's plot of positions, velocities and torques; the drift; the wearer's torque.
 
 A long recording is drawn as the minimum and maximum of each of 2,000 intervals, so that no peak is lost.
 """
@@ -9,10 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from exo_gravity.core.observer.momentum import COVER
 from exo_gravity.core.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording, in_blocks
 from exo_gravity.tools.reporting.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 from exo_gravity.tools.reporting.table import joint_labels, per_minute
+from exo_gravity.tools.reporting.wearer_share import WearerPart
 
 INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
@@ -82,21 +84,43 @@ def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria)
 
 
 def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> None:
-    for joint, (name, colour) in enumerate(zip(joint_labels(recording), JOINT_COLOURS, strict=True)):
-        numbers = np.arange(1, len(analysis.holds) + 1) + 0.12 * (joint - 1.5)
-        rate = [per_minute(hold.drift_rate[joint]) for hold in analysis.holds]
-        error = [per_minute(hold.drift_rate_uncertainty[joint]) for hold in analysis.holds]
-        axis.errorbar(numbers, rate, error, fmt="o", ms=4.5, lw=1.2, capsize=2, color=colour, label=name)
+    numbers = np.arange(1, len(analysis.holds) + 1)
+    rates = per_minute([hold.drift_rate for hold in analysis.holds])
+    errors = per_minute([hold.drift_rate_uncertainty for hold in analysis.holds])
+    for joint, name in enumerate(joint_labels(recording)):
+        axis.errorbar(
+            numbers + 0.12 * (joint - 1.5), rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2,
+            color=JOINT_COLOURS[joint], label=name,
+        )  # fmt: skip
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
     if math.isfinite(criteria.max_rate):
         bound = per_minute(criteria.max_rate)
         axis.axhspan(-bound, bound, color=HOLD_COLOUR, zorder=-1, label=f"allowed: ±{bound:g} deg/min")
         axis.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=5, frameon=False, fontsize=9)
-    axis.set_xticks(range(1, len(analysis.holds) + 1))
-    axis.set_xlim(0.4, len(analysis.holds) + 0.6)
+    axis.set_xticks(numbers)
+    axis.set_xlim(0.4, len(numbers) + 0.6)
     axis.set_xlabel("Hold")
     axis.set_ylabel("Drift (deg/min)")
     make_plain(axis)
+
+
+def wearer(recording: Recording, part: WearerPart) -> Figure:
+    """Return the wearer's torque at each joint and his share over time, with their 95 % bands."""
+    figure, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
+    axes = figure.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
+    rows = [*curve.torque.T, 100.0 * part.sliding.value]
+    bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
+    names = [f"{label} (Nm)" for label in joint_labels(recording)]
+    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*JOINT_COLOURS, INK], strict=True)
+    for axis, values, band, name, colour in columns:
+        axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
+        axis.plot(curve.time, values, color=colour, lw=1.0)
+        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        axis.set_title(name, loc="left", fontsize=9, color=colour)
+        make_plain(axis)
+    axes[-1].set_ylim(-60.0, 160.0)
+    axes[-1].set_xlabel("Time (s)")
+    return figure
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -68,11 +68,6 @@ def bullets(title: str, lines: Iterable[str]) -> str:
     return (items := _items(lines)) and (heading(title) if title else "") + items
 
 
-def paragraph(text: str) -> str:
-    """Return a paragraph."""
-    return f"<p>{escape(text)}</p>"
-
-
 def make_plain(axis: "Axes") -> None:
     """Leave two spines of a figure's axes, and faint horizontal lines."""
     axis.spines[["top", "right"]].set_visible(False)

@@ -4,7 +4,7 @@ import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -15,6 +15,9 @@ from exo_gravity.core.trial.analysis import Hold, Motion, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
 
+if TYPE_CHECKING:
+    from exo_gravity.tools.reporting.verdict import Report
+
 ROWS = 100_000  # of a time series, that are written at once
 UNMOVED = 1e-9  # rad; the means of equal positions differ by less
 
@@ -24,16 +27,24 @@ def per_minute(values: Any) -> Any:
     return 60.0 * np.degrees(values)
 
 
+# From SI units
+UNITS: dict[str, Callable[[Any], Any]] = {"deg": np.degrees, "deg/s": np.degrees, "deg/min": per_minute, "Nm": np.array}
+
+
 class Column(NamedTuple):
     """A number of each joint in each hold or motion."""
 
+    field: str  #: of Hold or Motion, (4,)
     key: str  #: in the CSV file
-    heading: str
+    heading: str  #: with the unit in the second line
     digits: int  #: decimal places
-    of: Callable[[Any], np.ndarray]  #: Hold or Motion -> (4,)
     largest: bool = False  #: the terminal shows the largest of the four only
     spare: int = 0  #: a narrow terminal drops these, from the largest number on
     below: bool = False  #: a joint that read one position throughout a hold has "<" and its uncertainty
+
+    def of(self, one: Any) -> np.ndarray:
+        """Return the numbers (4,) of a hold or motion in the column's unit."""
+        return np.asarray(UNITS[self.heading.partition("\n")[2]](getattr(one, self.field)))
 
     def texts(self, one: Any) -> list[str]:
         """Return the numbers of a hold or motion as text."""
@@ -44,22 +55,52 @@ class Column(NamedTuple):
         return [f"<{shown(bound, self.digits)}" if unmoved else text for text, bound, unmoved in bounds]
 
 
-HOLDS = (
-    Column("pose_deg", "Pose\ndeg", 1, lambda hold: np.degrees(hold.pose)),
-    Column("drift_deg_per_min", "Drift\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate), below=True),
-    Column(
-        "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, lambda hold: per_minute(hold.drift_rate_uncertainty), True
+class Kind(NamedTuple):
+    """A table: its rows, what stands before the numbers of each, and the numbers."""
+
+    name: str  #: of the field of `TrialAnalysis` with the rows, and of the CSV file
+    title: str
+    lead: Callable[[int, Any], dict[str, Any]]  #: number, and Hold or Motion -> the first columns of the CSV file
+    headings: dict[str, str]  #: of those that page and terminal show too
+    columns: tuple[Column, ...]
+
+    def texts(self, number: int, one: Any) -> list[str]:
+        """Return the first cells of a row, as page and terminal show them."""
+        lead = self.lead(number, one)
+        # An arm on its way down need not come to rest.
+        unknown = "–" if lead.get("kind") == "let down" else "never"
+        shared = (lead[key] for key in self.headings)
+        return [str(x) if isinstance(x, str | int) else unknown if math.isnan(x) else shown(x, 1) for x in shared]
+
+
+KINDS = (
+    Kind(
+        "holds",
+        "Holds",
+        lambda n, hold: {"hold": n, "start_s": hold.start, "duration_s": hold.duration, "after": hold.after},
+        {"hold": "Hold", "start_s": "At\ns", "duration_s": "For\ns"},
+        (
+            Column("pose", "pose_deg", "Pose\ndeg", 1),
+            Column("drift_rate", "drift_deg_per_min", "Drift\ndeg/min", 2, below=True),
+            Column("drift_rate_uncertainty", "drift_uncertainty_deg_per_min", "±\ndeg/min", 2, largest=True),
+            Column("drift", "drift_deg", "Total drift\ndeg", 2, spare=5),
+            Column("stray", "stray_in_10_s_deg", "Within 10 s\ndeg", 2, largest=True, spare=1),
+            Column("velocity_rms", "rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, largest=True, spare=4),
+            Column("torque_rms", "rms_torque_nm", "RMS torque\nNm", 2, spare=2),
+            Column("torque_error", "torque_error_nm", "Torque error\nNm", 3, largest=True, spare=3),
+        ),
     ),
-    Column("drift_deg", "Total drift\ndeg", 2, lambda hold: np.degrees(hold.drift), spare=5),
-    Column("stray_in_10_s_deg", "Within 10 s\ndeg", 2, lambda hold: np.degrees(hold.stray), True, 1),
-    Column("rms_velocity_deg_per_s", "RMS velocity\ndeg/s", 2, lambda hold: np.degrees(hold.velocity_rms), True, 4),
-    Column("rms_torque_nm", "RMS torque\nNm", 2, lambda hold: hold.torque_rms, spare=2),
-    Column("torque_error_nm", "Torque error\nNm", 3, lambda hold: hold.torque_error, True, 3),
-)
-MOTIONS = (
-    Column("peak_deg", "Peak\ndeg", 1, lambda motion: np.degrees(motion.peak)),
-    Column("residual_deg", "Residual\ndeg", 1, lambda motion: np.degrees(motion.residual)),
-    Column("peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, lambda motion: np.degrees(motion.speed), spare=1),
+    Kind(
+        "motions",
+        "Motions between holds",
+        lambda n, one: {"motion": n, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still},
+        {"kind": "Motion", "start_s": "At\ns", "until_still_s": "Still after\ns"},
+        (
+            Column("peak", "peak_deg", "Peak\ndeg", 1),
+            Column("residual", "residual_deg", "Residual\ndeg", 1),
+            Column("speed", "peak_speed_deg_per_s", "Peak speed\ndeg/s", 0, spare=1),
+        ),
+    ),
 )
 # What the columns mean
 TERMS = {
@@ -86,30 +127,18 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def write_csv(
-    path: Path,
-    arms: Iterable[tuple[Recording, TrialAnalysis]],
-    columns: Mapping[str, Callable[[float], Mapping[str, str]]],
-) -> None:
-    """Write holds.csv or motions.csv, a row for each joint; an unknown number is an empty cell.
-
-    columns: by arm, a function from a time in s to the first columns of a row. Without holds or motions no file is
-    written.
-    """
-    rows: list[dict[str, str]] = []
-    for recording, analysis in arms:
-        for number, one in enumerate(getattr(analysis, path.stem), 1):
-            if isinstance(one, Hold):
-                shared = {"hold": number, "start_s": one.start, "duration_s": one.duration, "after": one.after}
-            else:
-                shared = {"motion": number, "kind": one.kind, "start_s": one.start, "until_still_s": one.until_still}
-            numbers = {column.key: column.of(one) for column in (HOLDS if isinstance(one, Hold) else MOTIONS)}
+def write_csv(folder: Path, kind: Kind, report: "Report") -> None:
+    """Write a table as CSV, a row for each joint; an unknown number is an empty cell. Without rows, write nothing."""
+    rows = []
+    for recording, analysis in report.arms:
+        for number, one in enumerate(getattr(analysis, kind.name), 1):
+            shared = {**report.row_head(recording.name, one.start), **kind.lead(number, one)}
+            numbers = {column.key: column.of(one) for column in kind.columns}
             for joint, name in enumerate(recording.joint_names):
-                row = {**columns[recording.name](one.start), **shared, "joint": name}
-                row |= {key: values[joint] for key, values in numbers.items()}
+                row = {**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}}
                 rows.append({key: _csv_value(value) for key, value in row.items()})
     if rows:
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with (folder / f"{kind.name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             writer.writerows(rows)
@@ -137,35 +166,22 @@ def _csv_value(value: Any) -> str:
     return f"{value:.6g}" if math.isfinite(value) else ""
 
 
-def _shared(number: int, one: Hold | Motion) -> tuple[str, str, str]:
-    """Return the first three cells of a hold or motion: what it is, when, and how long."""
-    if isinstance(one, Hold):
-        return str(number), shown(one.start, 1), shown(one.duration, 1)
-    # An arm on its way down need not come to rest.
-    never = math.isnan(one.until_still) and one.kind != "let down"
-    return one.kind, shown(one.start, 1), "never" if never else shown(one.until_still, 1)
-
-
-def _tables(analysis: TrialAnalysis) -> Iterator[tuple[str, Sequence[Hold | Motion], Sequence[str], Sequence[Column]]]:
-    """Yield title, content, first headings and columns of both tables."""
-    yield "Holds", analysis.holds, ("Hold", "At\ns", "For\ns"), HOLDS
-    yield "Motions between holds", analysis.motions, ("Motion", "At\ns", "Still after\ns"), MOTIONS
-
-
 def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> Iterator[str]:
     """Yield the page's section of one arm: its figures and tables."""
     yield html.heading(f"Arm: {recording.name}", 2)
     yield from figures
     if not analysis.holds:
         yield "<p>No hold was found.</p>"
-    for title, found, heads, columns in _tables(analysis):
+    for kind in KINDS:
         groups = []
-        for number, one in enumerate(found, 1):
-            cells = [column.texts(one) for column in columns]
-            groups.append((_shared(number, one), list(zip(joint_labels(recording), *cells, strict=True))))
+        for number, one in enumerate(getattr(analysis, kind.name), 1):
+            cells = [column.texts(one) for column in kind.columns]
+            groups.append((kind.texts(number, one), list(zip(joint_labels(recording), *cells, strict=True))))
         if groups:
-            yield html.heading(title)
-            yield html.table((*heads, "", *(column.heading for column in columns)), groups, "joints")
+            yield html.heading(kind.title)
+            yield html.table(
+                (*kind.headings.values(), "", *(column.heading for column in kind.columns)), groups, "joints"
+            )
 
 
 def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis) -> None:
@@ -174,14 +190,14 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
     Where the table is wider than the console, spare columns are left out: they are in the CSV files.
     """
     console.print(f"\n[bold]{recording.name}[/], joints in order: {', '.join(joint_labels(recording))}")
-    for _, found, heads, columns in _tables(analysis):
-        rows = [one for one in found if isinstance(one, Hold) or one.kind != "move"]
+    for kind in KINDS:
+        rows = [one for one in getattr(analysis, kind.name) if getattr(one, "kind", "") != "move"]
         if not rows:
             continue
-        shared = zip(*(_shared(number, one) for number, one in enumerate(rows, 1)), strict=True)
-        cells = {head: list(column) for head, column in zip(heads, shared, strict=True)}
-        cells |= {column.heading: _cells(rows, column) for column in columns}
-        for column in sorted(columns, key=lambda column: -column.spare):
+        shared = zip(*(kind.texts(number, one) for number, one in enumerate(rows, 1)), strict=True)
+        cells: dict[str, Sequence[str]] = dict(zip(kind.headings.values(), shared, strict=True))
+        cells |= {column.heading: _cells(rows, column) for column in kind.columns}
+        for column in sorted(kind.columns, key=lambda column: -column.spare):
             used = sum(2 + max(map(len, (*head.split("\n"), *texts))) for head, texts in cells.items())
             if used > console.width and column.spare:
                 del cells[column.heading]

@@ -1,89 +1,30 @@
 """The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
 
-import re
+import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from datetime import datetime, timezone
-from functools import cached_property
+from datetime import datetime
 from html import escape
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.markup import escape as marked
 
-from exo_gravity.bag.content import Bag
-from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
+from exo_gravity.bag.content import Bag, Event
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.core.trial.analysis import analyse as analyse_arm
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.reporting import conditions, figures, html, table, wearer_share
-from exo_gravity.tools.reporting.conditions import EARLY
+from exo_gravity.tools.reporting import figures, html, table, wearer_share
+from exo_gravity.tools.reporting.verdict import EARLY, Conditions, Report
 
 MAX_EVENTS = 200
 WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
-TIMESTAMP = re.compile(r"_\d{8}_\d{6}$")  # which `trial` adds to the script's name
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
     "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
-    "wearer": wearer_share.CAPTION,
+    "wearer": "The wearer's torque at each joint, and his share of the torque that carries his arm, each with its 95 % "
+    "band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
 }
-
-
-@dataclass(frozen=True)
-class Report:
-    """A recording, the analysis of each arm, and the verdict."""
-
-    bag: Bag
-    criteria: HoldCriteria
-    arms: tuple[tuple[Recording, TrialAnalysis], ...]
-    failures: tuple[str, ...]  #: one sentence for each way in which an arm did not hold
-    settings: dict[str, conditions.Conditions]  #: by the arm's name
-    wearers: dict[str, wearer_share.WearerPart]  #: by the arm's name, where what the wearer did is known
-    notes: tuple[str, ...]  #: what limits the trust in the verdict
-    trouble: str = ""  #: why the trial ended before its script, or ''
-
-    @property
-    def exit_code(self) -> int:
-        """0: held. 1: did not hold. 2: some of the recording could not be read."""
-        return 2 if self.bag.problems else int(bool(self.failures))
-
-    @property
-    def held(self) -> str:
-        """The verdict on arms that held, which covers no more than was recorded."""
-        if self.bag.problems:
-            return "It held, as far as the recording could be read."
-        if self.trouble:
-            return f"It held until the trial ended early: {self.trouble}."
-        return "It held, as far as it was recorded." if self.bag.is_partial else "It held."
-
-    @cached_property
-    def verdict(self) -> tuple[str, bool]:
-        """The first sentences of the report, and whether they are good news: a bad event comes first."""
-        event, bad = conditions.worst(self.bag, self.arms, self.settings, self.criteria)
-        early = f" The trial ended early: {self.trouble}." if self.trouble else ""
-        held = f"It did not hold.{early}" if self.failures else self.held
-        otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
-        text = f"{event[:1].upper()}{event[1:]}. {otherwise}" if bad else f"{held} Worst: {event}." if event else held
-        return text, not (bad or self.failures)
-
-    @property
-    def trial(self) -> str:
-        """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
-        path = self.bag.path.resolve()
-        return path.parent.name if path.stem == "bag" else path.stem
-
-    @property
-    def title(self) -> str:
-        """Name of the trial, arms and date: 'demo, right arm, 2026-03-14'."""
-        name = TIMESTAMP.sub("", self.trial)
-        sides = " and ".join(recording.name for recording in self.bag.recordings)
-        arms = sides if sides == "arm" else f"{sides} arm{'s' if len(self.bag.recordings) > 1 else ''}"
-        return f"{name.replace('_', ' ')}, {arms}, {self.start:%Y-%m-%d}"
-
-    @property
-    def start(self) -> datetime:
-        """Start of the recording, local time."""
-        return datetime.fromtimestamp(self.bag.start / 1e9, timezone.utc).astimezone()
 
 
 def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MIN_HOLD, trouble: str = "") -> Report:
@@ -91,14 +32,16 @@ def analyse(bag: Bag, criteria: HoldCriteria | None = None, min_hold: float = MI
 
     trouble: why the trial ended early, or ''.
     """
-    criteria = criteria or HoldCriteria()
     arms = tuple((recording, analyse_arm(recording, min_hold)) for recording in bag.recordings)
-    found = tuple(sentence for recording, analysis in arms for sentence in failures(recording, analysis, criteria))
-    parts = {recording.name: wearer_share.of_arm(bag, recording) for recording in bag.recordings}
-    known = {name: part for name, part in parts.items() if not isinstance(part, str)}
-    unknown = [part for part in parts.values() if part and isinstance(part, str)]
-    settings = {recording.name: conditions.Conditions.of(bag, recording.name) for recording in bag.recordings}
-    return Report(bag, criteria, arms, found, settings, known, (*bag.notes, *_reservations(bag), *unknown), trouble)
+    settings = {recording.name: Conditions.of(bag, recording.name) for recording in bag.recordings}
+    wearers, notes = {}, [*bag.notes, *_reservations(bag)]
+    for recording in bag.recordings:
+        try:
+            if part := wearer_share.of_arm(bag, recording):
+                wearers[recording.name] = part
+        except (DataError, ParameterError) as error:
+            notes.append(f"{recording.name}: the wearer's torque is not known: {error}")
+    return Report(bag, criteria or HoldCriteria(), arms, settings, wearers, tuple(notes), trouble)
 
 
 def _reservations(bag: Bag) -> Iterator[str]:
@@ -126,13 +69,10 @@ def write(
     """
     folder = Path(folder)
     sections: list[str] = []
-    columns = {
-        arm: conditions.columns(report.bag, settings, report.trial, arm) for arm, settings in report.settings.items()
-    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in ("holds.csv", "motions.csv"):
-            table.write_csv(folder / name, report.arms, columns)
+        for kind in table.KINDS:
+            table.write_csv(folder, kind, report)
         if with_time_series:
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
@@ -140,15 +80,15 @@ def write(
             if analysis.holds:
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if part := report.wearers.get(recording.name):
-                drawn["wearer"] = wearer_share.figure(recording, part)
+                drawn["wearer"] = figures.wearer(recording, part)
             pictures = []
-            for kind, figure in drawn.items():
+            for name, figure in drawn.items():
                 png = html.png_of(figure)
-                path = folder / f"{recording.name.replace('/', '_')}_{kind}.png"
+                path = folder / f"{recording.name.replace('/', '_')}_{name}.png"
                 path.write_bytes(png)
                 for suffix in formats:
                     html.save_vector(figure, path.with_suffix(f".{suffix}"))
-                pictures.append(html.picture(png, CAPTIONS[kind]))
+                pictures.append(html.picture(png, CAPTIONS[name]))
             if part:
                 pictures.append(html.bullets("Wearer", [wearer_share.sentence(part)]))
             sections += table.arm_section(recording, analysis, pictures)
@@ -178,7 +118,8 @@ def print_report(report: Report, console: Console | None = None) -> None:
         console.print(f"[red]Not reported:[/] {marked(problem)}.")
     for sentence in report.failures:
         console.print(f"[red]{marked(sentence)}.[/]")
-    for arm, mode, support, wearer in conditions.lines(report.settings):
+    for arm, settings in report.settings.items():
+        mode, support, wearer = settings.in_words
         console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}")
     text, good = report.verdict
     console.print(f"[{'green' if good else 'red'} bold]{marked(text)}[/]")
@@ -187,7 +128,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
 def _page(report: Report, sections: Sequence[str]) -> str:
     bag = report.bag
     length = max(float(recording.time[-1]) for recording in bag.recordings)
-    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in conditions.after_start(bag)]
+    events = [f"{table.shown(event.time, 1)} s  {event.text}" for event in _after_start(bag)]
     more = [f"and {len(events) - MAX_EVENTS} more"] if len(events) > MAX_EVENTS else []
     parameters = "\n".join(bag.parameters[node].rstrip() for node in sorted(bag.parameters))
     ending = [
@@ -198,9 +139,39 @@ def _page(report: Report, sections: Sequence[str]) -> str:
     if parameters:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
     text, good = report.verdict
-    head = [
-        html.verdict(text, report.failures, good),
-        *conditions.section(bag.session, report.settings, report.criteria),
-    ]
+    head = [html.verdict(text, report.failures, good), *_conditions(report)]
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {'/'.join(bag.path.parts[-2:])}"
     return html.document(report.title, when, [*head, *sections, *ending])
+
+
+def _conditions(report: Report) -> Iterator[str]:
+    """Yield the page's section on the conditions and the criteria."""
+    session = report.bag.session
+    given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
+    yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
+    lines = [(arm, *conditions.in_words) for arm, conditions in report.settings.items()]
+    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
+    recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
+    yield f"<p>{escape(f'{_criteria_text(report.criteria)} {recorder}')}</p>"
+
+
+def _criteria_text(criteria: HoldCriteria) -> str:
+    """Say what "it held" means."""
+    stray, after_push, rate, offset = np.degrees(
+        (criteria.max_stray, criteria.max_stray_after_push, 60.0 * criteria.max_rate, criteria.max_offset)
+    )
+    rated = f"no joint drifts more than {rate:g} degrees per minute, " if math.isfinite(rate) else ""
+    return (
+        f"Criteria: within any 10 s of a hold no joint moves more than {stray:g} degrees, {after_push:g} after a push; "
+        f"{rated}at the end of a hold the arm is still, and within {offset:g} degrees of where it was let go."
+    )
+
+
+def _after_start(bag: Bag) -> list[Event]:
+    """Return markers and events in order, of those before an arm was carried only the last of each node."""
+    began = min((recording.carried[0][0] for recording in bag.recordings if recording.carried), default=-math.inf)
+    last = {event.text.partition(":")[0]: event for event in bag.events if event.time < began and not event.setting}
+    kept = [event for event in last.values() if ": OK, " not in event.text]
+    changed = [event for event in bag.events if event.time >= began or event.setting]
+    markers = [Event(event.time, f"marker: {event.text}") for event in bag.markers]
+    return sorted((*kept, *changed, *markers), key=lambda event: event.time)

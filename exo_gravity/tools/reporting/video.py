@@ -1,7 +1,6 @@
 """Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
 
 import argparse
-import math
 import os
 from ctypes.util import find_library
 from importlib.util import find_spec
@@ -9,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from exo_gravity.bag.content import Bag
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.tools.cli import missing
 
 if TYPE_CHECKING:
     from rich.console import Console
-
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
 NEEDED = ("mujoco", "imageio", "av", "PIL")
@@ -32,7 +30,7 @@ class Clip(NamedTuple):
     """A clip to write."""
 
     path: Path
-    speed: float  #: how many seconds of the recording one second of the clip shows
+    step: float  #: s of the recording from one frame to the next
     frame_rate: int  #: frames per second
 
 
@@ -55,46 +53,29 @@ def requested(video: str | None, speed: float) -> Clip | None:
         raise ParameterError("video", video, f"a file that ends with {' or '.join(FRAME_RATE)}")
     if not path.absolute().parent.is_dir():
         raise ParameterError("video", video, "a file in a folder that exists")
-    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED), FRAME_RATE[path.suffix.lower()])
-    for module in NEEDED:
-        if not find_spec(module):
-            raise ParameterError("video", video, f"left out: {missing(module, 'video')}")
-    try:
-        backend()
-    except DataError as error:
-        raise ParameterError("video", video, f"left out: {error}") from None
+    frame_rate = FRAME_RATE[path.suffix.lower()]
+    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED) / frame_rate, frame_rate)
+    problems = [missing(module, "video") for module in NEEDED if not find_spec(module)]
+    if not problems and not backend():
+        problems = [NO_GRAPHICS]
+    if problems:
+        raise ParameterError("video", video, f"left out: {problems[0]}")
     return clip
 
 
 def backend() -> str:
-    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides.
-
-    Raises DataError if no library for it is found.
-    """
+    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides. '' if it finds no library."""
     chosen = os.environ.get("MUJOCO_GL", "disabled")
     if chosen not in ("disabled", *BACKENDS.values()):
         return chosen
-    for library, name in BACKENDS.items():
-        if chosen in ("disabled", name) and find_library(library):
-            return name
-    raise DataError(NO_GRAPHICS)
-
-
-def frame_times(end: float, clip: Clip) -> list[float]:
-    """Return the times in s, from 0 to `end`, of the recording that the frames show."""
-    step = clip.speed / clip.frame_rate
-    return [step * i for i in range(math.floor(end / step) + 1)]
+    found = (name for library, name in BACKENDS.items() if chosen in ("disabled", name) and find_library(library))
+    return next(found, "")
 
 
 def write(bag: Bag, clip: Clip, console: "Console") -> None:
     """Write the clip of a recording, and print where it is. Raises DataError."""
     os.environ["MUJOCO_GL"] = backend()
-    from rich.progress import track
-
     from exo_gravity.tools.reporting.clip import write_clip
 
-    times = frame_times(min(float(recording.time[-1]) for recording in bag.recordings), clip)
-    hidden = not console.is_terminal
-    drawn = track(times, f"drawing {clip.path.name}", console=console, transient=True, disable=hidden)
-    write_clip(bag, clip.path, times, clip.frame_rate, drawn)
+    write_clip(bag, *clip, console)
     console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

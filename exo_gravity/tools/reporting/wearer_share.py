@@ -5,29 +5,20 @@ recording are those of its start.
 """
 
 from bisect import bisect_left
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from exo_gravity.bag.content import Bag
-from exo_gravity.core.compensation.settings import compensator_table, settings_of
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.compensation.settings import settings_of
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.model.kinematics import turning_in_base
 from exo_gravity.core.model.rotation import ZERO, Floats3
 from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.observer.momentum import COVER
 from exo_gravity.core.observer.share import WINDOW, Share, WearerCurve, observed, share_of, while_between
 from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.inputs.parameter_file import node_of, recorded_of
-from exo_gravity.tools.reporting import html
-from exo_gravity.tools.reporting.figures import WIDTH
-from exo_gravity.tools.reporting.table import joint_labels
-
-CAPTION = (
-    "The wearer's torque at each joint, and his share of the torque that carries his arm, each with its 95 % band. A "
-    "band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md."
-)
+from exo_gravity.tools.inputs.arms import recorded_of
 
 
 class WearerPart(NamedTuple):
@@ -38,33 +29,28 @@ class WearerPart(NamedTuple):
     whole: Share  #: over the recording
 
 
-def of_arm(bag: Bag, recording: Recording) -> WearerPart | str:
-    """Return what the wearer of an arm did, or why that is not known: a sentence, '' if no wearer is set."""
-    name = recording.name
-    unknown = f"{name}: the wearer's torque is not known: "
-    given = recorded_of(bag.parameters, node_of(name, "compensator"))
-    if given is None:
-        return ""
-    values: dict[str, Any] = {param.name: given.get(param.name, param.default) for param in compensator_table(given)}
-    try:
-        settings = settings_of({**values, "law": "exact"})
-    except ParameterError as error:
-        return f"{unknown}{error}"
-    if not any(settings.wearer_mass):
-        return ""  # his arm's weight would count as his torque
-    upright, times, rows = (Tilt.of(settings.side), ZERO), bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
+def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
+    """Return what the wearer of an arm did, None if no wearer is set or the arm was never carried.
+
+    Raises ParameterError or DataError that says why it is not known.
+    """
+    values = recorded_of(bag.parameters, recording.name, "compensator")
+    settings = settings_of({**values, "law": "exact"}) if values else None
+    if settings is None or not any(settings.wearer_mass):
+        return None  # without a wearer in the model, his arm's weight would count as his torque
+    times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
     if settings.use_imu and not times:
-        return f"{unknown}the recording has no /imu/data"
+        raise DataError("the recording has no /imu/data")
 
     def trunk_at(now: float) -> tuple[Tilt, Floats3]:
         if not settings.use_imu:
-            return upright
+            return Tilt.of(settings.side), ZERO
         row = rows[min(bisect_left(times, now), len(rows) - 1)]
         return Tilt.of_felt(settings.side, row[3:]), turning_in_base(settings.side, row[:3])
 
     curve = observed(settings, recording.time, (recording.position, recording.velocity, recording.effort), trunk_at)
     curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
-    return WearerPart(curve, share_of(curve, WINDOW), share_of(curve)) if len(curve.time) else ""
+    return WearerPart(curve, share_of(curve, WINDOW), share_of(curve)) if len(curve.time) else None
 
 
 def sentence(part: WearerPart) -> str:
@@ -76,22 +62,3 @@ def sentence(part: WearerPart) -> str:
     value = f"{100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
     doubt = "" if abs(share.value) > band else ": not distinguishable from zero"
     return f"The wearer carried {value}{doubt}."
-
-
-def figure(recording: Recording, part: WearerPart) -> Figure:
-    """Return torques and share over time, with their bands."""
-    drawn, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
-    axes = drawn.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
-    rows = [*curve.torque.T, 100.0 * part.sliding.value]
-    bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
-    names = [f"{label} (Nm)" for label in joint_labels(recording)]
-    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*html.JOINT_COLOURS, html.INK], strict=True)
-    for axis, values, band, name, colour in columns:
-        axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
-        axis.plot(curve.time, values, color=colour, lw=1.0)
-        axis.axhline(0.0, color=html.FAINT, lw=0.6, zorder=0)
-        axis.set_title(name, loc="left", fontsize=9, color=colour)
-        html.make_plain(axis)
-    axes[-1].set_ylim(-60.0, 160.0)
-    axes[-1].set_xlabel("Time (s)")
-    return drawn
