@@ -92,7 +92,7 @@ def _gained(records: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return when no hand was on the arm (n,), and the speed (n, 4) in rad/s gained HAND_OFF s after it and at once."""
     time, touched = records["time"], records["wearer"].any(axis=1)
     since = time - np.maximum.accumulate(np.where(touched, time, -np.inf))
-    return ~touched, *(_gained_while(records, since > pause) for pause in (HAND_OFF, 0.0))
+    return ~touched, _gained_while(records, since > HAND_OFF), _gained_while(records, since > 0.0)
 
 
 def _gained_while(records: np.ndarray, is_free: np.ndarray) -> np.ndarray:
