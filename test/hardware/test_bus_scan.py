@@ -10,7 +10,7 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_command
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.can.bus_scan import NOTHING, BusScan
+from exo_gravity.hardware.can.bus_scan import DAMPED, BusScan
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.sim import Firmware
 
@@ -47,16 +47,16 @@ def test_every_motor_is_found_with_its_reply_length_and_angle(wire: Wire, firmwa
     assert answers[0].error == (None if firmware.reply_length == 6 else 0)
 
 
-def test_the_scan_sends_only_commands_without_gains_and_torque(wire: Wire) -> None:
+def test_the_scan_sends_only_commands_of_damping_without_torque(wire: Wire) -> None:
     listener = Responder(wire)
     with scan_of(wire) as bus:
         bus.scan()
     assert {message.arbitration_id for message in listener.received} == set(range(1, 127))
-    assert {bytes(message.data) for message in listener.received} == {NOTHING}
-    assert NOTHING not in (ENTER, SET_ZERO)
+    assert {bytes(message.data) for message in listener.received} == {DAMPED}
+    assert DAMPED not in (ENTER, SET_ZERO)
     for spec in SPECS:
-        command = unpack_command(spec, NOTHING)
-        assert (command.kp, command.kd) == (0.0, 0.0)
+        command = unpack_command(spec, DAMPED)
+        assert (command.kp, command.kd) == (0.0, 5.0)
         assert abs(command.torque) < 0.005
 
 
@@ -133,7 +133,7 @@ def test_a_bus_whose_motors_a_dead_bridge_may_have_left_on_is_refused_and_releas
 
 
 @pytest.mark.parametrize(
-    ("command", "can_id"), [(frame(2, NOTHING), 2), (frame(0x0803, bytes(8), is_extended_id=True), 2051)]
+    ("command", "can_id"), [(frame(2, DAMPED), 2), (frame(0x0803, bytes(8), is_extended_id=True), 2051)]
 )
 def test_a_bus_on_which_another_host_commands_a_motor_is_refused(wire: Wire, command: can.Message, can_id: int) -> None:
     wire.repeat(command, 0.01)
@@ -156,7 +156,7 @@ def test_motors_of_both_formats_are_found_on_one_bus_and_the_v3_boards_are_sent_
     assert [answer.position for answer in answers] == pytest.approx([0.5, -0.2, 1.0, 0.3], abs=0.02)
     assert (answers[1].temperature, answers[1].error, answers[1].reply_id) == (30, 0, 0x2902)
     assert sorted(polled) == [1, 2, 3, 4]
-    sent = {message.arbitration_id for message in listener.received if bytes(message.data) == NOTHING}
+    sent = {message.arbitration_id for message in listener.received if bytes(message.data) == DAMPED}
     assert sent == {1, 3, 5, 6}
     assert not device.powered
 

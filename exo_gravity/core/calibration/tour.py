@@ -38,6 +38,7 @@ UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained
 SATURATION = 0.1  # s for which a joint may want more than its max_effort
 MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
+LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
@@ -64,7 +65,7 @@ class Tour:
         self._now = -math.inf
         self._position = np.zeros(JOINT_COUNT)  # rad, at the end of the present line
         self._skipped = 0  # poses
-        self._awaits_plan = False
+        self._awaits_plan, self._undecided = False, 0.0  # whether a pose is to be chosen, and s since then
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
         self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
         self._unexplained = np.zeros(JOINT_COUNT)  # s
@@ -91,6 +92,7 @@ class Tour:
             self._tracker.lines = self._way()
         dt, self._now = now - self._now, now
         self.elapsed += dt
+        self._undecided = self._undecided + dt if self._awaits_plan else 0.0
         if now - self._refreshed > REFRESH_PERIOD:
             self._refreshed, moments = now, self._guess.common_moments[:JOINT_COUNT]
             self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
@@ -103,6 +105,8 @@ class Tour:
         """Return what is wrong after `dt` s with the motion, or ''; velocity: (4,) rad/s."""
         if dt > MAX_GAP:
             return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
+        if self._undecided > LONGEST_CHOICE:
+            return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, velocity, strict=True):

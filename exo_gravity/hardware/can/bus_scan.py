@@ -1,9 +1,9 @@
 """Finds the AK motors on a bus without moving any, whatever the wire formats of their boards.
 
-V1 and V2 boards: a motor that is off still answers a command frame. The scan sends each ID a command with zero gains
-and zero torque, whose bytes are the same for every motor type: all ranges but those of the gains are symmetric. ENTER
-is never sent, so torque never flows. IDs above `MAX_CAN_ID` are not scanned: there, an echoed command could be taken
-for a reply.
+V1 and V2 boards: a motor that is off still answers a command frame. The scan sends each ID a command with damping
+alone, whose bytes are the same for every motor type: the gains' ranges are, and the other ranges are symmetric. ENTER
+is never sent, so torque never flows; a motor that was left on lowers its joint under damping. IDs above `MAX_CAN_ID`
+are not scanned: there, an echoed command could be taken for a reply.
 
 V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on.
 """
@@ -19,13 +19,14 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 
 SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
-NOTHING = pack_command(SPEC, 0.0, 0.0, 0.0, 0.0, 0.0)
+DAMPED = pack_command(SPEC, 0.0, 0.0, 0.0, DAMPING, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 ATTEMPTS = 2  # for each ID, in case a frame is lost
@@ -166,9 +167,9 @@ class BusScan(contextlib.ExitStack):
     def _ask(self, can_id: int) -> Iterator[tuple[can.Message, MotorAnswer | None]]:
         """Send one command; yield the frames with 11-bit IDs that arrive within REPLY_TIME, each with its answer."""
         list(self._port.waiting())  # read: what came before is no answer
-        self._port.send((can_id, NOTHING))
+        self._port.send((can_id, DAMPED))
         for message, _, answer in self._frames(REPLY_TIME):
-            if not message.is_extended_id and message.data != NOTHING:  # our own command, echoed by the bus
+            if not message.is_extended_id and message.data != DAMPED:  # our own command, echoed by the bus
                 yield message, answer
 
     def _frames(self, duration: float) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:

@@ -174,6 +174,14 @@ def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_rea
     assert tour.trouble == "the next pose could not be chosen: LinAlgError: Singular matrix"
 
 
+def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    tour, step = Tour(LIMITS, guess, fixed([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
+    efforts = [tour.step(0.05 * cycle, *step) for cycle in range(610)]
+    assert efforts[590] is not None and efforts[-1] is None
+    assert tour.trouble.startswith("the next pose was not chosen within 30 s")
+
+
 def test_a_line_keeps_speed_and_acceleration_and_arrives():
     line = Line(np.zeros(4), np.array((1.0, -0.5, 0.0, 0.2)))
     times = np.arange(0.0, line.duration, 0.001)
