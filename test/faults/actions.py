@@ -184,9 +184,10 @@ def start_second_bridge(namespace: str) -> Action:
 
 
 def has_refused(rig: Rig) -> None:
-    """Check that the second bridge has refused to run."""
+    """Check that the second bridge has refused to run, and has named the owner of the bus."""
     code, log = rig.second_bridge
     assert code not in (0, None), f"a second can_bridge ran on the same bus: {log[-1:]}"
+    assert any("is held by" in line for line in log), f"a second can_bridge ended without naming the owner: {log[-1:]}"
 
 
 def second_bridge(
