@@ -27,7 +27,7 @@ KEYS: Mapping[str, frozenset[str]] = {
     # of the page that holds control
     "enable": ARM,
     "clear_fault": ARM,
-    "resume": ARM,  # clear and enable, after a fault that was no one's
+    "resume": ARM,  # clear and enable, after a fault that leaves nothing to repair
     "set": frozenset({"arm", "values"}),  # parameters of the compensator
     "weigh": ARM,  # what the hand holds; the compensator's diagnostics tell
     "bring_home": ARM,  # a simulated arm: its virtual wearer lets it hang

@@ -241,7 +241,7 @@ def let_down_by(code: FaultCode) -> SafetyRun:
     return arm.until(State.FAULT)
 
 
-@pytest.mark.parametrize("code", [code for code in FaultCode if code.is_no_ones])
+@pytest.mark.parametrize("code", [code for code in FaultCode if code.is_resumable])
 def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_from_where_it_is(code):
     arm = let_down_by(code)
     assert arm.machine.resume(arm.now)
@@ -253,7 +253,7 @@ def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_f
 
 
 def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
-    others = [code for code in FaultCode if not code.is_no_ones]
+    others = [code for code in FaultCode if not code.is_resumable]
     assert {*FaultCode} - {*others} == {
         "motor_silent",
         "command_stale",

@@ -68,13 +68,13 @@ class FaultCode(str, Enum):
 
     meaning: str
     casts_doubt: bool
-    is_no_ones: bool
+    is_resumable: bool
 
     def __new__(cls, value: str, meaning: str, then: str = "") -> "FaultCode":
         """Create a code from its text, its meaning and what follows."""
         code = str.__new__(cls, value)
         code._value_, code.meaning = value, meaning
-        code.casts_doubt, code.is_no_ones = then == RECHECK, then == RESUME
+        code.casts_doubt, code.is_resumable = then == RECHECK, then == RESUME
         return code
 
     def __str__(self) -> str:

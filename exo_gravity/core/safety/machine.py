@@ -21,7 +21,7 @@
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
 Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
-casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that was no one's.
+casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that leaves nothing to repair.
 """
 
 import math
@@ -109,7 +109,7 @@ class SafetyMachine:
         """Why `resume` would be refused; '' if it would not."""
         if self.state is not State.FAULT or self.fault is None:
             return f"the arm is {self.state.value}, must be in fault"
-        if not self.fault.code.is_no_ones:
+        if not self.fault.code.is_resumable:
             return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
         return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
 

@@ -87,7 +87,7 @@ class BridgeServices:
         return "" if loop.safety.clear(time.monotonic()) else f"no fault to clear: the arm is {loop.safety.state.value}"
 
     def resume(self, loop: ControlLoop, _request: Trigger.Request) -> str:
-        """Clear a fault that was no one's and enable the arm, where it is."""
+        """Clear a fault that leaves nothing to repair, and enable the arm where it is."""
         why_not = loop.safety.why_not_resumed
         return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
 
