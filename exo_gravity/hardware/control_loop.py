@@ -26,7 +26,7 @@ from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
-SMOOTHING = 0.02  # per cycle, of the measured work time
+WORK_SMOOTHING = 0.02  # per cycle, of the measured work time
 MAX_ERRORS = 3  # unexpected exceptions in a row after which the state machine is no longer trusted
 SUSPENDED = 1.0  # s; less may be a thread that waited between two looks at a clock
 LONGEST_ABSENCE = 5.0  # s without a sign of the owner, while the arm is carried; its longest request takes 2 s
@@ -208,7 +208,7 @@ class ControlLoop:
         except Exception as error:
             self.cycle_errors += 1
             self.cycle_error = f"{type(error).__name__}: {error}"
-        self._work += SMOOTHING * (self._now() - now - self._work)
+        self._work += WORK_SMOOTHING * (self._now() - now - self._work)
 
     def _wait(self, deadline: float) -> float:
         """Wait until `deadline`; return it, or the present time if that is more than a period late.

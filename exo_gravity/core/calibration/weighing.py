@@ -26,7 +26,7 @@ TAKE_OVER = 4.0  # s
 CYCLES = 3  # there and back
 LEAST_LEVER = 0.2  # m, of dz/dq: below, a load needs too little torque
 LEAST_RATE = 80.0  # Hz
-STILL = 0.2  # rad/s of a joint at the start
+START_SPEED = 0.2  # rad/s of a joint at the start
 LARGEST_ERROR = 0.4  # rad of a joint from its path
 PERSISTENCE = 0.3  # s for which a joint may want more than it may have
 LIFTED = 0.5  # kg less than nothing, and
@@ -137,7 +137,7 @@ class Weighing:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
             self.trouble = f"the hand hangs below the joints, where a load needs no torque: {pose}"
             return
-        if fastest > STILL:
+        if fastest > START_SPEED:
             self.trouble = f"the arm moves at {fastest:.2f} rad/s: hold it still"
         wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
         self._worn = np.array(LAWS["exact"](wearer, theta, tilt))  # Nm

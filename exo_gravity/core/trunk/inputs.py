@@ -31,7 +31,7 @@ TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
 # is forgotten by FORGET s a second, faster than a clock gains.
 MAX_LEAD, FORGET = 0.05, 0.002
 MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
-STILL = ZERO  # rad/s
+NO_ROTATION = ZERO  # rad/s
 # A tilt that is late for a moment is turned on, while the trunk can have turned otherwise by at most MAX_TURN: the
 # torque is then off by 10 % of gravity's largest. A quick bow, of 90 degrees in 1.5 s, accelerates by 4 rad/s^2, and so
 # makes the last angular velocity wrong by 0.4 rad/s on average over HOLD. A sender of pitch and roll gives none.
@@ -47,7 +47,7 @@ class TiltInput:
         self.timeout = timeout
         self._side = side
         self._tilt = Tilt.of(side)
-        self._angular_velocity = STILL
+        self._angular_velocity = NO_ROTATION
         self._time = -math.inf  # s, when it was measured
         self._in_time = -math.inf  # s, when the newest one that came in time was measured
         self._arrival = -math.inf
@@ -62,10 +62,10 @@ class TiltInput:
         last measurement, and if `age` is impossible because the clock that stamped it differs from ours.
         """
         if now - self._vector_arrival > self.timeout:
-            self._set(now, lambda: gravity_in_trunk(*Tilt.of(self._side, pitch, roll)[:2]), STILL, age)
+            self._set(now, lambda: gravity_in_trunk(*Tilt.of(self._side, pitch, roll)[:2]), NO_ROTATION, age)
 
     def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = STILL, age: float = 0.0
+        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = NO_ROTATION, age: float = 0.0
     ) -> None:
         """Set gravity's direction (3,) and the angular velocity (3,) rad/s, in the trunk's axes; else as `set_tilt`."""
         self._vector_arrival = now

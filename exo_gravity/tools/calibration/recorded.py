@@ -26,7 +26,7 @@ from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 SPEED = (0.008, 0.35)  # rad/s: slower is held, faster has inertia
-SMOOTHING = 0.2  # s over which the speed is taken
+SPEED_WINDOW = 0.2  # s over which the speed is taken
 EDGE = 0.25  # of the common way of two sweeps, left out at each end, where they turn
 LEAST_WAY = 0.03  # rad that each joint must turn in both directions
 LONGEST_TURN = 3.0  # s between a sweep and the one back
@@ -126,7 +126,7 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     """Yield the runs between `start` and `end` s in which every joint turns slowly without turning round."""
     first, beyond = np.searchsorted(recording.time, start), np.searchsorted(recording.time, end, "right")
     time, position = recording.time[first:beyond], recording.position[first:beyond]
-    later = np.minimum(np.searchsorted(time, time + SMOOTHING), len(time) - 1)
+    later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW), len(time) - 1)
     speed = (position[later] - position) / np.maximum(time[later] - time, 1e-3)[:, None]
     is_slow = np.all((np.abs(speed) >= SPEED[0]) & (np.abs(speed) <= SPEED[1]), axis=1)
     way = np.where(is_slow, np.sign(speed) @ (27, 9, 3, 1), 0.5)
