@@ -226,11 +226,15 @@ def run_bridge(rig: Rig, namespace: str, **options: Any) -> tuple[int | None, li
 
 
 def record_on_a_full_disk(rig: Rig) -> None:
-    """Record the arm for 2 s with a recorder that may write only a small file."""
+    """Record the arm for 2 s with a recorder that may write only a small file.
+
+    It compiles no module: Python would leave a compiled file that is cut, with which no process starts any more.
+    """
     folder: Path = rig.folder / f"recording_{time.monotonic_ns()}"
     command = [executable("recorder"), "--ros-args", "-p", f"output:={folder}"]
     silent = subprocess.DEVNULL
-    recorder = subprocess.Popen(command, stdout=silent, stderr=silent, start_new_session=True)
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    recorder = subprocess.Popen(command, stdout=silent, stderr=silent, env=environment, start_new_session=True)
     resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FILE_SIZE_LIMIT, FILE_SIZE_LIMIT))
     time.sleep(4.0)
     recorder.terminate()

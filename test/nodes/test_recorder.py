@@ -213,7 +213,8 @@ def test_without_an_output_the_node_names_the_missing_parameter_and_ends_with_2(
 
 def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, tmp_path):
     small = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # noqa: E731
-    process = start(tmp_path / "bag", preexec_fn=small)
+    # A compiled module that is cut would keep every later process of this environment from starting.
+    process = start(tmp_path / "bag", preexec_fn=small, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
     arm.wait_until(arm.is_recorded)
     k = 0
     while process.poll() is None and k < 20_000:
