@@ -42,6 +42,11 @@ def compensator(values: dict[str, Any]) -> Action:
     return inject
 
 
+def await_load(rig: Rig) -> None:
+    """Wait until the load has changed: an arm that still sinks takes longer, and no hand may move it meanwhile."""
+    rig.probe.wait_until(lambda: rig.probe.diagnostic("compensator", "changing load") == "none")
+
+
 def load_case(name: str, change: dict[str, Any], back: dict[str, Any], rig: type[Rig] = WearerRig) -> FaultCase:
     return FaultCase(
         name,
@@ -49,7 +54,7 @@ def load_case(name: str, change: dict[str, Any], back: dict[str, Any], rig: type
         rig,
         limit=None,
         outcomes=("active",),
-        clear=in_turn(compensator(back), pause(3.0)),
+        clear=in_turn(compensator(back), pause(3.0), await_load),
         speed_limit=GUIDED_SPEED,
     )
 
