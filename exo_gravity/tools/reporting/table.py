@@ -4,7 +4,7 @@ import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich import box
@@ -15,10 +15,10 @@ from exo_gravity.core.trial.analysis import Hold, Motion, TrialAnalysis
 from exo_gravity.core.trial.recording import Recording
 from exo_gravity.tools.reporting import html
 
-if TYPE_CHECKING:
-    from exo_gravity.tools.reporting.verdict import Report
-
 ROWS = 100_000  # of a time series, that are written at once
+Arm = tuple[Recording, TrialAnalysis]
+Row = Mapping[str, Any]
+
 UNMOVED = 1e-9  # rad; the means of equal positions differ by less
 
 
@@ -127,12 +127,15 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
-def write_csv(folder: Path, kind: Kind, report: "Report") -> None:
-    """Write a table as CSV, a row for each joint; an unknown number is an empty cell. Without rows, write nothing."""
+def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[[str, float], Row]) -> None:
+    """Write a table as CSV, a row for each joint; an unknown number is an empty cell. Without rows, write nothing.
+
+    row_head: returns the first cells of a row, from the arm's name and the time in s.
+    """
     rows = []
-    for recording, analysis in report.arms:
+    for recording, analysis in arms:
         for number, one in enumerate(getattr(analysis, kind.name), 1):
-            shared = {**report.row_head(recording.name, one.start), **kind.lead(number, one)}
+            shared = {**row_head(recording.name, one.start), **kind.lead(number, one)}
             numbers = {column.key: column.of(one) for column in kind.columns}
             for joint, name in enumerate(recording.joint_names):
                 row = {**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}}

@@ -72,7 +72,7 @@ def write(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for kind in table.KINDS:
-            table.write_csv(folder, kind, report)
+            table.write_csv(folder, kind, report.arms, report.row_head)
         if with_time_series:
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
