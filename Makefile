@@ -7,7 +7,7 @@
 # make lint         ruff, mypy, ament's flake8 and pep257, shellcheck
 # make docs         these documents as a site, in build/site; a warning is an error
 # make faults       the whole fault matrix on the simulated device, 40 minutes; a table and build/faults.json
-# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 7 minutes
+# make mutations    deliberate defects, each of which must turn a row of the fault matrix unsafe; 20 minutes
 # make soak         both arms for an hour: live changes, an active wearer, harmless faults; MINUTES=N for less
 # make bench        the laws, the loop and the tools against peers, 15 minutes on a quiet machine; QUICK=1: part of it
 # make ordinary     ordinary motors, sensors and computers for an hour of virtual time: no alarm; a table, 10 minutes
