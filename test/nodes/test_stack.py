@@ -147,7 +147,7 @@ def test_set_zero_makes_the_present_pose_zero_and_is_refused_while_the_arm_is_ca
 @pytest.mark.thorough
 def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(seated, tmp_path):
     path = str(tmp_path / "anfis.json")
-    assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) is None
+    assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) == 0
     assert "anfis_file" in seated.set_parameters("compensator", law="anfis").reason
     assert seated.set_parameters("compensator", atomically=True, law="anfis", anfis_file=path).successful
     seated.wait_until(lambda: seated.diagnostic("compensator", "law") == "anfis")
