@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from exo_gravity.core.model.gravity import LAWS, Torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.gravity import LAWS, Torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.tools.inputs.arms import read_arm
-from exo_gravity.tools.inputs.parameter_file import can_options, load
+from exo_gravity.lab.inputs.arms import read_arm
+from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 
 class DirectArm:

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from exo_gravity.core import gravity_torque
+from exo_gravity.core.arm.gravity import LAWS
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
-from exo_gravity.core.model.gravity import LAWS
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of
-from exo_gravity.tools.inputs.references import pinocchio_model, toolbox_robot
+from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
 from .table import Row, race
 

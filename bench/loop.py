@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.launcher import Launcher
 
 from .direct_arm import DirectArm

@@ -20,24 +20,24 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from exo_gravity.core import paper_static_torque
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.tilt import gravity_in_trunk
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, TermSettings
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, FaultCode
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import PATIENCE
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_wearer import path_between
 

@@ -14,9 +14,9 @@ from bench.baselines.controllers import HELD, INTEGRAL, STIFFNESS, Burden, Contr
 from bench.baselines.growth import growth, sizes
 from bench.effort.exertion import REACH
 from exo_gravity.core import Tilt, gravity_torque
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.tools.inputs.arms import configured_arm
 
 MOTORS_OF_ARM = configured_arm().motors
 POSE = (0.1, 0.9, 0.6, 0.7)

@@ -10,9 +10,9 @@ from unittest.mock import patch
 
 import pytest
 
+from exo_gravity.lab.calibration import live
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import live
-from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 from .calibration.tour import run_tour
 
@@ -20,7 +20,7 @@ from .calibration.tour import run_tour
 def test_too_few_poses_are_reported_with_the_one_that_is_missing_and_nothing_is_fitted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Other trouble: test/core/calibration/test_tour.py."""
+    """Other trouble: test/lab/calibration/test_tour.py."""
     params, output = str(packaged_config("sim.yaml")), str(tmp_path / "new.yaml")
     with patch.object(live, "run_tour", run_tour([])):
         assert calibrate.main(["gravity", "--params", params, "--output", output, "--poses", "3"]) == 1

@@ -13,7 +13,7 @@ from bench.effort.exertion import MIDDLE, POSES, RATE, REACH, TASKS, Exertion, S
 from bench.effort.holds import hold, perturbed_arm
 from bench.effort.report import Results, comparisons, figure, tables, write_csv
 from bench.effort.study import NOTHING, ONE_G, ZERO_G, Study
-from exo_gravity.core.model.kinematics import links_of
+from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.params import device_of
 

@@ -16,12 +16,12 @@ from bench.wearer.strapped_arm import RHYTHM, StrappedArm
 from bench.wearer.straps import table
 from bench.wearer.study import KINDS, Trial
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.calibration.weighing import Weighed
-from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.observer.share import Share, WearerCurve
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.compensation.weighing import Weighed
+from exo_gravity.lab.observer.share import Share, WearerCurve
 from exo_gravity.sim import STEP, ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.script import TrialScript
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 LOAD = Wearer(75.0).on_links(LENGTH)

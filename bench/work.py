@@ -13,13 +13,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.reader import read_bag
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.anfis import from_gravload, train_law
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.reporting import trial_report
-from exo_gravity.tools.trials.offline import simulated_trials
+from exo_gravity.lab.anfis_training import from_gravload, train_law
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.report import trial_report
+from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.sim.script import TrialScript
 
 from .table import Row
 

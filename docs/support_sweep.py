@@ -11,16 +11,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from exo_gravity.core import ArmModel
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.report.html import HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, resting
+from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
-from exo_gravity.tools.reporting.html import HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.sim.script import TrialScript
 
 POSE = [0.3, 0.45, 0.10, 0.4]  # rad; carrying the whole arm of the wearer takes less than rated torque here
 HELD, RELEASED = 30.0, 10.0  # s, how long the hand holds the arm in the pose, and how long the arm is alone

@@ -14,14 +14,14 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from exo_gravity.bag.content import RECORDER
-from exo_gravity.core.calibration.tour import CALIBRATOR
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
-from exo_gravity.core.view.urdf import ROBOT_MODEL
+from exo_gravity.lab.bag.content import RECORDER
+from exo_gravity.lab.calibration.tour import CALIBRATOR
+from exo_gravity.lab.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL
 from exo_gravity.sim.params import SIMULATOR
 

@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 from trunk_motion import LAWS, LOW, MOUNTING, POSES, USUAL, Law, simulate
 
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.sim import ImuConfig
 from exo_gravity.sim.trunk_motion import TrunkState, Walk
 

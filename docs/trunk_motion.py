@@ -21,10 +21,10 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.from_file import trunk_imu
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.offline import trunk_imu
+from exo_gravity.sim.script import TrialScript
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 ASSUMED = ArmModel(LENGTH, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))  # of config/exo.yaml

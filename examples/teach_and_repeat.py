@@ -18,8 +18,8 @@ from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim.script import TrialScript
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 PERIOD = 0.004  # s

@@ -12,7 +12,7 @@ from launch.substitutions import EnvironmentVariable, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools.urdf import urdf_of
 
 

@@ -14,35 +14,25 @@ TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PA
 MAY_IMPORT = {
     "core": {"core"},
     "hardware": {"core", "hardware"},
-    "sim": {"core", "sim"},
-    "nodes": {"core", "hardware", "sim", "bag", "panel", "nodes"},
-    "bag": {"core", "bag"},
-    "panel": {"core", "panel"},
-    "tools": {"core", "bag", "tools"},
+    "sim": {"core", "hardware", "sim"},
+    "lab": {"core", "hardware", "sim", "lab"},
+    "panel": {"core", "sim", "lab", "panel"},
+    "nodes": {"core", "hardware", "sim", "lab", "panel", "nodes"},
+    "tools": {"core", "hardware", "sim", "lab", "tools"},
 }
-# `trial --offline` runs without ROS, so it starts no nodes and uses the simulated device directly. `calibrate motors`
-# asks the motors before there is anything that a node could be started with. `doctor` measures a thread that is
-# favoured like the control loop, and asks whom the nodes' settings let in.
+# `doctor` asks whom the nodes' settings let in.
 EXCEPTIONS = {
-    "exo_gravity/tools/trials/offline.py": {"sim", "hardware"},
-    "exo_gravity/tools/calibration/motors.py": {"hardware"},
-    "exo_gravity/tools/doctor.py": {"hardware", "nodes"},
+    "exo_gravity/tools/doctor.py": {"nodes"},
+    "exo_gravity/lab/calibration/imu.py": {"tools"},
+    "exo_gravity/lab/calibration/live.py": {"tools"},
+    "exo_gravity/lab/report/video.py": {"tools"},
+    "exo_gravity/lab/trial/run.py": {"tools"},
+    "exo_gravity/core/compensation/weighing.py": {"lab"},
 }
+# The path of a torque: what a torque depends on. It imports nothing that looks at arms from outside.
+PATH_NODES = ("can_bridge", "compensator", "imu", "ros")
 # The rooms of core from the bottom up: each imports only those before it, and itself.
-FLOORS = (
-    "errors",
-    "numbers",
-    "params",
-    "motors",
-    "model",
-    "trunk",
-    "safety",
-    "compensation",
-    "observer",
-    "trial",
-    "view",
-    "calibration",
-)
+FLOORS = ("errors", "numbers", "params", "motors", "arm", "trunk", "safety", "compensation")
 MOST_ENTRIES = 12  # on core's first floor
 
 

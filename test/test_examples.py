@@ -20,7 +20,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float32MultiArray
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.arm.wearer import Wearer
 
 from .support import ROOT
 

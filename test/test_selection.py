@@ -37,7 +37,7 @@ def test_a_file_that_needs_a_missing_package_is_left_out(selection: ModuleType, 
     assert selection.left_out["mujoco"] == 1
 
 
-@pytest.mark.parametrize("path", ["test/core/test_motors.py", "test/core", "test/bag/test_events.py"])
+@pytest.mark.parametrize("path", ["test/core/test_motors.py", "test/core", "test/lab/bag/test_events.py"])
 def test_a_file_that_does_not_need_it_is_kept(selection: ModuleType, path: str) -> None:
     assert selection.pytest_ignore_collect(ROOT / path) is None
 

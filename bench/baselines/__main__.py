@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm
+from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm
 
 from . import growth, learned
 from .report import baseline_line, figure, growth_line, write_csv

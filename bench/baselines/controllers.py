@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.effort.exertion import POSES, RATE, REACH, SETTLING, LettingGo, Task, measure, perform
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.sim import STEP, SimulatedDevice

@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.model.anfis import Anfis
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.anfis import rms, train
-from exo_gravity.tools.inputs.arms import ConfiguredArm
+from exo_gravity.core.arm.anfis import Anfis
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.lab.anfis_training import rms, train
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 INPUTS = ("theta_3", "theta_4", "theta_2", "theta_1", "pitch", "tilt")
 COLUMNS = (2, 3, 1, 0, 4, 5)  # of theta_1..theta_4, pitch, tilt

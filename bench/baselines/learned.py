@@ -28,13 +28,13 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neural_network import MLPRegressor
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.model.gravity import LAWS, gravity_torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.gravity import LAWS, gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.lab.anfis_training import rms
+from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.inputs.references import gravload
 from exo_gravity.sim.params import SIMULATOR, device_of
-from exo_gravity.tools.anfis import rms
-from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
-from exo_gravity.tools.inputs.references import gravload
 
 from .controllers import Burden, Feedforward, Law, burden
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.tools.reporting.html import JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.html import JOINT_COLOURS, make_plain
 
 from .growth import Growth
 from .learned import Baseline

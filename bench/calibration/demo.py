@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from exo_gravity.core.trial.recording import Recording, ScriptedStep
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.calibration.result import Change, write_changes
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.report.html import FAINT, INK, JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.table import joint_labels
+from exo_gravity.lab.trial.from_file import OfflineTrial, simulated_trials
+from exo_gravity.lab.trial.recording import Recording, ScriptedStep
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration.result import Change, write_changes
-from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, make_plain
-from exo_gravity.tools.reporting.table import joint_labels
-from exo_gravity.tools.trials.offline import OfflineTrial, simulated_trials
 
 SIMULATOR, COMPENSATOR = "/right/simulator", "/right/compensator"
 DEVICE = (

@@ -12,12 +12,12 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.tools.inputs.arms import ConfiguredArm
 
 TURN = (0.45, 0.7)  # rad, by which a joint is moved
 CLUMSY = 0.25  # of it, by which the other joints move along

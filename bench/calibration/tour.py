@@ -16,20 +16,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from exo_gravity.core.calibration.tour import CALIBRATOR, Tour, tour_of
-from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, UNKNOWN, JointSample, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.lab.calibration.live import LiveTour
+from exo_gravity.lab.calibration.tour import CALIBRATOR, Tour, tour_of
+from exo_gravity.lab.inputs.arms import node_values
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of
-from exo_gravity.tools.calibration.live import LiveTour
-from exo_gravity.tools.inputs.arms import node_values
-from exo_gravity.tools.inputs.parameter_file import load
 
 LONGEST = 420.0  # s
 HANDS, SINKING = 1.0, 5.0  # Nm s/rad of the hands that let the arm hang, and s that it takes

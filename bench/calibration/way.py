@@ -18,16 +18,16 @@ from unittest.mock import patch
 import numpy as np
 import yaml
 
-from exo_gravity.core.calibration.identification import Identified
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.tilt import rotation_matrix
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import rotation_matrix
+from exo_gravity.lab.calibration import live, motors, tours
+from exo_gravity.lab.calibration.identification import Identified
+from exo_gravity.lab.calibration.live import LiveTour, Person
+from exo_gravity.lab.calibration.result import CalibrationResult
+from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, node_values
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import live, motors, tours
-from exo_gravity.tools.calibration.live import LiveTour, Person
-from exo_gravity.tools.calibration.result import CalibrationResult
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arm, node_values
-from exo_gravity.tools.inputs.parameter_file import load
 
 from . import demo
 from .device import SIMULATOR as SIMULATOR_NODE

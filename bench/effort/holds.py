@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 from .exertion import POSES, RATE, SETTLING, LettingGo, perform
 from .study import BOTH, WEARER_EXCESS, settings_by_name

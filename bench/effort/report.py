@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from exo_gravity.tools.reporting.html import FAINT, JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.html import FAINT, JOINT_COLOURS, make_plain
 
 from .exertion import Exertion
 from .study import NOTHING, ONE_G, ZERO_G

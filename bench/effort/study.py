@@ -19,6 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.kinematics import least_inertia, links_of
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -30,13 +34,9 @@ from exo_gravity.core.compensation.terms.catalogue import (
     Spring,
 )
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.kinematics import least_inertia, links_of
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim.params import SIMULATOR, device_of
-from exo_gravity.tools.inputs.arms import ConfiguredArm, node_values, read_arm
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 from .exertion import MIDDLE, REACH, TASKS, Exertion, measure
 

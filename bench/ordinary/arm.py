@@ -14,22 +14,22 @@ from typing import cast
 
 import numpy as np
 
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.core.safety.drive import EffortCommand, State
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.lab.inputs.arms import read_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
-from exo_gravity.tools.inputs.arms import read_arm
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.sim.script import TrialScript
 from test.hardware.virtual_time import VirtualClock, Wire
 from test.support.imu_drivers import Timing
 from test.support.simulated_device import joints_of

@@ -17,22 +17,22 @@ import numpy as np
 
 from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
 from bench.motion_monitor import MOTOR_NAMES
-from exo_gravity.core.calibration.identification import identify
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque, moments_of
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque, moments_of
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import Vector
+from exo_gravity.lab.calibration.identification import identify
+from exo_gravity.lab.calibration.tours import moments_from, wearer_from
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.tools.calibration.tours import moments_from, wearer_from
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import packaged_config
 from test.support.random_device import LEANING, LENGTH, Device, off_axis_of
 
 STRIBECK = 0.05  # Nm

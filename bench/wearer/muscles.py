@@ -15,11 +15,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.sim import STEP, VirtualWearer
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_wearer import path_between
 
 STIFFNESS, DAMPING, INTEGRAL = (15.0, 25.0, 20.0, 8.0), (1.0, 2.0, 1.5, 0.5), (15.0, 25.0, 20.0, 8.0)

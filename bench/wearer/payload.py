@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.calibration.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.script import TrialScript
 
 from ..device_study import Row
 from .devices import Worn

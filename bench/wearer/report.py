@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from exo_gravity.core.observer.momentum import COVER, ContactWatch, WearerEstimate
-from exo_gravity.core.observer.share import WINDOW, share_of
-from exo_gravity.tools.reporting.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
+from exo_gravity.lab.observer.momentum import COVER, ContactWatch, WearerEstimate
+from exo_gravity.lab.observer.share import WINDOW, share_of
+from exo_gravity.lab.report.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 
 from ..device_study import Row
 from .study import KINDS, METHODS, Trial

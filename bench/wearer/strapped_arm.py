@@ -13,8 +13,8 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.sim import ArmConfig, SimulatedArm, VirtualWearer
 from exo_gravity.sim import arm as arms
 

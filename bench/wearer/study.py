@@ -18,20 +18,20 @@ from typing import Any
 
 import numpy as np
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.kinematics import turning_in_base
-from exo_gravity.core.model.tilt import Tilt, gravity_in_trunk
-from exo_gravity.core.observer.momentum import BANDWIDTH, REFERENCE, MomentumObserver
-from exo_gravity.core.observer.share import Share, WearerCurve, observed, share_of
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.observer.momentum import BANDWIDTH, REFERENCE, MomentumObserver
+from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 
 from .devices import Worn, turned

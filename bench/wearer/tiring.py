@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.observer.adaptation import SupportAdaptation
-from exo_gravity.core.observer.momentum import MomentumObserver
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.lab.observer.adaptation import SupportAdaptation
+from exo_gravity.lab.observer.momentum import MomentumObserver
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.script import TrialScript
 
 from ..device_study import Row
 from .devices import Worn

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 
 from ..device_study import Row
 from .devices import Worn

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import (
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.rotation import (
     ZERO,
     Floats3,
     Quaternion,
@@ -27,7 +26,8 @@ from exo_gravity.core.model.rotation import (
     unit_quaternion,
     up_in_body,
 )
-from exo_gravity.core.model.tilt import angle_between, pitch_roll, rotation_matrix
+from exo_gravity.core.arm.tilt import angle_between, pitch_roll, rotation_matrix
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk import imu_checks
 from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range

@@ -1,7 +1,7 @@
 """calibrator: moves the arm through the poses of a calibration, in the compensator's place.
 
 It answers joint states with efforts as `compensator` does. While the bridge starts, it answers with the expected weight
-of the hanging arm; once the bridge reports `active`, the tour (core/calibration/tour.py) begins. After trouble it
+of the hanging arm; once the bridge reports `active`, the tour (lab/calibration/tour.py) begins. After trouble it
 withdraws, so that the bridge lets the arm down. It prints one line of JSON for each event:
 
     {"progress": "pose 3 of 12: ..."}   {"observation": {"theta": [4 rad], ..., "speed": 0.1}}
@@ -19,11 +19,11 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run

@@ -19,7 +19,6 @@ from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of
-from exo_gravity.core.trial.script import IDLE, Step, TrialScript
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.imu import message_of
@@ -30,6 +29,7 @@ from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.sim import SimulatedImu, VirtualWearer
 from exo_gravity.sim.device import MAX_CATCH_UP
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.script import IDLE, Step, TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt

@@ -23,9 +23,9 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.core.trial.session import Session, check_text
+from exo_gravity.lab.trial.session import Session, check_text
 from exo_gravity.panel.view import OF_SUBJECT
+from exo_gravity.sim.script import TrialScript
 
 STOP_TIMEOUT = 10.0  # s for a recorder to end
 WEARER, REPORT = "wearer.yaml", "report.html"

@@ -10,7 +10,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.params import Param
-from exo_gravity.core.view.urdf import described, urdf
+from exo_gravity.lab.view.urdf import described, urdf
 
 # fmt: off
 PANEL = (

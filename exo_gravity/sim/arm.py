@@ -23,11 +23,11 @@ os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJ
 import mujoco
 import numpy as np
 
+from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
+from exo_gravity.core.arm.gravity import MAX_OFFSET
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
-from exo_gravity.core.model.gravity import MAX_OFFSET
-from exo_gravity.core.model.rotation import ZERO, Floats3
-from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.core.numbers import JOINT_COUNT, four_floats
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState

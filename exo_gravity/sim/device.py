@@ -22,9 +22,9 @@ import can
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.trial.script import IDLE
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
 from exo_gravity.sim.motor import SimulatedMotor
+from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.virtual_wearer import VirtualWearer

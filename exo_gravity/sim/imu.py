@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.model.arm import MAX_GRAVITY, STANDARD_GRAVITY
-from exo_gravity.core.model.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
+from exo_gravity.core.arm.arm import MAX_GRAVITY, STANDARD_GRAVITY
+from exo_gravity.core.arm.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState

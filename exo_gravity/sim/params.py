@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.model.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.arm.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
 from exo_gravity.core.params import Param, param_of, params_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm

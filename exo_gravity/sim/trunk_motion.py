@@ -9,9 +9,9 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of
-from exo_gravity.core.trial.script import Step
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of
+from exo_gravity.sim.script import Step
 
 # Hip to shoulder: 0.288 of the stature (0.818 - 0.530, Drillis and Contini 1966, in Winter, Biomechanics and Motor
 # Control of Human Movement) of 1.75 m. The shoulder's distance from the spine is neglected.

@@ -8,9 +8,9 @@ limited to the strength of a hand. Hold: no torque. Push: half a sine wave of th
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import minimum_jerk
 
 # The hand's compliance in Nm/rad, Nm s/rad and Nm/(rad s): of the order of a human arm's; least damping where the arm

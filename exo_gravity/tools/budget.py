@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.errors import named
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.budget import (
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.budget import (
     USUAL_TILT,
     JointBudget,
     budget,
@@ -28,10 +27,11 @@ from exo_gravity.core.model.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.core.model.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.arm.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.errors import named
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arms
 from exo_gravity.tools.cli import exit_code
-from exo_gravity.tools.inputs.arms import ConfiguredArm, configured_arms
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

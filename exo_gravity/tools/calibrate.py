@@ -13,13 +13,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.tools.cli import extras, require_ros
-from exo_gravity.tools.inputs.arms import configured_arm
 
 if TYPE_CHECKING:
-    from exo_gravity.tools.calibration.result import CalibrationResult
+    from exo_gravity.lab.calibration.result import CalibrationResult
 
 # Module in tools/calibration, and what the command finds.
 COMMANDS = {
@@ -79,9 +79,9 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from exo_gravity.tools.calibration.imu import with_mounting
-    from exo_gravity.tools.calibration.live import Person
-    from exo_gravity.tools.calibration.result import check_output, page_of, write_changes
+    from exo_gravity.lab.calibration.imu import with_mounting
+    from exo_gravity.lab.calibration.live import Person
+    from exo_gravity.lab.calibration.result import check_output, page_of, write_changes
 
     command: str = options.command
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
@@ -95,7 +95,7 @@ def _run(options: argparse.Namespace) -> int:
     arm = None if command == "imu" else configured_arm(options.params, options.side)
     if options.bag is None and command != "motors":
         require_ros("calibrate")
-    module = import_module(f"exo_gravity.tools.calibration.{COMMANDS[command][0]}")
+    module = import_module(f"exo_gravity.lab.calibration.{COMMANDS[command][0]}")
     calibrate: Callable[..., CalibrationResult] = getattr(module, f"calibrate_{command}")
     result = with_mounting(calibrate(options, arm, person.say), options.params)
     for line in (*(change.text for change in result.changes), *result.lines):

@@ -30,9 +30,9 @@ from exo_gravity.core.errors import ExoGravityError, named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, Traffic, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, FROZEN, check_bridge, limits_of
 from exo_gravity.hardware.clock import favour, request_real_time
+from exo_gravity.lab.inputs.arms import node_values
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, load, packaged_config, stages
 from exo_gravity.tools.cli import extras, non_negative, require_ros
-from exo_gravity.tools.inputs.arms import node_values
-from exo_gravity.tools.inputs.parameter_file import Nodes, can_options, check_buses, load, packaged_config, stages
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -35,8 +35,8 @@ import yaml
 
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.lab.inputs.parameter_file import Loader, check_buses, load, packaged_config, stages
 from exo_gravity.tools.cli import require_ros
-from exo_gravity.tools.inputs.parameter_file import Loader, check_buses, load, packaged_config, stages
 
 NODES_PACKAGE = "exo_gravity.nodes."
 ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator

@@ -11,9 +11,9 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
+from exo_gravity.lab.report import video
+from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.tools.cli import exit_code, non_negative
-from exo_gravity.tools.reporting import video
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -45,7 +45,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _repair(options: argparse.Namespace) -> int:
-    from exo_gravity.bag.writer import is_complete, repair
+    from exo_gravity.lab.bag.writer import is_complete, repair
 
     path = Path(options.bag)
     if is_complete(path):
@@ -59,8 +59,8 @@ def _repair(options: argparse.Namespace) -> int:
 def _run(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from exo_gravity.bag.reader import read_bag
-    from exo_gravity.tools.reporting import trial_report
+    from exo_gravity.lab.bag.reader import read_bag
+    from exo_gravity.lab.report import trial_report
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),

@@ -10,11 +10,11 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.model.anfis import JOINTS
-from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.arm.anfis import JOINTS
+from exo_gravity.core.arm.tilt import SIDES
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.cli import exit_code
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.references import PAPER_ANFIS
 
 RECORDED_RIDGE = 0.03  # larger, because recorded torques contain noise and stiction that the law must not learn
 
@@ -33,7 +33,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     """Train, save the law and print its errors; return 0."""
-    from exo_gravity.tools.anfis import RIDGE, from_bag, from_gravload, train_law
+    from exo_gravity.lab.anfis_training import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)
     configured = configured_arm(options.params, options.side)

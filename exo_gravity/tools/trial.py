@@ -27,19 +27,19 @@ import yaml
 from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.params import params_of
-from exo_gravity.core.trial.analysis import MIN_HOLD, HoldCriteria
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.core.trial.session import Session
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.report import video
+from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
+from exo_gravity.lab.trial.session import Session
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools.cli import extras
-from exo_gravity.tools.inputs.parameter_file import packaged_config
 from exo_gravity.tools.launcher import stop_on_signals
-from exo_gravity.tools.reporting import video
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from exo_gravity.bag.content import Bag
-    from exo_gravity.tools.reporting.trial_report import Report
+    from exo_gravity.lab.bag.content import Bag
+    from exo_gravity.lab.report.trial_report import Report
 
 # One position code over a minute is 0.02 degrees, so the rate over a much shorter hold means little.
 LONG_HOLD = 30.0  # s
@@ -70,7 +70,7 @@ def analysed(bag: "Bag", script: TrialScript, guided: bool, trouble: str) -> tup
 
     If every hold of the script is long enough, the drift rate is limited too.
     """
-    from exo_gravity.tools.reporting import trial_report
+    from exo_gravity.lab.report import trial_report
 
     holds = [step.duration for step in script.steps if step.action == "hold"]
     rate = MAX_RATE if min(holds, default=0.0) >= LONG_HOLD else math.inf
@@ -87,9 +87,9 @@ def analysed(bag: "Bag", script: TrialScript, guided: bool, trouble: str) -> tup
 
 def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, console: "Console") -> int:
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
-    from exo_gravity.bag.reader import read_bag
-    from exo_gravity.tools.reporting import trial_report
-    from exo_gravity.tools.trials.run import ADVICE, BUSY_CODE, Trial, is_guided, run_attempts
+    from exo_gravity.lab.bag.reader import read_bag
+    from exo_gravity.lab.report import trial_report
+    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, is_guided, run_attempts
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         if clip:
             os.environ["MUJOCO_GL"] = video.backend()  # before the simulated device imports MuJoCo
         with extras("trial", "sim"):
-            from exo_gravity.tools.trials.offline import record_offline
+            from exo_gravity.lab.trial.from_file import record_offline
         end = record_offline(trial, console, stopped.is_set)
     else:
         trial.prepare()

@@ -10,11 +10,11 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import named
-from exo_gravity.core.model.tilt import SIDES
-from exo_gravity.core.view.urdf import described, urdf
+from exo_gravity.lab.inputs.arms import configured_arm, configured_arms
+from exo_gravity.lab.view.urdf import described, urdf
 from exo_gravity.tools.cli import exit_code
-from exo_gravity.tools.inputs.arms import configured_arm, configured_arms
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from exo_gravity.core.model.tilt import SIDES
+from exo_gravity.core.arm.tilt import SIDES
+from exo_gravity.lab.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.tools.cli import exit_code
-from exo_gravity.tools.inputs.arms import configured_arm, with_cog_at_link_ends
 
 COUNT, QUICK_COUNT = 100_000, 2_000  # random poses per limit of the tilt
 
@@ -31,7 +31,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     """Run the comparison and print it; return 1 unless all checks held."""
-    from exo_gravity.tools.comparison import CONFIGURED, LINK_ENDS, checks, evaluate, tables, write
+    from exo_gravity.lab.comparison import CONFIGURED, LINK_ENDS, checks, evaluate, tables, write
 
     configured = configured_arm(options.params, options.side)
     output = Path(options.output)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt
+from exo_gravity.core.arm.anfis import Anfis, AnfisLaw, grades
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis import Anfis, AnfisLaw, grades
 
 ARM = ArmModel((0.05, 0.13, 0.30, 0.30), (0.04, 0.10, 0.2, 0.12), (0.5, 0.4, 0.6, 0.2))
 UPRIGHT = Tilt.of("right")

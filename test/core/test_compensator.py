@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, GuidedChange
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.trunk.inputs import HOLD, MAX_LEAD
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with

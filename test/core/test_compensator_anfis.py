@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.anfis import Anfis, AnfisLaw
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME
 from exo_gravity.core.compensation.guidance import FADE_TIME
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.anfis import Anfis, AnfisLaw
-from exo_gravity.core.model.tilt import Tilt
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.model.kinematics import turning_torque
+from exo_gravity.core.arm.kinematics import turning_torque
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import LAWS, ArmModel, Tilt, gravity_torque, paper_mobile_torque, paper_static_torque
-from exo_gravity.tools.inputs.references import gravload, pinocchio
+from exo_gravity.lab.inputs.references import gravload, pinocchio
 
 ROUNDING = 1e-12  # Nm
 DOWN = np.array((0.0, 0.0, 1.0))

@@ -10,10 +10,10 @@ import pytest
 
 import exo_gravity.sim.arm
 from exo_gravity.core import ArmModel
-from exo_gravity.core.model.kinematics import least_inertia, links_of, turning_torque
+from exo_gravity.core.arm.kinematics import least_inertia, links_of, turning_torque
+from exo_gravity.lab.inputs.references import OFFSET, pinocchio_model
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, in_base
-from exo_gravity.tools.inputs.references import OFFSET, pinocchio_model
 
 from .test_gravity_oracles import random_arm
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import MOMENTS, load_moments, moments_of, regressor
-from exo_gravity.tools.inputs.references import ALPHA, OFFSET
+from exo_gravity.lab.inputs.references import ALPHA, OFFSET
 
 from ..support.random_device import off_axis_of
 

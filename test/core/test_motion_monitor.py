@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from bench.motion_monitor import HANGING, bounded, caught, flipped, misread, quiet, settings_of, sound
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.safety.drive import NOTHING, FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.core.safety.motion_monitor import MotionMonitor

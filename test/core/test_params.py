@@ -12,7 +12,7 @@ from exo_gravity.core.compensation.guidance import LONGEST_STEP
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import GONE, values_of
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.lab.inputs.parameter_file import load
 
 LIVE = [param for param in COMPENSATOR if not param.fixed]
 WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])

@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.arm.kinematics import links_of
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.guidance import MAX_FADE_RATE, DropWatch
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import moments_of
-from exo_gravity.core.model.kinematics import links_of
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
+from exo_gravity.sim.script import TrialScript
 
 from ..support.compensator_run import THETA, CompensatorRun, settings_with
 from .test_gravity_oracles import random_arm

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import LAWS
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import LAWS
-from exo_gravity.core.model.tilt import Tilt, gravity_in_trunk, pitch_roll, rotation_matrix
 
 # Base frame of the left arm in trunk axes: x0 left, y0 forward, z0 down.
 LEFT_BASE_FROM_TRUNK = np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1)))

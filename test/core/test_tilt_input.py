@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.arm.tilt import angle_between, pitch_roll
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import angle_between, pitch_roll
 from exo_gravity.core.trunk.inputs import HOLD, TILT_SPEED, TiltInput
-from exo_gravity.tools.inputs.references import pinocchio
+from exo_gravity.lab.inputs.references import pinocchio
 
 from ..support.compensator_run import ROBOT, THETA, CompensatorRun
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.wearer import SEX, TABLES, Wearer
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.wearer import SEX, TABLES, Wearer
 
 LENGTHS = (0.28, 0.27, 0.086)
 LINKS = (0.05, 0.13, 0.28, 0.30)  # link 3 is as long as the upper arm, so that the elbows coincide

@@ -10,7 +10,7 @@ from typing import ClassVar
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support import CONFIG
 from ..support.launched_nodes import LaunchedNodes, Parameters

@@ -12,7 +12,7 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support import CONFIG, ROOT
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, Parameters

@@ -19,7 +19,7 @@ import numpy as np
 import yaml
 
 from exo_gravity.hardware.clock import favour
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
 from ..support.ros_probe import RosProbe

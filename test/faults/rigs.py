@@ -16,8 +16,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support import CONFIG
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters

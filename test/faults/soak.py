@@ -34,8 +34,8 @@ from geometry_msgs.msg import Vector3Stamped
 from rich.console import Console
 from sensor_msgs.msg import JointState
 
-from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.motors.specs import EXIT
+from exo_gravity.lab.bag.reader import read_bag
 
 from .actions import enable, in_turn, pause, publish, send_signal, states_at, tilt
 from .cases import CONTINUE, EFFORTS, STATES, STOP, TILT

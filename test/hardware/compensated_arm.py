@@ -6,19 +6,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import EffortCommand, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.simulated_device import joints_of, make_device

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus

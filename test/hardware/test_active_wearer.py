@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 
 from ..support.active_wearer import attach, hold_still, lift, push, reach, shake, throw
 from .virtual_rig import POSE, VirtualRig

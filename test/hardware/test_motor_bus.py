@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan import SocketcanBus
 
+from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.model.arm import ArmModel
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.safety.drive import NO_COMMAND, EffortCommand, FaultCode, State
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.script import TrialScript
 
 from .compensated_arm import CYCLE, WEARER, CompensatedArm
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import gravity_in_trunk
 from exo_gravity.hardware.trunk_estimator import MAX_GAP, ImuSample, TrunkEstimator
 
 ALIGNED = (0.0, 0.0, 0.0, 1.0)

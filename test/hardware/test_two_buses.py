@@ -12,8 +12,8 @@ from typing import Any
 import can
 import pytest
 
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.model.gravity import gravity_torque
 from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, FaultCode, State

@@ -7,11 +7,11 @@ import pytest
 import rtbdata
 
 from exo_gravity.core import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support.urdf_oracle import MujocoArm

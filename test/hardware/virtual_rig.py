@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import can
 
-from exo_gravity.core.model.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.drive import NOTHING, Drive, EffortCommand, State
 from exo_gravity.core.safety.machine import SafetyMachine

@@ -16,8 +16,8 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 
 from ..support.joint_state_feeder import POSE, JointStateFeeder

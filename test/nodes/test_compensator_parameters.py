@@ -12,8 +12,8 @@ from rcl_interfaces.srv import DescribeParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.inputs.parameter_file import load
+from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.sim.script import TrialScript
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.ros_probe import RosProbe

@@ -5,8 +5,8 @@ import math
 import pytest
 import yaml
 
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.ros.messages import milliseconds, row
-from exo_gravity.tools.inputs.parameter_file import load
 
 from ..support import CONFIG
 

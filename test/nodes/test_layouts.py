@@ -20,8 +20,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
-from exo_gravity.core.view.urdf import ROOT
-from exo_gravity.tools.inputs.arms import configured_arms
+from exo_gravity.lab.inputs.arms import configured_arms
+from exo_gravity.lab.view.urdf import ROOT
 from exo_gravity.tools.launcher import node_modules
 from exo_gravity.tools.urdf import urdf_of
 

@@ -16,9 +16,9 @@ from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.tools.inputs.parameter_file import load
 
 from ..hardware.simulated_rig import LIMITS
 from ..hardware.virtual_rig import Carried

@@ -25,8 +25,8 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity import version
-from exo_gravity.bag.reader import read_bag
-from exo_gravity.core.trial.session import Session
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 

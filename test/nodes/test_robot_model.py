@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from exo_gravity.core.view.urdf import ROOT
+from exo_gravity.lab.view.urdf import ROOT
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 

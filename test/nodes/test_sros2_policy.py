@@ -20,8 +20,8 @@ from rclpy.node import NodeNameNonExistentError
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 
-from exo_gravity.bag.storage import Storage
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.storage import Storage
 from exo_gravity.tools.launcher import Launcher
 
 from ..support import CONFIG

@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from exo_gravity.core.motors.specs import ENTER
-from exo_gravity.core.trial.script import TrialScript
-from exo_gravity.tools.trials.offline import simulated_trials
+from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.sim.script import TrialScript
 
 from ..support.launched_nodes import NO_IMU, executable
 from ..support.waiting import PATIENCE

@@ -15,9 +15,9 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.nodes.compensator.watches import WearerWatch
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 

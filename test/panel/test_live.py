@@ -11,8 +11,8 @@ import yaml
 from rcl_interfaces.srv import ListParameters
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.reader import read_bag
-from exo_gravity.bag.storage import Storage
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.bag.storage import Storage
 
 from ..support.launched_nodes import LaunchedNodes
 from ..support.ports import free_port

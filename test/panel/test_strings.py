@@ -6,7 +6,7 @@ from pathlib import Path
 
 import exo_gravity.panel
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.trial.script import TIMED, VALUED
+from exo_gravity.sim.script import TIMED, VALUED
 
 FOLDER = Path(exo_gravity.panel.__file__).parent
 CONTENT = json.loads((FOLDER / "strings.json").read_text(encoding="utf-8"))

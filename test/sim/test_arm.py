@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 
 from ..support.random_device import off_axis_of

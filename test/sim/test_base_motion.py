@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import _mjcf, felt_in_base, in_base
 from exo_gravity.sim.trunk_motion import TrunkState

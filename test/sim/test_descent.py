@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
-from exo_gravity.core.model.wearer import Wearer
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import NO_COMMAND, OFF, State

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from exo_gravity.core.arm.tilt import pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.tilt import pitch_roll, rotation_matrix
 from exo_gravity.sim import ImuConfig, SimulatedImu
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, TrunkState, Turn, Walk
 

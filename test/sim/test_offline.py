@@ -12,11 +12,11 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, resting
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.imu import measured_tilt
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
+from exo_gravity.sim.script import TrialScript
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 POSE = [0.1, 0.6, 0.7, 0.5]

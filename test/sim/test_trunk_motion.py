@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from exo_gravity.core.trial.script import Step
+from exo_gravity.sim.script import Step
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
 
 from ..support.trunk import orientation

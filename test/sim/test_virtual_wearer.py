@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.trial.script import TrialScript
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, VirtualWearer
+from exo_gravity.sim.script import TrialScript
 
 POSE = (-0.6, 0.9, 0.8, 0.7)
 PUSH = (0.5, 2.0, 1.5, 1.0)

@@ -8,15 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.model.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, resting
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial, resting
+from exo_gravity.sim.script import TrialScript
 
 RATED = (3.0, 9.0, 3.0, 3.0)
 NAMES = ("rotation", "abduction", "flexion", "elbow")

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from exo_gravity.core.model.gravity import NO_TORQUE
-from exo_gravity.core.trial.script import Step, TrialScript
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.sim import SimulatedDevice
+from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.sim.virtual_wearer import Path, VirtualWearer, path_between
 
 Joints = Sequence[float]

@@ -1,4 +1,4 @@
-"""A process that writes a recording until it is killed, for test/bag/test_writer.py.
+"""A process that writes a recording until it is killed, for test/lab/bag/test_writer.py.
 
     python -m test.support.bag_processes PATH
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import time
 
-from exo_gravity.bag.writer import BagWriter, offered_qos
+from exo_gravity.lab.bag.writer import BagWriter, offered_qos
 
 from .synthetic_bags import JOINT_STATE, NAMES, joint_state
 

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.calibration.motion import Observation
-from exo_gravity.core.calibration.pose_fit import TYPICAL_MOMENTS
-from exo_gravity.core.calibration.poses import next_pose
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import Vector
+from exo_gravity.lab.calibration.pose_fit import TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.poses import next_pose
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.bag.content import Bag
-from exo_gravity.bag.reader import read_bag
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.trial.recording import Recording, ScriptedStep
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.trial.recording import Recording, ScriptedStep
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE = "sensor_msgs/msg/JointState"

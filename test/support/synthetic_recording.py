@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exo_gravity.core.trial.recording import Recording, ScriptedStep
+from exo_gravity.lab.trial.recording import Recording, ScriptedStep
 
 RATE = 500.0  # Hz
 POSITION_CODE = 25.0 / 65535  # rad

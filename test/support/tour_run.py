@@ -10,17 +10,17 @@ import mujoco
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.motion import Station
-from exo_gravity.core.calibration.poses import Itinerary, TorqueGuess
-from exo_gravity.core.calibration.tour import Tour
-from exo_gravity.core.model.gravity import Torque, load_moments, moments_of
-from exo_gravity.core.model.kinematics import LinkInertia
-from exo_gravity.core.model.tilt import Tilt
+from exo_gravity.core.arm.gravity import Torque, load_moments, moments_of
+from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import Station
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import Drive, EffortCommand, State
 from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
+from exo_gravity.lab.calibration.tour import Tour
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

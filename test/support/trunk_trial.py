@@ -12,11 +12,11 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.core.trial.script import TrialScript
+from exo_gravity.lab.trial.from_file import trunk_imu
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
+from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.offline import ArmSetup, OfflineTrial
-from exo_gravity.tools.trials.offline import trunk_imu
+from exo_gravity.sim.script import TrialScript
 
 FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from exo_gravity.tools.reporting import html
+from exo_gravity.lab.report import html
 
 
 @pytest.fixture

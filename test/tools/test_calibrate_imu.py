@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exo_gravity.core.model.tilt import angle_between, rotation_matrix
+from exo_gravity.core.arm.tilt import angle_between, rotation_matrix
+from exo_gravity.lab.calibration.imu import ImuRecord, read_imu
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.calibrate import main
-from exo_gravity.tools.calibration.imu import ImuRecord, read_imu
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
 
 from ..support.imu_records import record, rests
 from ..support.synthetic_bags import START, STORE, Entry, write_bag

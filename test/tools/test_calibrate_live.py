@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.tools.calibration.live import LiveTour, Person
+from exo_gravity.lab.calibration.live import LiveTour, Person
 
 
 @pytest.fixture

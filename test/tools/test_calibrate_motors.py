@@ -20,13 +20,13 @@ from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.lab.calibration import motors
+from exo_gravity.lab.calibration.live import Person
+from exo_gravity.lab.calibration.motors import MotorSearch
+from exo_gravity.lab.calibration.result import CalibrationResult
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.tools.calibrate import main
-from exo_gravity.tools.calibration import motors
-from exo_gravity.tools.calibration.live import Person
-from exo_gravity.tools.calibration.motors import MotorSearch
-from exo_gravity.tools.calibration.result import CalibrationResult
-from exo_gravity.tools.inputs.arms import configured_arm
 
 from ..support.simulated_device import SPECS
 

@@ -10,13 +10,13 @@ from html import escape
 import numpy as np
 import pytest
 
-from exo_gravity.core.calibration.identification import fit_friction, identify
-from exo_gravity.core.calibration.motion import Observation
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import gravity_torque, load_moments, regressor
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.tools.calibration.result import CalibrationResult, Change, page_of, remainders
-from exo_gravity.tools.inputs.arms import configured_arm
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque, load_moments, regressor
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.lab.calibration.identification import fit_friction, identify
+from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders
+from exo_gravity.lab.inputs.arms import configured_arm
 
 DAY = datetime.date(2026, 11, 22)
 DOWN = Tilt.of("right", 0.3, -0.2).direction

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.calibration.result import Change, write_changes
-from exo_gravity.tools.inputs.arms import configured_arms
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.calibration.result import Change, write_changes
+from exo_gravity.lab.inputs.arms import configured_arms
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 
 DAY = datetime.date(2026, 11, 22)
 OLD = """\

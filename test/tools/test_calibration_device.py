@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.calibration.poses import Itinerary, friction_stations
-from exo_gravity.core.trial.recording import Recording
+from exo_gravity.lab.calibration import recorded
+from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
+from exo_gravity.lab.calibration.recorded import TILT_TOPIC, TILT_TYPE
+from exo_gravity.lab.calibration.tours import friction_from, moments_from
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools import calibrate
-from exo_gravity.tools.calibration import recorded
-from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE
-from exo_gravity.tools.calibration.tours import friction_from, moments_from
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import packaged_config
 
 from ..support.synthetic_bags import START, STORE, messages, write_bag
 from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun, fixed

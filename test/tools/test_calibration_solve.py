@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.calibration.motion import Observation
-from exo_gravity.core.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import wearer_of
+from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.model.gravity import load_moments, moments_of, regressor
-from exo_gravity.core.model.tilt import Tilt
 from exo_gravity.core.params import values_of
-from exo_gravity.tools.calibration import live
-from exo_gravity.tools.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.calibration import live
+from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.lab.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 
 ARM = configured_arm(packaged_config("sim.yaml"))
 DOWN = Tilt.of("right", 0.3, -0.2).direction  # a tilted stand: joint 1 carries something too

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from exo_gravity.core.arm.tilt import rotation_matrix
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.tilt import rotation_matrix
+from exo_gravity.lab.calibration.imu import ImuRecord, mounting, six_rests
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.tools.calibration.imu import ImuRecord, mounting, six_rests
 
 from ..support.imu_records import RATE, record, rests
 

@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.tools import launcher
-from exo_gravity.tools.inputs.parameter_file import load, stages
 from exo_gravity.tools.launcher import (
     chosen,
     command_of,

@@ -16,13 +16,13 @@ import pytest
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from exo_gravity.bag.content import Event
-from exo_gravity.bag.reader import read_bag
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.trial.session import Session
+from exo_gravity.lab.bag.content import Event
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.report import figures
+from exo_gravity.lab.report.trial_report import analyse, print_report, write, write_empty
+from exo_gravity.lab.trial.session import Session
 from exo_gravity.tools.report import main
-from exo_gravity.tools.reporting import figures
-from exo_gravity.tools.reporting.trial_report import analyse, print_report, write, write_empty
 
 from ..support import csv_rows
 from ..support import synthetic_bags as made

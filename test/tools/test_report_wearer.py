@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.model.tilt import gravity_in_trunk
-from exo_gravity.core.model.wearer import Wearer
-from exo_gravity.core.trial.recording import Recording
-from exo_gravity.tools.reporting import trial_report, wearer_share
+from exo_gravity.core.arm.tilt import gravity_in_trunk
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.lab.report import trial_report, wearer_share
+from exo_gravity.lab.trial.recording import Recording
 
 from ..support.synthetic_bags import bag_of
 

@@ -7,12 +7,12 @@ import pytest
 import yaml
 
 from exo_gravity.core import gravity_torque
+from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.tools.anfis import RIDGE, Projection, from_bag, from_gravload, train, train_law
-from exo_gravity.tools.calibration.recorded import TILT_TOPIC, TILT_TYPE
-from exo_gravity.tools.inputs.arms import configured_arm
-from exo_gravity.tools.inputs.references import PAPER_ANFIS
+from exo_gravity.lab.anfis_training import RIDGE, Projection, from_bag, from_gravload, train, train_law
+from exo_gravity.lab.calibration.recorded import TILT_TOPIC, TILT_TYPE
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
 
 from ..support import synthetic_bags as made

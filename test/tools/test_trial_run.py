@@ -18,15 +18,15 @@ import pytest
 import yaml
 from rich.console import Console
 
-from exo_gravity.bag.content import Bag
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.trial.script import Step, TrialScript
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.trial import run as running
+from exo_gravity.lab.trial.run import TrialEnd, follow, is_guided, too_busy
+from exo_gravity.lab.trial.screen import LEAD, TrialScreen, describe
+from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.tools import trial
 from exo_gravity.tools.trial import analysed, read_script
-from exo_gravity.tools.trials import run as running
-from exo_gravity.tools.trials.run import TrialEnd, follow, is_guided, too_busy
-from exo_gravity.tools.trials.screen import LEAD, TrialScreen, describe
 
 from ..support import synthetic_bags as made
 
@@ -297,7 +297,7 @@ class Attempts:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *ends: TrialEnd) -> None:
         self.ends = list(ends)
         monkeypatch.setattr(running, "run_nodes", lambda *arguments: self.ends.pop(0))
-        monkeypatch.setattr("exo_gravity.bag.reader.read_bag", self._no_recording)
+        monkeypatch.setattr("exo_gravity.lab.bag.reader.read_bag", self._no_recording)
         monkeypatch.setattr(trial, "stop_on_signals", threading.Event)
 
     @staticmethod

@@ -8,12 +8,12 @@ import pinocchio
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.view.urdf import ArmDescription, urdf
-from exo_gravity.tools.inputs.arms import configured_arms
-from exo_gravity.tools.inputs.parameter_file import packaged_config
+from exo_gravity.lab.inputs.arms import configured_arms
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.view.urdf import ArmDescription, urdf
 from exo_gravity.tools.urdf import main, urdf_of
 
 ROUNDING = 1e-9  # Nm

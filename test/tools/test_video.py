@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.tools.inputs.parameter_file import packaged_config
-from exo_gravity.tools.reporting import video as output
-from exo_gravity.tools.reporting.video import NO_GRAPHICS, backend, requested
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.report import video as output
+from exo_gravity.lab.report.video import NO_GRAPHICS, backend, requested
 
 SCRIPT = """
 name: short

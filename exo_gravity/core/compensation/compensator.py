@@ -14,6 +14,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.gravity import LAWS, Torque
+from exo_gravity.core.arm.kinematics import turning_torque
+from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.guidance import (
     BREAK,
     LONGEST_STEP,
@@ -25,10 +29,6 @@ from exo_gravity.core.compensation.guidance import (
 )
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.gravity import LAWS, Torque
-from exo_gravity.core.model.kinematics import turning_torque
-from exo_gravity.core.model.tilt import AXES, Tilt
 from exo_gravity.core.trunk.inputs import MAX_TURN, FeltMotion, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
@@ -50,7 +50,7 @@ class Answer(NamedTuple):
 
 
 class Scale(Protocol):
-    """What weighs the load in the hand for a while: core/calibration/weighing.py."""
+    """What weighs the load in the hand for a while: core/compensation/weighing.py."""
 
     trouble: str  #: why there is no result, or ''; set, it ends the weighing
     is_thrown: bool  #: whether the load must have left the hand

@@ -15,7 +15,7 @@ because a change follows another or a law does not apply in this pose, is the co
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.model.gravity import Torque
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.safety.limits import GUIDE_SPEED
 
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break

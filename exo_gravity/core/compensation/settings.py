@@ -5,10 +5,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
-from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
-from exo_gravity.core.errors import DataError, ParameterError, named
-from exo_gravity.core.model.anfis import AnfisLaw
-from exo_gravity.core.model.arm import (
+from exo_gravity.core.arm.anfis import AnfisLaw
+from exo_gravity.core.arm.arm import (
     MAX_GAIN,
     MAX_GRAVITY,
     MAX_LENGTH,
@@ -20,10 +18,12 @@ from exo_gravity.core.model.arm import (
     ArmModel,
     ModelError,
 )
-from exo_gravity.core.model.gravity import LAWS, NO_TORQUE, Torque
-from exo_gravity.core.model.rotation import Floats3
-from exo_gravity.core.model.tilt import SIDES, Tilt
-from exo_gravity.core.model.wearer import SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.arm.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.arm.rotation import Floats3
+from exo_gravity.core.arm.tilt import SIDES, Tilt
+from exo_gravity.core.arm.wearer import SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, param_of, params_of
 from exo_gravity.core.safety.limits import MAX_COMMAND

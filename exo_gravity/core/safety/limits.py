@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
+from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import MAX_MOMENT
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor, channels_of
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT

@@ -9,9 +9,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, three_floats, up_in_body
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, three_floats, up_in_body
 
 # The usual widest ranges of a MEMS sensor, and those that any sensor may have.
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s

@@ -17,10 +17,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, three_floats
+from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Floats3, acceleration_of, plus, three_floats
-from exo_gravity.core.model.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.numbers import Vector
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar, NamedTuple
 
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.hardware.imu_sources.i2c import FifoSource, Limits, Values
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Measurement
 

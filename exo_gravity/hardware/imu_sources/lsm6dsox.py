@@ -6,8 +6,8 @@ DS12814 (LSM6DSOX), DS12140 (LSM6DSO).
 
 from typing import ClassVar
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import DeviceError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
 from exo_gravity.hardware.imu_sources.i2c import FifoSource
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Measurement
 

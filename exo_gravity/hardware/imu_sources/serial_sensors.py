@@ -15,9 +15,9 @@ import math
 import struct
 from typing import ClassVar
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY
-from exo_gravity.core.model.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Clock, ImuSource, Measurement
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59

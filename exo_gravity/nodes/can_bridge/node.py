@@ -20,8 +20,8 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
-from exo_gravity.core.model.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
 from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of

@@ -16,12 +16,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import moments_of
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import MAX_LEAD
 from exo_gravity.hardware.urdf_arm import UrdfArm

@@ -18,10 +18,10 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.calibration.weighing import Weighing, refusal
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Terms
+from exo_gravity.core.compensation.weighing import Weighing, refusal
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time

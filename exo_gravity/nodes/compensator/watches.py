@@ -19,17 +19,17 @@ from typing import Any
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
+from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.model.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
-from exo_gravity.core.model.kinematics import turning_in_base
-from exo_gravity.core.model.rotation import ZERO, Floats3
-from exo_gravity.core.model.tilt import Tilt
-from exo_gravity.core.observer.adaptation import SupportAdaptation
-from exo_gravity.core.observer.momentum import COVER, ContactWatch, MomentumObserver, WearerEstimate
 from exo_gravity.core.trunk.inputs import FELT_RANGE
+from exo_gravity.lab.observer.adaptation import SupportAdaptation
+from exo_gravity.lab.observer.momentum import COVER, ContactWatch, MomentumObserver, WearerEstimate
 from exo_gravity.nodes.ros.messages import by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters
 from exo_gravity.nodes.ros.subscriptions import Repeated

@@ -27,8 +27,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
-from exo_gravity.bag.content import MARKERS
 from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run

@@ -27,11 +27,11 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from exo_gravity import version
-from exo_gravity.bag import content
-from exo_gravity.bag.content import PARAMETERS, STATES, arm_of, leaf
-from exo_gravity.bag.writer import BagWriter, offered_qos
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.core.trial.session import Session
+from exo_gravity.lab.bag import content
+from exo_gravity.lab.bag.content import PARAMETERS, STATES, arm_of, leaf
+from exo_gravity.lab.bag.writer import BagWriter, offered_qos
+from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run

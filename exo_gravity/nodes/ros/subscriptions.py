@@ -21,8 +21,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
+from exo_gravity.core.arm.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.trunk.inputs import NO_ROTATION, NOT_REPORTED, TiltInput
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exo_gravity.core.arm.kinematics import least_inertia, links_of
 from exo_gravity.core.compensation.guidance import LONGEST_STEP
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -35,7 +36,6 @@ from exo_gravity.core.compensation.terms.terms import (
     term_settings_of,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
+from exo_gravity.core.arm.kinematics import least_inertia, links_of
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
     TANK,
@@ -24,7 +25,6 @@ from exo_gravity.core.compensation.terms.catalogue import (
     Spring,
 )
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

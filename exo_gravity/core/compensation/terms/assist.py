@@ -13,9 +13,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.compensation.guidance import BREAK
 from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND

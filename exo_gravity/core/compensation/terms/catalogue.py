@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.gravity import Torque
-from exo_gravity.core.model.kinematics import LinkInertia
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import check_owned, owned, params_of
 

@@ -11,6 +11,9 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.kinematics import least_inertia, links_of
 from exo_gravity.core.compensation.guidance import LONGEST_STEP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
@@ -28,9 +31,6 @@ from exo_gravity.core.compensation.terms.catalogue import (
     clamp,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.model.arm import ArmModel
-from exo_gravity.core.model.gravity import NO_TORQUE, Torque
-from exo_gravity.core.model.kinematics import least_inertia, links_of
 from exo_gravity.core.params import Param, params_of
 
 MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque

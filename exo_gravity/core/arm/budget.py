@@ -1,0 +1,189 @@
+"""The torque budget: the gravity torque on each motor over the whole workspace, compared with the motor's limits.
+
+The workspace is every pose within the joint limits at every trunk tilt up to a bound. Gravity's torque is linear in the
+masses (M1..M4 of `gravity.py`), hence in the support s of the wearer's arm: tau = tau_robot + s tau_wearer. The largest
+s that keeps a joint within its limit in a pose, |tau_robot + s tau_wearer| <= limit, is therefore a quotient.
+
+Shares of the workspace are estimated from uniform random poses. The search for a worst pose starts from the worst of
+these and improves one coordinate after another until nothing gets worse.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
+
+Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
+
+USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
+SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
+STARTS = 5  # poses from which the worst one is sought, because a search can end in a local maximum
+CHUNK = 2_000  # poses, about 1 ms of computation
+TOLERANCE = 1e-3  # Nm, or support; smaller differences are irrelevant to a motor
+STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 comes first, so that the search stays put at a tie
+
+# Rated and peak torque in Nm. Source for motors other than the two that the package drives: the maker's product pages
+# of February 2024, collected in gatech-epic-power/epically-powerful (actuation/motor_data.py); AK10-9 is V2.0.
+FAMILY = {
+    **{spec.name: (spec.rated_torque, spec.peak_torque) for spec in MOTORS.values()},
+    "AK70-10": (10.0, 24.8),
+    "AK10-9": (18.0, 48.0),
+    "AK80-64": (48.0, 120.0),
+}
+
+
+def motor_for(torque: float) -> str | None:
+    """Return the motor with the smallest rated torque that covers `torque` Nm, or None if no motor does."""
+    return min((name for name in FAMILY if FAMILY[name][0] >= torque), key=lambda name: FAMILY[name][0], default=None)
+
+
+def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
+    """Return rated and peak torque (2, 4) in Nm of `motors` whose real torque is `torque_scale` times the command."""
+    # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
+    scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
+    return np.asarray(scale * np.transpose([FAMILY[motor] for motor in motors]))
+
+
+def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np.ndarray:
+    """Return the lowest and the highest point (2, 6): four joint angles, then pitch and roll of the trunk, in rad.
+
+    position_min, position_max: the joint limits, (4,) rad. max_tilt: of the trunk, in either direction, rad.
+    """
+    return np.array(((*position_min, -max_tilt, -max_tilt), (*position_max, max_tilt, max_tilt)))
+
+
+@dataclass(frozen=True)
+class JointBudget:
+    """The torque that one joint needs at a given support, and the largest support it allows."""
+
+    rated: float  #: Nm, of its motor
+    peak: float  #: Nm
+    torque: float  #: Nm, the largest needed in the workspace
+    worst: np.ndarray  #: (6,) rad, the pose and the trunk's pitch and roll at which it is needed
+    within_rated: float  #: share 0..1 of the workspace in which the motor stays within its rated torque, rounded down
+    within_peak: float  #: the same for peak torque
+    #: the largest support 0..1 at which the joint stays within rated torque everywhere, rounded down; None: the robot
+    #: alone needs more
+    support: float | None
+
+
+def largest_support(joints: Sequence[JointBudget]) -> float | None:
+    """Return the largest support 0..1 that keeps all joints within rated torque; None if none does."""
+    supports = [joint.support for joint in joints if joint.support is not None]
+    return min(supports) if len(supports) == len(joints) else None
+
+
+def _rounded_down(share: float) -> float:
+    """Return a share rounded down to a thousandth, so that the rounded value is still within the limit."""
+    return math.floor(1000 * share + 1e-9) / 1000
+
+
+def overload(names: Sequence[str], joints: Sequence[JointBudget]) -> str:
+    """Return which joints are overloaded and which support would fit, in a sentence; '' if no joint is overloaded."""
+    needs = [
+        f"{name} needs {joint.torque:.1f} Nm in its worst pose (rated {joint.rated:.3g}, peak {joint.peak:.3g})"
+        for name, joint in zip(names, joints, strict=True)
+        if joint.torque > joint.rated
+    ]
+    if not needs:
+        return ""
+    fits = largest_support(joints)
+    remedy = "the robot alone needs too much" if fits is None else f"the largest support that fits is {fits:g}"
+    return f"motors overloaded: {', '.join(needs)}; {remedy}"
+
+
+def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
+    """Return the exact torque (n, 4) in Nm at points (n, 6): joint angles, then pitch and roll of the trunk, in rad."""
+    pitch, roll = points[:, JOINT_COUNT], points[:, JOINT_COUNT + 1]
+    # This is `Tilt.of` for arrays and the left arm. A workspace has both signs of roll, so it covers the right arm too.
+    level = np.cos(pitch)
+    directions = np.stack((-np.sin(roll) * level, np.sin(pitch), np.cos(roll) * level), axis=1)
+    return gravity_torque(arm, points[:, :JOINT_COUNT], directions)
+
+
+def budget(
+    robot: ArmModel,
+    load: tuple[Vector, Vector],
+    support: float,
+    bounds: np.ndarray,
+    rated: Vector,
+    peak: Vector,
+    pause: Callable[[], None] = lambda: None,
+) -> tuple[JointBudget, ...]:
+    """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
+
+    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. bounds:
+    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk
+    of about a millisecond of computation. Raises ParameterError if the load does not fit the robot.
+    """
+    full = robot.with_wearer(*load)
+
+    def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""
+        chunks = []
+        for chunk in np.array_split(points, len(points) // CHUNK + 1):
+            pause()
+            chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
+        own, with_all = map(np.concatenate, zip(*chunks, strict=True))
+        return own, with_all - own
+
+    points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
+    starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
+
+    def need(at: np.ndarray) -> np.ndarray:
+        own, added = torques(at)
+        return np.asarray(np.abs(own + support * added))
+
+    def shortage(at: np.ndarray) -> np.ndarray:
+        """Return the negative of the largest support, at most 1, within rated torque; 1 where none fits."""
+        own, added = torques(at)
+        room = rated - np.sign(added) * own  # in the direction of the wearer's torque
+        most = np.divide(room, np.abs(added), out=np.ones_like(room), where=np.abs(added) > 1e-9)
+        return np.where(np.abs(own) > rated, 1.0, -np.minimum(most, 1.0))
+
+    needs, shortages = need(starts), shortage(starts)
+    joints = []
+    for joint, limits in enumerate(zip(map(float, rated), map(float, peak), strict=True)):
+        worst, torque = _worst(need, joint, bounds, starts, needs[:, joint])
+        _, short = _worst(shortage, joint, bounds, starts, shortages[:, joint])
+        # The search can find an overloaded pose that no sample shows. Then the share must not be 1.
+        low, high = (
+            _rounded_down(min(float(np.mean(needs[-SAMPLES:, joint] <= limit)), 0.9999 if torque > limit else 1.0))
+            for limit in limits
+        )
+        joints.append(JointBudget(*limits, torque, worst, low, high, None if short > 0.0 else _rounded_down(-short)))
+    return tuple(joints)
+
+
+def _worst(
+    cost: Cost, joint: int, bounds: np.ndarray, starts: np.ndarray, costs: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return the point (6,) with the largest cost of `joint`, and that cost.
+
+    Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (m,), of `starts`
+    (m, 6).
+    """
+    low, high = bounds
+    chosen = sorted({*np.argsort(costs)[-STARTS:].tolist(), int(np.argmax(costs[: SAMPLES // 5]))})
+    points, values, width = starts[chosen], costs[chosen], (high - low) / 8
+    while np.any(width > 1e-4):  # climb from each of the points along one coordinate at a time
+        for axis in range(points.shape[1]):
+            lines = np.repeat(points[:, None], len(STEPS), axis=1)
+            lines[:, :, axis] = np.clip(lines[:, :, axis] + STEPS * width[axis], low[axis], high[axis])
+            found = cost(lines.reshape(-1, points.shape[1]))[:, joint].reshape(len(points), len(STEPS))
+            best_step = np.arange(len(points)), np.argmax(found, axis=1)
+            points, values = lines[best_step], found[best_step]
+        width = width / 4
+    best, largest = points[np.argmax(values >= values.max() - TOLERANCE)], float(values.max())
+    for axis in range(len(best)):
+        simpler = best.copy()
+        simpler[axis] = np.clip(0.0, low[axis], high[axis])
+        if cost(simpler[None])[0, joint] >= largest - TOLERANCE:
+            best = simpler
+    return best, largest

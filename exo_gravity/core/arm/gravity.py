@@ -1,0 +1,201 @@
+"""The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
+
+`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,
+and any trunk tilt: docs/mathematics.md derives it. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the
+paper, word for word. They agree with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n)
+and the trunk is upright.
+
+Each formula is written once, for a module `xp`: `math` for one pose in plain floats (control loop), `numpy` for whole
+arrays (analysis). Symbols: t1..t4 joint angles in rad, M1..M4 first moments along the links and W, Z, Y3, Y4 across
+them in kg m, g gravity in m/s^2; l, d and m1..m4 as in the paper. With the frames of Table 1 (joint n turns about
+z_{n-1}, and z_3 = z_4 = z_2) and gravity's unit vector d in the base frame, the torque is linear in the moments:
+
+    S4 = M4 x4 + Y4 y4        S2 = S3 + M2 x2 + Z z2
+    S3 = S4 + M3 x3 + Y3 y3   S1 = S2 + M1 x1 + W z1        torque n = g z_{n-1} . (d x S_n)
+
+M_n: mass of link n times its centre of gravity along the link, plus all mass beyond link n times the link's length. W:
+of link 1 along z_1 and of link 2 along y_2 = z_1. Z: of links 2, 3 and 4 along z_2. Y3, Y4: of links 3 and 4 along
+their y. What lies along a joint's own axis (link 1 along y_1) needs no torque.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+
+Torque = tuple[float, ...]  # (4,) Nm in joint order
+NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
+Law = Callable[[ArmModel, Sequence[float], Tilt], Torque]  # arm, theta (4,) rad, tilt -> the torque that holds the arm
+Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
+
+
+def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
+    """Return the closed form of Newton-Euler; `direction` is gravity's unit vector in the arm's base frame."""
+    t1, t2, t3, t4 = theta
+    gx, gy, gz = direction
+    (M1, M2, M3, M4), (W, Z, Y3, Y4) = arm.first_moment, arm.off_axis
+    s1, c1, s2, c2, s3, c3 = xp.sin(t1), xp.cos(t1), xp.sin(t2), xp.cos(t2), xp.sin(t3), xp.cos(t3)
+    s34, c34 = xp.sin(t3 + t4), xp.cos(t3 + t4)
+    # Gravity along the axes that rotate with joint 1: A across the shoulder, B forward.
+    A = gx * c1 + gy * s1
+    B = gy * c1 - gx * s1
+    R = A * s2 + gz * c2
+    # First moments of link 4 and of links 3 and 4 together, along link 2 and across it.
+    along4, across4 = M4 * c34 - Y4 * s34, M4 * s34 + Y4 * c34
+    along, across = M3 * c3 - Y3 * s3 + along4, M3 * s3 + Y3 * c3 + across4
+    return (
+        (W + across) * A - (M1 + (M2 + along) * s2 - Z * c2) * B,
+        (M2 + along) * (gz * s2 - A * c2) - Z * R,
+        across * R - along * B,
+        across4 * R - along4 * B,
+    )
+
+
+def _paper_static(xp: ModuleType, arm: ArmModel, theta: Values) -> tuple[Any, ...]:
+    """EQ2-EQ5; theta_1 is the angle between joint 1's axis and gravity."""
+    t1, t2, t3, t4 = theta
+    (_, l2, l3, l4), (d1, d2, d3, d4), (m1, m2, m3, m4) = (a.tolist() for a in (arm.length, arm.cog, arm.mass))
+    return (
+        (d1 * (m1 + m2 + m3 + m4) + l2 * (m2 + m3 + m4) * xp.sin(t2) + l3 * (m3 + m4) * xp.cos(t3)
+         + l4 * m4 * xp.cos(t3 + t4)) * xp.sin(t1),
+        (d2 * (m2 + m3 + m4) + l3 * (m3 + m4) * xp.cos(t3) + l4 * m4 * xp.cos(t3 + t4)) * xp.sin(t2),
+        (d3 * (m3 + m4) * xp.sin(t3) + l4 * m4 * xp.sin(t3 + t4)) * xp.cos(t2),
+        d4 * m4 * xp.sin(t3 + t4) * xp.cos(t2),
+    )  # fmt: skip
+
+
+def _paper_mobile(xp: ModuleType, arm: ArmModel, theta: Values, beta: Any, phi: Any) -> tuple[Any, ...]:
+    """EQ1m-EQ4m: EQ2-EQ5 at theta_2 + phi and theta_3 + beta, times cos(phi) cos(beta).
+
+    Joints 2 to 4 have the additional factor cos(theta_1).
+    """
+    t1, t2, t3, t4 = theta
+    tau1, tau2, tau3, tau4 = _paper_static(xp, arm, (t1, t2 + phi, t3 + beta, t4))
+    upright = xp.cos(phi) * xp.cos(beta)
+    axis = xp.cos(t1) * upright
+    return tau1 * upright, tau2 * axis, tau3 * axis, tau4 * axis
+
+
+def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
+    """Return the torque in Nm that holds `arm` against gravity by the exact law, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad. direction: (3,) or (n, 3), unit vector of gravity in the arm's base frame; (0, 0, 1) if
+    the trunk is upright. Raises ParameterError if a shape is wrong, a number is not finite, or a direction is not a
+    unit vector.
+    """
+    poses = _poses(theta)
+    down = np.asarray(direction, dtype=float)
+    if down.shape not in ((3,), (*poses.shape[:-1], 3)):
+        raise ParameterError("direction", down, f"of shape (3,) or {(*poses.shape[:-1], 3)}")
+    if not np.allclose(np.linalg.norm(down, axis=-1), 1.0, atol=1e-6, rtol=0):
+        raise ParameterError("direction", down, "a unit vector")
+    return _torque(_exact, arm, poses, down)
+
+
+def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ2-EQ5 in Nm, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad. Here theta_1 is the angle between joint 1's axis and gravity (0 for an upright wearer),
+    not joint 1's encoder angle. Raises ParameterError if the shape is wrong, a number is not finite, or the arm is
+    given by its moments or has moments across its links.
+    """
+    arm.check_masses("paper_static")
+    return _torque(_paper_static, arm, _poses(theta))
+
+
+def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+    """Return the torque of EQ1m-EQ4m in Nm, in the shape of `theta`.
+
+    theta: (4,) or (n, 4) rad, with theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad, a
+    number or (n,) each. `Tilt` computes beta, phi and theta_1 for a trunk. Raises ParameterError as above.
+    """
+    arm.check_masses("paper_mobile")
+    poses = _poses(theta)
+    beta, phi = (np.asarray(angle, dtype=float) for angle in (pitch, yaw))
+    for name, angle in (("pitch", beta), ("yaw", phi)):
+        if angle.shape not in ((), poses.shape[:-1]) or not np.all(np.isfinite(angle)):
+            raise ParameterError(name, angle, f"a finite number or an array of shape {poses.shape[:-1]}")
+    tilt = np.stack(np.broadcast_arrays(beta, phi), axis=-1)
+    return _torque(lambda xp, arm, angles, tilt: _paper_mobile(xp, arm, angles, *tilt), arm, poses, tilt)
+
+
+def _poses(theta: ArrayLike) -> np.ndarray:
+    poses = np.asarray(theta, dtype=float)
+    if poses.ndim not in (1, 2) or poses.shape[-1] != JOINT_COUNT:
+        raise ParameterError("theta", poses, f"of shape (4,) or (n, 4), not {poses.shape}")
+    if not np.all(np.isfinite(poses)):
+        raise ParameterError("theta", poses, "finite angles in rad")
+    return poses
+
+
+def _torque(formula: Callable[..., tuple[Any, ...]], arm: ArmModel, *inputs: np.ndarray) -> np.ndarray:
+    """Return the scaled torque (4,) or (n, 4) by `formula`; inputs: (k,) for all poses, or (n, k), the angles first."""
+    columns = (np.moveaxis(values, -1, 0).copy() for values in inputs)  # contiguous: twice as fast
+    unscaled = np.broadcast_arrays(*formula(np, arm, *columns))
+    return np.asarray(np.stack(unscaled, axis=-1) * (arm.gain * arm.gravity))
+
+
+def _law(formula: Callable[..., Torque]) -> Law:
+    def torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+        a, b, c, d = arm.scale
+        tau, felt = formula(arm, theta, tilt), tilt.magnitude
+        return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
+
+    return torque
+
+
+#: the closed forms for the control loop, one pose in plain floats; they apply in every pose at any tilt
+LAWS: dict[str, Law] = {
+    "exact": _law(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
+    "paper_static": _law(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
+    "paper_mobile": _law(lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)),
+}
+
+
+MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
+MAX_OFFSET = 0.1  # m of a centre of gravity from its link
+
+
+def moments_of(arm: ArmModel) -> np.ndarray:
+    """Return the eight moments (8,) of `arm` in kg m."""
+    return np.array((*arm.first_moment, *arm.off_axis))
+
+
+def load_moments(length: Vector, mass: float, lever: float) -> np.ndarray:
+    """Return what a weight of `mass` kg on link 4, `lever` m from the elbow, adds to the moments: (8,) kg m.
+
+    length: (4,) m. Raises ParameterError.
+    """
+    lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
+    mass = one_float("load_mass", mass, 0.0, MAX_MASS, "kg")
+    lever = one_float("load_lever", lever, 0.0, MAX_LENGTH, "m")
+    return np.array((*(mass * lengths[:3]).tolist(), mass * lever, 0.0, 0.0, 0.0, 0.0))
+
+
+def regressor(
+    theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0), gravity: float = STANDARD_GRAVITY
+) -> np.ndarray:
+    """Return the torque of each joint per unit of each moment: (n, 4, 8) in Nm per kg m.
+
+    theta: (n, 4) rad. direction: (3,) or (n, 3), gravity's unit vector in the base frame. The torque (n, 4) in Nm is
+    `regressor(...) @ moments`. Raises ParameterError as `gravity_torque` does.
+    """
+    poses = np.atleast_2d(np.asarray(theta, dtype=float))
+    return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
+
+
+@lru_cache(4)
+def _unit_arms(gravity: float) -> list[ArmModel]:
+    """Return an arm for each moment, which has that moment of 1 kg m and no other."""
+    rows = np.eye(len(MOMENTS))
+    no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
+    return [ArmModel.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]

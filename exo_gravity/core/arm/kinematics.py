@@ -1,0 +1,189 @@
+"""Where the arm's joints and links are, and the torque that accelerates its links: all from Table 1 of the paper.
+
+With the unit vectors x_n along the links (standard Denavit-Hartenberg), a point of link n is at the sum of l_m x_m over
+the links before it, plus its distance along x_n. So the kinetic energy is a quadratic form in the x_n with constant
+coefficients:
+
+    T = 1/2 sum W_ij x'_i . x'_j     W_ij = W_ji = l_i M_j (i < j)     W_nn = Q_n + l_n^2 (mass beyond link n)
+
+M_j: first moments (gravity.py). Q_n: second moment of link n about its joint. The rest of the paper's Equation 1 is
+tau_k = sum W_ij (dx_i/dq_k) . x''_j = z_{k-1} . sum over i >= k of x_i x W_ij x''_j, plus the rotor of joint k. Links
+are thin rods around their centres of gravity, Q_n = m_n (d_n^2 + l_n^2 / 12), or points of mass at REACH where only the
+moments are known. Offsets of the centres of gravity across the links are left out.
+"""
+
+import itertools
+import math
+import operator
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ZEROS, ArmModel
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+
+# kg m^2 at the gear's output: 243.5 and 607 g cm^2 (published motor tables) times the gear ratio squared, AK60-6 and
+# AK80-9.
+ROTORS = (8.8e-4, 4.9e-3, 8.8e-4, 8.8e-4)
+REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which the mass of an arm given by its moments is assumed
+LEAST_REACH = 0.01  # m
+GRID = tuple(map(math.radians, (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)))  # of joints 2 to 4, for the least inertia
+
+
+class Frame(NamedTuple):
+    """Where a link is, in the arm's base frame: its joint, the joint's axis, and the direction along the link."""
+
+    origin: Floats3
+    axis: Floats3
+    along: Floats3
+
+
+def frames(length: Sequence[float], theta: Sequence[float]) -> tuple[Frame, Frame, Frame, Frame]:
+    """Return the four links of `length` (4,) m at `theta` (4,) rad."""
+    t1, t2, t3, t4 = theta
+    l1, l2, l3, _ = length
+    s1, c1, s2, c2 = math.sin(t1), math.cos(t1), math.sin(t2), math.cos(t2)
+    first: Floats3 = (c1, s1, 0.0)
+    swing: Floats3 = (-s1, c1, 0.0)  # the axis of joint 2
+    second: Floats3 = (s2 * c1, s2 * s1, c2)
+    bend: Floats3 = (-c2 * c1, -c2 * s1, s2)  # the axis of joints 3 and 4
+    third = plus(plus(ZERO, second, math.cos(t3)), swing, math.sin(t3))
+    fourth = plus(plus(ZERO, second, math.cos(t3 + t4)), swing, math.sin(t3 + t4))
+    shoulder = plus(ZERO, first, l1)
+    flexion = plus(shoulder, second, l2)
+    elbow = plus(flexion, third, l3)
+    return (
+        Frame(ZERO, (0.0, 0.0, 1.0), first),
+        Frame(shoulder, swing, second),
+        Frame(flexion, bend, third),
+        Frame(elbow, bend, fourth),
+    )
+
+
+class LinkInertia(NamedTuple):
+    """The inertia of an arm's links and rotors: the coefficients W of the kinetic energy."""
+
+    weights: tuple[tuple[float, ...], ...]  #: W, (4, 4) kg m^2
+    rotors: tuple[float, ...] = ROTORS  #: at the joints, (4,) kg m^2
+
+    @classmethod
+    def of_moments(cls, length: Vector, moment: Vector, load: tuple[float, float] = (0.0, 0.0)) -> "LinkInertia":
+        """Return the approximate inertia of an arm that is known by its moments.
+
+        length: (4,) m. moment: M1..M4 in kg m, with the load. load: a weight in kg on link 4, and its distance from
+        the elbow in m.
+        """
+        lengths, whole = np.asarray(length, dtype=float), np.asarray(moment, dtype=float)
+        weight, lever = load
+        bare = whole - weight * np.append(lengths[:3], lever)
+        reach = np.maximum(lengths * REACH, LEAST_REACH)
+        mass = np.zeros(JOINT_COUNT)
+        for link in reversed(range(JOINT_COUNT)):
+            mass[link] = max(0.0, bare[link] - mass[link + 1 :].sum() * lengths[link]) / reach[link]
+        second = mass * reach**2
+        mass[3] += weight
+        second[3] += weight * lever**2
+        return _links(lengths, mass, whole, second)
+
+    def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
+        """Return the torque (4,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (4,) each."""
+        links = frames(ZEROS, theta)
+        turning = spin_up = ZERO  # of the link
+        second = []
+        for (_, axis, along), speed, change in zip(links, velocity, acceleration, strict=True):
+            spin_up = plus(plus(spin_up, axis, change), cross(turning, axis), speed)
+            turning = plus(turning, axis, speed)
+            second.append(acceleration_of(along, turning, spin_up))
+        rotors = map(operator.mul, self.rotors, acceleration)
+        return tuple(map(operator.add, _torque(links, self.weights, second), rotors))
+
+    def momentum(
+        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
+    ) -> tuple[Torque, Torque]:
+        """Return the generalized momentum p = M v, (4,) kg m^2/s, and C^T v, (4,) Nm, with M' = C + C^T.
+
+        C^T v is the derivative of the kinetic energy by the angles: p' = tau + C^T v. For j >= k the derivative of x'_j
+        by q_k is z_{k-1} x x'_j + z'_{k-1} x x_j. turning: angular velocity of the base in its own axes, (3,) rad/s,
+        which adds to both.
+        """
+        links = frames(ZEROS, theta)
+        swings, derivatives = [], []  # z'_{k-1}, and x'_j
+        for (_, axis, along), speed in zip(links, velocity, strict=True):
+            swings.append(cross(turning, axis))
+            turning = plus(turning, axis, speed)
+            derivatives.append(cross(turning, along))
+        moment, change, momentum, coriolis = ZERO, ZERO, [], []
+        for n in (3, 2, 1, 0):
+            impulse = ZERO
+            for weight, derivative in zip(self.weights[n], derivatives, strict=True):
+                impulse = plus(impulse, derivative, weight)
+            moment = plus(moment, cross(links[n].along, impulse))
+            change = plus(change, cross(derivatives[n], impulse))
+            momentum.append(dot(links[n].axis, moment) + self.rotors[n] * velocity[n])
+            coriolis.append(dot(links[n].axis, change) + dot(swings[n], moment))
+        return tuple(momentum[::-1]), tuple(coriolis[::-1])
+
+    def matrix(self, theta: Sequence[float]) -> np.ndarray:
+        """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
+        return np.array([self.torque(theta, ZEROS, row) for row in np.eye(JOINT_COUNT).tolist()])
+
+
+@lru_cache(8)
+def least_inertia(links: LinkInertia) -> tuple[float, ...]:
+    """Return the least inertia (4,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+    poses = itertools.product((0.0,), GRID, GRID, GRID)
+    free = [1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses]
+    return tuple(np.min(free, axis=0).tolist())
+
+
+@lru_cache(8)
+def links_of(arm: ArmModel) -> LinkInertia:
+    """Return the inertia of `arm` with the usual rotors; approximate if it is given by its moments."""
+    load, lever = arm.payload[0], float(arm.length[3]) + arm.payload[1]  # a point in the hand
+    if arm.by_moments:
+        return LinkInertia.of_moments(arm.length, arm.first_moment, (load, lever))
+    second = arm.mass * (arm.cog**2 + arm.length**2 / 12.0)
+    held = np.array((0.0, 0.0, 0.0, load))
+    return _links(arm.length, arm.mass + held, arm.first_moment, second + held * lever**2)
+
+
+def _links(length: np.ndarray, mass: np.ndarray, moment: Vector, second: np.ndarray) -> LinkInertia:
+    beyond = np.append(np.cumsum(mass[::-1])[-2::-1], 0.0)
+    between = np.triu(np.outer(length, moment), 1)
+    weights = between + between.T + np.diag(second + length**2 * beyond)
+    return LinkInertia(tuple(map(tuple, weights.tolist())))
+
+
+def _torque(links: Sequence[Frame], weights: Sequence[Sequence[float]], second: Sequence[Floats3]) -> list[float]:
+    """Return the torque (4,) in Nm that gives the x_n of `links` the second derivatives `second`, (4, 3) 1/s^2."""
+    moment, torque = ZERO, []
+    for (_, axis, along), row in zip(links[::-1], weights[::-1], strict=True):
+        force = ZERO
+        for weight, derivative in zip(row, second, strict=True):
+            force = plus(force, derivative, weight)
+        moment = plus(moment, cross(along, force))
+        torque.append(dot(axis, moment))
+    return torque[::-1]
+
+
+def turning_torque(arm: ArmModel, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+    """Return the torque (4,) in Nm that turns the `side` arm at `theta` (4,) rad along with its base.
+
+    A trunk that turns faster and faster takes the arm along only if the motors accelerate it. What depends on speed is
+    neglected (at 1 rad/s it is a tenth of gravity's torque, or less). angular_acceleration: of the trunk, (3,) rad/s^2
+    in its own axes.
+    """
+    alpha = turning_in_base(side, angular_acceleration)
+    links = frames(ZEROS, theta)
+    torque = _torque(links, links_of(arm).weights, [cross(alpha, link.along) for link in links])
+    return tuple(map(operator.mul, arm.gain.tolist(), torque))
+
+
+def turning_in_base(side: str, vector: Sequence[float]) -> Floats3:
+    """Return an angular velocity or acceleration (3,) of the trunk in the base frame of the `side` arm."""
+    x, y, z = vector
+    return (y, x, -z) if side == "left" else (y, -x, z)  # a mirror, as the right arm is of the left, reverses rotations

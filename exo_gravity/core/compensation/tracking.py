@@ -1,0 +1,222 @@
+"""How the calibration moves the arm, slowly along straight lines in joint space, and what a pose's sweeps show.
+
+All joints sweep through a pose there and back. At the same angle the torque of the way there is gravity plus friction,
+that of the way back gravity minus friction.
+
+The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
+is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have the same natural
+frequency, however they are coupled.
+"""
+
+import math
+from collections.abc import Generator, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+
+MAX_SPEED = 0.3  # rad/s, of any joint
+ACCELERATION = 0.5  # rad/s^2
+AMPLITUDE = 0.06  # rad, of a sweep on each side of its pose
+WINDOW = 0.55  # of a sweep's amplitude: the part on both sides of the pose that is measured
+FOLLOWED = 0.5  # of this part, that each joint must follow in a valid sweep
+LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
+BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
+RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
+ADDED = 0.005  # kg m^2 at each joint: with it 1 kg on link 4 at 100 Hz is carried without sticking (measured)
+FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
+MAX_FREQUENCY = 20.0  # rad/s
+INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
+# Times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that stick on
+# opposite sides of their path would cancel each other's integral where the inertia of both together is small.
+FLOOR = 2.0
+USUAL_FRICTION = 0.15  # Nm, until it is measured
+FRICTION_RATE = 6.0  # of the friction, per s: at once, a joint that rests anywhere within its friction would jump
+AHEAD, FASTER = 0.003, 0.03  # rad and rad/s ahead of the reference, from which on no more friction is compensated
+SLOW_ERROR, STOP_ERROR = 0.04, 0.08  # rad behind the reference, from which on it slows down, and at which it waits
+FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is compensated fully
+
+
+class Observation(NamedTuple):
+    """One pose, passed in both directions of motion."""
+
+    theta: Vector  #: (4,) rad
+    direction: Vector  #: (3,), gravity's unit vector in the base frame
+    effort: Vector  #: (4,) Nm as commanded, mean of both directions
+    friction: Vector  #: (4,) Nm, half of their difference
+    spread: Vector  #: (4,) Nm, standard error of `effort`
+    load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
+    load_lever: float = 0.0  #: m, its distance from the elbow
+    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
+
+
+class Sweep(NamedTuple):
+    """The n samples of one way through a pose."""
+
+    position: np.ndarray  #: (n, 4) rad
+    effort: np.ndarray  #: (n, 4) Nm; the part beyond what is expected at each angle can be given in its place
+    direction: np.ndarray  #: (n, 3), gravity's unit vectors in the base frame
+
+
+class Station(NamedTuple):
+    """A pose that is measured while all joints sweep through it `cycles` times, there and back."""
+
+    theta: tuple[float, ...]  #: (4,) rad
+    speed: float = 0.1  #: rad/s, of the sweep
+    amplitude: float = AMPLITUDE  #: rad, on each side of the pose
+    cycles: int = 2
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the sweep begins and where it turns back, (4,) rad each."""
+        return np.array(self.theta) - self.amplitude, np.array(self.theta) + self.amplitude
+
+
+class Line:
+    """The motion from `start` to `end`, (4,) rad; the joint with the longest way turns at `speed` rad/s at most.
+
+    duration: s.
+    """
+
+    def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MAX_SPEED) -> None:
+        self._start = np.asarray(start, dtype=float)
+        way = np.asarray(end, dtype=float) - self._start
+        self._length = float(np.abs(way).max())
+        self._heading = way / self._length if self._length else way
+        self._speed = min(speed, MAX_SPEED, math.sqrt(self._length * ACCELERATION))
+        self._ramp = self._speed / ACCELERATION
+        self.duration = self._length / self._speed + self._ramp if self._length else 0.0
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return position (4,) rad and velocity (4,) rad/s at `time` s after the start."""
+        time = min(max(time, 0.0), self.duration)
+        rising, falling = min(time, self._ramp), max(0.0, time - self.duration + self._ramp)
+        travelled = ACCELERATION * (rising**2 - falling**2) / 2 + self._speed * (time - rising)
+        return self._start + travelled * self._heading, ACCELERATION * (rising - falling) * self._heading
+
+    def is_measured(self, time: float) -> bool:
+        """Return whether the motion is in its middle, within WINDOW of the half length at steady speed."""
+        is_steady = self._ramp <= time <= self.duration - self._ramp
+        return is_steady and abs(time - self.duration / 2.0) * self._speed <= WINDOW * self._length / 2.0
+
+
+def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
+    """Return what `sweeps` show at a pose, and the largest change (4,) in Nm of the effort from one cycle to another.
+
+    They alternate between there and back. What is expected at an angle should be subtracted from the effort: the rest
+    does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
+    """
+    bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle
+    for number, sweep in enumerate(sweeps):
+        effort = sweep.effort[::-1] if number % 2 else sweep.effort
+        bins[number] = [part.mean(axis=0) for part in np.array_split(effort, BINS)]
+    there, back = bins[0::2], bins[1::2]
+    gravity = (there + back) / 2.0
+    cycles = gravity.mean(axis=1)
+    friction = (there - back).mean(axis=(0, 1)) / 2.0
+    scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
+    theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
+    direction = mean_direction(np.concatenate([sweep.direction for sweep in sweeps]))
+    seen = Observation(theta, direction, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION))
+    return seen, np.ptp(cycles, axis=0)
+
+
+def mean_direction(directions: np.ndarray) -> np.ndarray:
+    """Return the mean (3,) of unit vectors (n, 3), of length 1."""
+    mean = directions.mean(axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
+    """Return the share (4,) of the measured way that each joint went in every one of `sweeps` through `station`."""
+    ways = np.min([np.abs(sweep.position[-1] - sweep.position[0]) for sweep in sweeps], axis=0)
+    return np.asarray(ways / (2.0 * WINDOW * station.amplitude))
+
+
+class Tracker:
+    """Moves the four joints along lines, one after the other, and takes the samples of sweeps.
+
+    rate: control cycles per s. max_effort: (4,) Nm. lines: to follow, each taken when it begins; the owner sets them
+    before the first step. friction: (4,) Nm, compensated in the direction of motion, as far as the owner knows it.
+    saturated: (4,) s for which each joint has wanted more than its `max_effort`. error: (4,) rad by which the arm is
+    behind its path. correction: (4,) Nm, what the controller added to gravity and friction in the last step.
+    """
+
+    def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
+        self.friction = np.full(JOINT_COUNT, USUAL_FRICTION)
+        self.saturated = np.zeros(JOINT_COUNT)
+        self.error = np.zeros(JOINT_COUNT)
+        self.correction = np.zeros(JOINT_COUNT)
+        self._frequency = min(MAX_FREQUENCY, FREQUENCY_PER_RATE * rate)
+        self._max_effort = np.array(max_effort)
+        self._integral = np.zeros(JOINT_COUNT)
+        self._slide = np.zeros(JOINT_COUNT)  # Nm that compensate friction
+        self._effort: Torque = (0.0,) * JOINT_COUNT
+        self.lines: Iterator[Line] = iter(())
+        self._line = Line(self.error, self.error)
+        self._time = math.inf  # s, on the present line; it is over
+        self._samples: list[tuple[Vector, np.ndarray, Vector]] | None = None  # of the present sweep
+
+    def sweep(self, station: Station) -> Generator[Line, None, list[Sweep]]:
+        """Yield the ways through `station`, there and back; return their samples, without the expected torque."""
+        sweeps, (low, high) = list[Sweep](), station.ends
+        for ends in ((low, high), (high, low)):
+            self._samples = []
+            yield Line(*ends, station.speed)
+            sweeps.append(Sweep(*map(np.array, zip(*self._samples, strict=True))))
+        self._samples = None
+        return sweeps
+
+    def shift(self, change: np.ndarray) -> None:
+        """Take over a `change` (4,) Nm of the expected torque, so that the effort does not step."""
+        self._integral -= change
+
+    def step(
+        self, dt: float, position: Vector, velocity: Vector, expected: Torque, direction: Vector, matrix: np.ndarray
+    ) -> Torque:
+        """Return the effort (4,) in Nm, `dt` s after the last one.
+
+        position, velocity: (4,), rad and rad/s. expected: (4,) Nm, gravity's torque. direction: (3,), of gravity, for
+        the samples. matrix: (4, 4) kg m^2, the approximate mass matrix.
+        """
+        if self._time > self._line.duration:
+            self._line, self._time = next(self.lines), -LEAD
+        goal, heading = self._line.at(self._time)
+        self.error = goal - position
+        behind = float(np.abs(self.error).max())
+        pace = max(0.0, min(1.0, (STOP_ERROR - behind) / (STOP_ERROR - SLOW_ERROR)))
+        self._time += pace * dt
+        if self._samples is not None and self._line.is_measured(self._time):
+            # The effort of the last cycle brought the arm here.
+            self._samples.append((position, np.subtract(self._effort, expected), direction))
+        # Friction is compensated before the motion begins: a joint that breaks away late would jump.
+        coming = self._line.at(self._time + LEAD)[1] if self._time < LEAD else heading
+        speed_error = pace * heading - velocity
+        self._compensate_friction(dt, coming, speed_error)
+        self._effort = self._controlled(dt, speed_error, expected, matrix + ADDED * np.eye(JOINT_COUNT))
+        return self._effort
+
+    def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
+        """Compensate friction by and by towards `heading` (4,) rad/s, and no further in a joint that is ahead."""
+        most, way = FRICTION_RATE * self.friction * dt, np.sign(heading)
+        wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
+        change = np.clip(wanted - self._slide, -most, most)
+        is_ahead = (self.error * way < -AHEAD) | (speed_error * way < -FASTER)
+        self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
+
+    def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
+        frequency = self._frequency
+        stiff = matrix @ self.error * frequency**2
+        push = stiff + matrix @ speed_error * 2.0 * frequency
+        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        floor = FLOOR * weakest * self.error * frequency**2
+        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + floor)
+        torque = expected + self._slide + push + integral
+        is_saturated = np.abs(torque) > self._max_effort
+        self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
+        # Without this the integral would wind up.
+        self._integral = np.where(is_saturated & (torque * self.error > 0.0), self._integral, integral)
+        self.correction = push + self._integral
+        return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())

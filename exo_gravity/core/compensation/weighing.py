@@ -1,0 +1,211 @@
+"""Weighs what is in the hand of a relaxed arm: the motors take it over, and sweep all joints a little there and back.
+
+For TAKE_OVER s the arm is held where it is, so that the wearer can relax and the motors get the load. The mean of both
+directions of a sweep is what the settings do not carry, without the joints' friction (`motion.average`). With dz/dq,
+the height that each joint gives the hand, m kg in the hand take the torque m g dz/dq; m is fitted to it.
+
+The result contains the error of the model, which weighing the empty hand in the same pose shows. Muscles look like a
+load: what the wearer carries himself is missing from the result, unless his torque is one that no load can cause.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import MAX_PAYLOAD, ArmModel
+from exo_gravity.core.arm.gravity import LAWS, Torque
+from exo_gravity.core.arm.kinematics import links_of
+from exo_gravity.core.arm.tilt import AXES, Tilt
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.tracking import FOLLOWED, LEAD, Line, Station, Sweep, Tracker, average, followed
+from exo_gravity.lab.observer.momentum import COVER
+
+TAKE_OVER = 4.0  # s
+CYCLES = 3  # there and back
+LEAST_LEVER = 0.2  # m, of dz/dq: below, a load needs too little torque
+LEAST_RATE = 80.0  # Hz
+START_SPEED = 0.2  # rad/s of a joint at the start
+LARGEST_ERROR = 0.4  # rad of a joint from its path
+PERSISTENCE = 0.3  # s for which a joint may want more than it may have
+LIFTED = 0.5  # kg less than nothing, and
+FOREIGN = 2.0  # Nm of any joint that is no load's: more is a hand on the arm, and a joint gets no more
+UNREST = (0.08, 0.05)  # kg, and share of the mass, between two turns
+UNLIKE = (0.3, 0.1)  # Nm, and share of the torque, that is no load's, beyond COVER standard errors
+LEAST_ERROR = 0.05  # Nm: standard error of a joint's torque at best
+MAX_GAP = 0.1  # s
+SAME_POSE = 0.1  # m, of dz/dq
+EMPTY = 0.15  # kg: a result of less, while no load is configured, is that of an empty hand
+CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
+
+
+class Weighed(NamedTuple):
+    """A result: the mass in kg, what is random of its standard deviation, and dz/dq, (4,) m."""
+
+    mass: float
+    deviation: float
+    lever: np.ndarray
+
+
+def refusal(s: Settings, terms: Sequence[str], rate: float) -> str:
+    """Return why nothing can be weighed with these settings, active terms, and joint states at `rate` Hz, or ''."""
+    if carriers := [name for name in terms if name in CARRIERS]:
+        return f"{', '.join(carriers)} would carry a part of the load: switch it off"
+    if any(s.wearer_mass) and (s.mode != "zero_g" or s.support < 1.0):
+        return "a wearer can relax only while the whole arm is carried: mode zero_g with support 1"
+    if rate < LEAST_RATE:
+        return f"joint states come at {rate:.0f} Hz, must be {LEAST_RATE:g} or more"
+    return ""
+
+
+class Weighing:
+    """One weighing, from the first call of `torque` on.
+
+    names: of the joints (4,). rate: of the calls, Hz. empty: result of the empty hand, if known.
+    result: None while there is none. trouble: why there is none, or ''. is_thrown: whether the load must have left the
+    hand, so that its torque throws the arm.
+    """
+
+    def __init__(self, settings: Settings, names: Sequence[str], rate: float, empty: Weighed | None = None) -> None:
+        self.result: Weighed | None = None
+        self.trouble, self.is_thrown = "", False
+        self._settings, self._names, self._empty = settings, names, empty
+        self._tracker, friction = Tracker(rate, settings.max_effort), settings.terms.friction
+        if any(friction.coulomb):  # less what the term `friction` compensates
+            self._tracker.friction = (1.0 - friction.share) * np.array(friction.coulomb)
+        self._matrix: np.ndarray | None = None  # kg m^2, of the arm where it is held; None before the first call
+        self._is_moving = False
+        self._foreign = 0.0  # s for which a hand has pushed
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is a result, or none will come."""
+        return bool(self.result or self.trouble)
+
+    @property
+    def empty(self) -> Weighed | None:
+        """The latest result for an empty hand, or None."""
+        result = self.result
+        return result if result and abs(result.mass) < EMPTY and not self._settings.payload_mass else self._empty
+
+    @property
+    def text(self) -> str:
+        """What is known, in a sentence."""
+        if self.trouble:
+            return f"not weighed: {self.trouble}"
+        if self.result is None:
+            return "the arm moves a little: stay relaxed" if self._is_moving else "relax: the motors take the load over"
+        mass, random, lever = self.result
+        error = COVER * math.hypot(random, self._model, self._share * mass)
+        text = f"{mass:.3f} +- {error:.3f} kg more than the settings carry"
+        if self.empty is self.result:
+            return f"{text}: the hand is empty"
+        more, empty = mass, self._empty
+        if empty and math.dist(empty.lever, lever) <= SAME_POSE:
+            more -= empty.mass
+            error = COVER * math.hypot(random, empty.deviation, self._share * more, math.sqrt(2.0) * self._leaning)
+            text = f"{text}; {more:.3f} +- {error:.3f} kg more than with an empty hand"
+        return f"{text}: payload.mass = {max(0.0, self._settings.payload_mass + more):.3f} carries it"
+
+    def torque(
+        self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
+    ) -> Torque:
+        """Return `torque` (4,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over."""
+        if self._matrix is None:
+            self._matrix, dt = links_of(self._settings.moving).matrix(theta), 0.0
+            self._begin(theta, velocity, tilt)
+        if self.is_over:
+            return torque
+        effort = self._tracker.step(dt, theta, velocity, torque, tilt.direction, self._matrix)
+        if self.is_over or self._is_wrong(dt):
+            return torque
+        most = FOREIGN + MAX_PAYLOAD * self._settings.robot.gravity * np.abs(self._lever)  # what a load may need
+        return tuple((np.array(torque) + np.clip(np.subtract(effort, torque), -most, most)).tolist())
+
+    def _begin(self, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> None:
+        """Refuse a pose that shows no load, and an arm that moves; compute what depends on the pose alone.
+
+        These are each joint's weight in the fit of the mass, by least squares, where all joints share one error of the
+        tilt; and the standard errors of the result: of the torque's scale, as a share, and in kg of the trunk's tilt,
+        and of the whole model with it.
+        """
+        s, error, gravity = self._settings, self._settings.model_error, self._settings.robot.gravity
+        self._lever = np.array(LAWS["exact"](s.unit_load, theta, tilt))  # dz/dq, m
+        fastest = max(map(abs, velocity))
+        if np.linalg.norm(self._lever) < LEAST_LEVER:
+            pose = "bend the elbow to a right angle, or raise the arm to the side"
+            self.trouble = f"the hand hangs below the joints, where a load needs no torque: {pose}"
+            return
+        if fastest > START_SPEED:
+            self.trouble = f"the arm moves at {fastest:.2f} rad/s: hold it still"
+        wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
+        self._worn = np.array(LAWS["exact"](wearer, theta, tilt))  # Nm
+        by_tilt = np.array([LAWS["exact"](s.arm, theta, axis) for axis in AXES]).T  # (4, 3) Nm/rad
+        covariance = np.diag(np.hypot(error.torque, LEAST_ERROR) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T
+        weight = np.linalg.solve(covariance, self._lever)
+        self._weight = weight / (weight @ self._lever)  # 1/m
+        self._tilted = error.tilt * np.linalg.norm(by_tilt, axis=1)  # Nm
+        self._leaning = error.tilt * math.hypot(*(self._weight @ by_tilt)) / gravity
+        self._share = math.hypot(*(self._weight * self._lever * error.scale))
+        model = math.hypot(*(self._weight * error.torque), error.wearer * float(self._weight @ self._worn))
+        self._model = math.hypot(model / gravity, self._leaning)
+        self._tracker.lines = self._way(Station(tuple(theta), cycles=CYCLES))
+
+    def _way(self, station: Station) -> Iterator[Line]:
+        """Yield each line when it begins; have the result, or the trouble, after the last one."""
+        here, sweeps = np.array(station.theta), list[Sweep]()
+        for _ in range(round(TAKE_OVER / LEAD)):
+            yield Line(here, here)
+        yield Line(here, station.ends[0], station.speed)
+        self._is_moving = True
+        for _ in range(station.cycles):
+            sweeps += yield from self._tracker.sweep(station)
+        yield Line(station.ends[0], here, station.speed)
+        self._finish(sweeps, followed(sweeps, station))
+        yield Line(here, here)
+
+    def _is_wrong(self, dt: float) -> bool:
+        """Note what is wrong with the motion; return whether anything is."""
+        error, gravity = self._tracker.error, self._settings.robot.gravity
+        worst = int(np.argmax(np.abs(error)))
+        saturated = [name for name, t in zip(self._names, self._tracker.saturated, strict=True) if t > PERSISTENCE]
+        correction = self._tracker.correction / (self._settings.robot.gain * gravity)
+        mass = float(self._weight @ correction)
+        foreign = (np.abs(correction - mass * self._lever) * gravity).tolist()
+        is_foreign = max(foreign) > FOREIGN or not -LIFTED < mass < MAX_PAYLOAD
+        self._foreign = self._foreign + dt if is_foreign else 0.0
+        if not dt <= MAX_GAP:
+            self.trouble = f"no joint states for {1000.0 * dt:.0f} ms"
+        elif abs(error[worst]) > LARGEST_ERROR:
+            self.is_thrown = float(error @ self._lever) < 0.0
+            why = "was the load dropped?" if self.is_thrown else "relax gradually, and touch nothing"
+            self.trouble = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
+        elif self._foreign > PERSISTENCE:
+            self.trouble = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"
+        elif saturated:
+            remedy = "the load needs more than max_effort here: hold it nearer to the body"
+            self.trouble = f"{', '.join(saturated)}: {remedy}"
+        return bool(self.trouble)
+
+    def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
+        """Fit the mass to the sweeps, of whose way each joint must have followed FOLLOWED; shares: (4,)."""
+        seen, unrest = average(sweeps)
+        error, weight, gravity = self._settings.model_error, self._weight, self._settings.robot.gravity
+        scale = self._settings.robot.gain * gravity
+        mass = float(weight @ (seen.effort / scale))
+        needed = mass * scale * self._lever
+        parts = (error.torque, seen.spread, self._share * needed, error.wearer * self._worn, self._tilted)
+        known = COVER * np.linalg.norm(np.array(parts), axis=0)
+        unlike = np.abs(seen.effort - needed) - known - UNLIKE[0] - UNLIKE[1] * np.abs(needed)
+        restless = math.hypot(*(weight * unrest)) / gravity
+        if restless > UNREST[0] + UNREST[1] * abs(mass):
+            self.trouble = f"{restless:.2f} kg between two turns: relax, and touch nothing"
+        for name, share, off in zip(self._names, shares, unlike, strict=True):
+            if share < FOLLOWED:
+                self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
+            elif off > 0.0:
+                torque = f"{off + UNLIKE[0]:.1f} Nm"
+                self.trouble = f"{name}: no load in the hand explains {torque}: is somebody touching the arm?"
+        if not self.trouble:
+            self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)

@@ -1,0 +1,127 @@
+"""What a recording holds: its topics, and what the reader makes of them, as plain data that needs no bag library."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.params import Param, params_of
+from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.lab.trial.session import Session
+
+if TYPE_CHECKING:
+    import pandas
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+STRING = "std_msgs/msg/String"
+# Of each arm, in its namespace
+STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
+WEARER = ("wearer_efforts", "wearer_efforts_std")
+# Of all
+DIAGNOSTICS, PARAMETER_EVENTS, MARKERS, IMU = "/diagnostics", "/parameter_events", "/event_marker", "/imu/data"
+# Of the recorder, in the recording alone
+PARAMETERS, LOSSES, SESSION = "/recorder/parameters", "/recorder/losses", "/recorder/session"
+READ = {  # type of each topic, or last part of its name, that the reader decodes
+    STATES: JOINT_STATE,
+    COMMANDS: JOINT_STATE,
+    STEPS: STRING,
+    DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+    PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
+    IMU: "sensor_msgs/msg/Imu",
+    PARAMETERS: STRING,
+    LOSSES: STRING,
+    SESSION: STRING,
+    MARKERS: STRING,
+}
+
+
+def leaf(topic: str) -> str:
+    """Return the last part of a topic's name."""
+    return topic.rpartition("/")[2]
+
+
+def arm_of(name: str) -> str:
+    """Return the namespace of a topic or node without slashes, 'arm' for the root namespace."""
+    return name.rpartition("/")[0].strip("/") or "arm"
+
+
+def is_wanted(topic: str, msgtype: str) -> bool:
+    """Return whether the reader decodes this topic."""
+    return msgtype in (READ.get(topic), READ.get(leaf(topic)))
+
+
+class Event(NamedTuple):
+    """A marker, a fault, a warning or a changed parameter."""
+
+    time: float  #: s since the start of the recording
+    text: str
+    setting: tuple[str, str, Any] | None = None  #: node, name and new value of a changed parameter
+
+
+@dataclass(frozen=True)
+class Bag:
+    """What a recording holds."""
+
+    path: Path
+    start: int  #: ns since 1970 of time 0
+    recordings: tuple[Recording, ...]  #: one per arm
+    events: tuple[Event, ...]  #: faults, warnings and changed parameters
+    parameters: dict[str, str]  #: YAML text by node
+    notes: tuple[str, ...]  #: missing parts that do no harm
+    problems: tuple[str, ...]  #: unreadable parts, one sentence each
+    is_partial: bool = False  #: whether it was cut short, or ends before its arms were down
+    session: Session = field(default_factory=Session)  #: of whom, and what for
+    markers: tuple[Event, ...] = ()  #: set by the operator or by a node
+    #: the trunk's motion, (n, 7): s since the start, angular velocity (3,) in rad/s, what it feels as gravity (3,) as
+    #: a share of 1 g, in its axes
+    trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
+
+        subject: the session's code; arm, joint; time_s since the start; step: of the script from 1 on, and its action,
+        0 and '' outside of it; carried: whether the motors carried the arm; position_rad, velocity_rad_per_s,
+        torque_nm as measured, command_nm as requested, NaN where unknown.
+        """
+        arms = [_columns(recording) for recording in self.recordings]
+        columns = {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
+        return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
+
+    def to_frame(self) -> "pandas.DataFrame":
+        """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas (extra `analysis`)."""
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            sentence = "to_frame needs pandas, which is not installed: pip install 'exo_gravity[analysis]'"
+            raise ModuleNotFoundError(sentence, name="pandas") from None
+        return pandas.DataFrame(self.columns())
+
+
+def _columns(recording: Recording) -> dict[str, np.ndarray]:
+    time = recording.time
+    step, action = np.zeros(len(time), int), np.full(len(time), "", object)
+    for number, one in enumerate(recording.steps, 1):
+        within = slice(*np.searchsorted(time, (one.start, one.end)))
+        step[within], action[within] = number, one.action
+    carried = np.zeros(len(time), bool)
+    for start, end in recording.while_carried(-np.inf, np.inf):
+        carried |= (start <= time) & (time <= end)
+    shared = {"time_s": time, "step": step, "action": action, "carried": carried}
+    values = (recording.position, recording.velocity, recording.effort, recording.command)
+    names = ("position_rad", "velocity_rad_per_s", "torque_nm", "command_nm")
+    return {
+        "arm": np.full(len(time) * JOINT_COUNT, recording.name, object),
+        "joint": np.tile(np.array(recording.joint_names, object), len(time)),
+        **{name: np.repeat(column, JOINT_COUNT) for name, column in shared.items()},
+        **{name: np.ravel(column) for name, column in zip(names, values, strict=True)},
+    }
+
+
+# The parameters of `recorder`.
+RECORDER = (
+    Param("output", "", "new folder for the recording", fixed=True, required=True),
+    Param("live", False, "print the latest state as one line of JSON, ten times a second", fixed=True),
+    *params_of(Session, fixed=True),
+)

@@ -1,0 +1,200 @@
+"""Held poses -> the arm's moments, the torque scale of each motor, and what the poses do not show.
+
+The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
+
+    effort = torque(moments + load) / scale + offset          torque: `core.model.gravity.regressor` times the moments
+
+A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
+refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
+weight; nor can they tell a moment across link 3 or 4 from an error of that joint's zero.
+
+Over its speed, a joint's friction is Coulomb, viscous and Stribeck:
+
+    F(v) = coulomb + viscous v + stribeck exp(-(v / v_s)^2)          B. Armstrong-Helouvry et al., Automatica 30 (1994)
+
+For a given Stribeck speed v_s this is linear in the other three, so v_s is searched on a grid.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.gravity import MOMENTS
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.lab.calibration.pose_fit import (
+    ANGLE,
+    COUNT,
+    DISTURBED,
+    MOMENT,
+    OFFSET,
+    SCALE,
+    START,
+    TILT,
+    bounded,
+    rows_of,
+    without_each_pose,
+    without_outliers,
+)
+from exo_gravity.lab.calibration.poses import missing_pose
+
+HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
+SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
+MISFIT = 0.1  # of the peak effort
+LEAST_MISFIT = 0.1  # Nm
+LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
+STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
+SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
+LEAST_RATIO = 2.0  # of the fastest to the slowest speed
+FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
+# Unknowns of joint 1, which carries nothing while its axis is vertical.
+FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
+NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
+LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """The result of `identify` from n observations. Two standard errors cover 95 %, also for few poses."""
+
+    moments: np.ndarray  #: (8,) kg m in the order of `MOMENTS`
+    error: np.ndarray  #: (8,) kg m, their standard errors, infinite where the poses do not show a moment, which is 0
+    scale: np.ndarray  #: (4,), true torque per commanded torque
+    scale_error: np.ndarray  #: (4,), standard errors, infinite where not known
+    offset: np.ndarray  #: (4,) Nm as commanded
+    friction: np.ndarray  #: (4,) Nm as commanded
+    residual: np.ndarray  #: (n, 4) Nm, effort minus prediction
+    held_out: np.ndarray  #: (n, 4) Nm, the same predicted without that pose, NaN where the others do not suffice
+    singular_values: np.ndarray  #: of the information in the poses, the largest first; below 1: not known
+    unknown: tuple[str, ...]  #: sentences on what the poses do not show, and what would
+    rejected: tuple[tuple[int, str], ...]  #: index and reason of each observation that is not used
+    #: No weight was hung: the product of the scales of joints 2 to 4 is taken as 1, moments are in commanded torque.
+    relative: bool
+    tilt: np.ndarray  #: (3,) rad in the base frame, rotation of gravity from the measured to the true direction
+    tilt_covariance: np.ndarray  #: (3, 3); one lean of the stand does not show the turn about gravity, two do
+
+
+def identify(observations: Sequence[Observation], length: Vector, gravity: float = STANDARD_GRAVITY) -> Identified:
+    """Return what the observations show of an arm with links of `length` (4,) m.
+
+    Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
+    """
+    rows = rows_of(observations, length, gravity)
+    keep, rejected = without_outliers(rows)
+    used, solution = bounded(rows.only(keep))
+    typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
+    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+        misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
+        raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
+    direction, hidden, is_relative = observations[-1].direction, solution.hidden > HIDDEN, not np.any(used.load)
+    _check_known(hidden, len(observations), direction, gravity, is_relative)
+    unknowns = np.where(hidden, START, solution.unknowns)
+    # Student's distribution: for few poses two standard errors would cover less than 95 %.
+    covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
+    error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
+    moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
+    check_physical(moments, error[MOMENT], scale, direction, gravity)
+    residual = rows.effort - rows.predicted(solution.unknowns)
+    held_out = residual.copy()
+    held_out[keep], _ = without_each_pose(solution, used.sigma)
+    friction = np.median([observation.friction for observation in observations], axis=0)
+    return Identified(
+        moments, error[MOMENT], scale, scale * error[SCALE], unknowns[OFFSET], friction, residual, held_out,
+        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative)), rejected, is_relative,
+        unknowns[TILT], covariance[TILT, TILT],
+    )  # fmt: skip
+
+
+def _check_known(hidden: np.ndarray, count: int, direction: Vector, gravity: float, is_relative: bool) -> None:
+    """Raise DataError that names what is missing if `count` poses do not show `hidden` (22,) of joints 2 to 4."""
+    missing = hidden.copy()
+    missing[list(FIRST_JOINT)] = False
+    if np.all(missing[SCALE][1:]) and not is_relative:
+        raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
+    if np.any(missing):
+        names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
+        pose = missing_pose(missing, direction, gravity)
+        raise DataError(f"{count} poses do not show {names}: add the pose {pose}")
+
+
+def check_physical(
+    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: Vector, gravity: float
+) -> None:
+    """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
+    low, high = SCALES
+    for joint in np.flatnonzero((scale < low) | (scale > high)):
+        expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
+        raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
+    for index in (1, 2, 3):
+        moment, uncertain = f"{MOMENTS[index]} = {moments[index]:.3f} kg m", error[index]
+        if uncertain > abs(moments[index]):
+            pose = missing_pose(np.arange(COUNT) == index, direction, gravity)
+            raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
+        if moments[index] <= 0.0:
+            raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")
+    for across, along in ((6, 2), (7, 3)):
+        if abs(moments[across]) > moments[along]:
+            angle = math.degrees(math.atan2(moments[across], moments[along]))
+            seems = f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
+            raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
+
+
+def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> Iterator[str]:
+    """Yield what the poses do not show, and what would, in sentences; unknowns and `hidden`: (22,)."""
+    if relative:
+        yield "A common factor of all torque scales and moments: hang a known weight on link 4."
+    if names := ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start])):
+        yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
+    for joint, along, across in ((4, 3, 7), (3, 2, 6)):
+        angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
+        looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
+        yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
+    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
+    if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
+        yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
+
+
+class FrictionCurve(NamedTuple):
+    """Friction of a joint over its speed."""
+
+    speed: np.ndarray  #: (n,) rad/s
+    torque: np.ndarray  #: (n,) Nm, measured
+    fitted: np.ndarray  #: (n,) Nm
+    coulomb: float  #: Nm
+    viscous: float  #: Nm s/rad
+    stribeck: float  #: Nm, 0 if the data show none
+    stribeck_speed: float  #: rad/s, 0 without Stribeck friction
+    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck
+
+
+def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
+    """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
+
+    Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
+    """
+    speeds = len(np.unique(speed))
+    if speeds < 3:
+        raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
+    if speed.max() < LEAST_RATIO * speed.min():
+        measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
+        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
+    fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
+    best = min(fits, key=lambda fit: float(np.sum((fit.fitted - torque) ** 2)))
+    return best if speeds > 3 and best.stribeck > SIGNIFICANT * best.error[2] else _fit(speed, torque)
+
+
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
+    """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
+    falling = np.exp(-((speed / stribeck_speed) ** 2)) if stribeck_speed else np.zeros_like(speed)
+    matrix = np.stack((np.ones_like(speed), speed, falling), axis=1)
+    values, _, rank, _ = np.linalg.lstsq(matrix, torque, rcond=None)
+    fitted = matrix @ values
+    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
+    errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    coulomb, viscous, stribeck = values.tolist()
+    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist()))

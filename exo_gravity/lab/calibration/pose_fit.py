@@ -1,0 +1,241 @@
+"""Weighted least squares for the unknowns of an arm in held poses.
+
+The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, three
+angles by which a known weight seems to lie off the links (a zero of joint 3 or 4 that is off by a degree moves a weight
+by more than a light forearm's own moment), and the rotation of gravity's direction from the measured to the true one:
+an IMU is mounted, and a stand placed, to no better than a degree. The commanded effort is `torque(moments + load) /
+scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns
+that the poses do not show: those whose standard error exceeds `NATURAL`.
+
+Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
+joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.gravity import MOMENTS, load_moments, regressor
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+
+MOMENT = slice(0, 8)
+SCALE = slice(8, 12)
+OFFSET = slice(12, 16)
+ANGLE = slice(16, 19)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 to Z
+ALONG, ACROSS = [2, 3, 3], [6, 7, 5]  # indices of these moments
+TILT = slice(19, 22)  # rotation vector of gravity in the base frame
+TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
+COUNT = 22
+# kg m, logarithm, Nm, rad, rad: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 3, 3))
+# kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
+TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
+START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(18)))  # of the search
+HUBER = 2.0  # standard errors beyond which a residual's weight falls
+POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
+STEPS = 40
+TINY = 1e-20  # of the complex step: no difference is taken, so nothing is lost to rounding
+MEDIAN_SQUARE = 0.455  # of a standard normal variable
+MEDIAN_CAUSED = 3.36  # of the sum of four such squares
+LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
+SHARE_OF_PEAK = 0.01
+DISTURBED = "Was it touched, does a joint slip or touch a stop?"
+COMMON = 0.002  # of torque: error of all sweeps of a joint in one tour, which their scatter does not show
+LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
+BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
+TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
+EXACT = 1e-6  # error of a value that is held
+OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
+
+
+class Rows(NamedTuple):
+    """What is fitted, for n poses."""
+
+    along: np.ndarray  #: (n, 4, 8, 3) Nm per kg m, the torque with gravity along each axis of the base frame
+    direction: np.ndarray  #: (n, 3), gravity's unit vector in the base frame, as measured
+    load: np.ndarray  #: (n, 8) kg m, moments of the weight
+    effort: np.ndarray  #: (n, 4) Nm
+    sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
+    #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
+    anchor: np.ndarray = np.zeros((0, COUNT))
+
+    def only(self, keep: np.ndarray) -> "Rows":
+        """Return the poses that `keep` (n,) selects."""
+        return Rows._make([*(column[keep] for column in self[:-1]), self.anchor])
+
+    def predicted(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the commanded effort (n, 4) in Nm."""
+        turn = np.eye(len(MOMENTS), dtype=unknowns.dtype)
+        turn[ALONG, ACROSS] = unknowns[ANGLE]
+        moments = unknowns[MOMENT] + self.load @ turn
+        direction = self.direction + self.direction @ (unknowns[TILT] @ TURN)
+        torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
+        return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
+
+    def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivative of `predicted` by the unknowns, (n, 4, 22), exact to rounding by complex steps."""
+        steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(COUNT))
+        return np.stack(list(steps), axis=-1) / TINY
+
+
+class Solution(NamedTuple):
+    """The fit of `Rows`."""
+
+    unknowns: np.ndarray  #: (22,)
+    covariance: np.ndarray  #: (22, 22) of what is known
+    hidden: np.ndarray  #: (22,), share 0..1 of each unknown that is not known
+    singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
+    residual: np.ndarray  #: (n, 4) Nm
+    left: np.ndarray  #: (n, 4), part of each residual's variance that the fit leaves, 0..1
+    freedom: np.ndarray  #: (4,), degrees of freedom of each joint's residuals
+    hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
+    inverse: np.ndarray  #: (22, 4 n + k), change of the unknowns with each effort and condition, divided by its error
+
+
+def rows_of(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
+    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
+    if not observations:
+        raise DataError("no pose was observed")
+    theta, direction, effort, spread = found = columns(observations)
+    for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
+        for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
+            raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
+    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
+    product = np.eye(COUNT)[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
+    product *= not np.any(load)
+    anchor = np.vstack((np.eye(COUNT)[ANGLE] / BESIDE_ERROR, np.eye(COUNT)[TILT] / TILT_ERROR, product / EXACT))
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
+
+
+def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
+    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
+    return [np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4)]
+
+
+def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
+    """Return `Rows.along` of the poses `theta` (n, 4) rad."""
+    return np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)
+
+
+def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.0) -> Solution:
+    """Return the least-squares solution from `start` (22,); weight: (n, 4) of the squared residuals."""
+    root = np.sqrt(weight) / rows.sigma
+    unknowns = start
+    for _ in range(STEPS):
+        poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
+        whitened = np.vstack((poses, rows.anchor))
+        left, size, right = np.linalg.svd(whitened * NATURAL, full_matrices=False)
+        known = size > 1.0
+        inverse = NATURAL[:, None] * (right[known].T / size[known]) @ left[:, known].T
+        residual = rows.effort - rows.predicted(unknowns)
+        step = inverse @ np.append(root * residual, -rows.anchor @ unknowns)
+        if np.all(np.abs(step) < 1e-9 * NATURAL):
+            break
+        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
+    hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
+    size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
+    singular_values = np.pad(size, (0, ANGLE.start - len(size)))
+    hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
+    left_over = 1.0 - np.einsum("njnj->nj", hat)
+    freedom = np.maximum(left_over.sum(axis=0), 0.0)
+    covariance = inverse @ inverse.T
+    return Solution(unknowns, covariance, hidden, singular_values, residual, left_over, freedom, hat, inverse)
+
+
+def robust(rows: Rows) -> tuple[Rows, Solution]:
+    """Return a solution that gives large residuals little weight, and the rows with at least the error they state."""
+    solution = solve(rows)
+    for _ in range(4):
+        squares = (solution.residual / rows.sigma) ** 2
+        squares /= np.maximum(0.2, solution.left)
+        factor = np.maximum(1.0, _pooled(np.median(squares, axis=0) / MEDIAN_SQUARE, solution.freedom))
+        size = np.sqrt(squares / factor)
+        solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
+    return rows._replace(sigma=rows.sigma * np.sqrt(factor)), solution
+
+
+def final(rows: Rows) -> tuple[Rows, Solution]:
+    """Return the plain least-squares solution, and the rows with the error that its residuals show.
+
+    The covariance includes a relative error of `COMMON` that all poses of a joint with the same weight share.
+    """
+    scaled, solution = rows, solve(rows)
+    for _ in range(3):
+        squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
+        factor = _pooled(squares / np.maximum(solution.freedom, 1e-9), solution.freedom)
+        scaled = rows._replace(sigma=rows.sigma * np.sqrt(factor))
+        solution = solve(scaled, solution.unknowns)
+    return scaled, solution._replace(covariance=solution.covariance + _common_error(scaled, solution))
+
+
+def bounded(rows: Rows) -> tuple[Rows, Solution]:
+    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
+    used, solution = final(rows)
+    if solution.unknowns[0] >= 0.0:
+        return used, solution
+    used, held = final(rows._replace(anchor=np.vstack((rows.anchor, np.eye(COUNT)[:1] / EXACT))))
+    held.unknowns[0], held.covariance[0, 0] = 0.0, solution.covariance[0, 0]
+    return used, held
+
+
+def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
+    """Return the covariance (22, 22) that the error `COMMON` of each joint and weight causes."""
+    torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
+    loads, group = np.unique(rows.load, axis=0, return_inverse=True)
+    shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
+    columns = COMMON * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
+    change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
+    return np.asarray(change.T @ change)
+
+
+def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Return each joint's factor (4,) of the variance, moved towards that of all joints where its data are few."""
+    total = freedom.sum()
+    common = float(factor @ freedom) / total if total > 1.0 else 1.0
+    pooled = (factor * freedom + POOLING * common) / (freedom + POOLING)
+    return np.asarray(np.maximum(pooled, 1e-4))
+
+
+def without_each_pose(solution: Solution, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each pose, what leaving it out shows.
+
+    The residual (n, 4) in Nm of a prediction from the other poses, NaN where they do not suffice; and the part (n,) of
+    the sum of squares that this pose causes, about 4 for a pose with usual errors.
+    """
+    whitened = solution.residual / sigma
+    held_out, caused = np.full_like(whitened, np.nan), np.zeros(len(whitened))
+    for i, residual in enumerate(whitened):
+        left = np.eye(JOINT_COUNT) - solution.hat[i, :, i, :]
+        if np.linalg.eigvalsh((left + left.T) / 2.0)[0] > 1e-6:
+            held_out[i] = np.linalg.solve(left, residual)
+            caused[i] = residual @ held_out[i]
+    return held_out * sigma, caused
+
+
+def without_outliers(rows: Rows) -> tuple[np.ndarray, tuple[tuple[int, str], ...]]:
+    """Return which poses (n,) fit one arm, and index and reason of each that does not.
+
+    Raises DataError if more than a third does not fit.
+    """
+    keep = np.ones(len(rows.effort), dtype=bool)
+    rejected: list[tuple[int, str]] = []
+    least = np.maximum(LEAST_OUTLIER, SHARE_OF_PEAK * np.abs(rows.effort).max(axis=0))
+    while True:
+        used, solution = robust(rows.only(keep))
+        held_out, caused = without_each_pose(solution, used.sigma)
+        matters = np.nanmax(np.abs(held_out) / least, axis=1, initial=0.0) > 1.0
+        worst = int(np.argmax(caused * matters))
+        if not matters[worst] or caused[worst] < OUTLIER * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
+            return keep, tuple(rejected)
+        joint = int(np.argmax(np.abs(held_out[worst] / used.sigma[worst])))
+        index = int(np.flatnonzero(keep)[worst])
+        off = f"effort of joint {joint + 1} is {held_out[worst, joint]:+.2f} Nm off what the other poses predict"
+        rejected.append((index, off))
+        keep[index] = False
+        if len(rejected) > len(keep) // 3:
+            reasons = "; ".join(f"pose {index + 1}: {why}" for index, why in rejected)
+            raise DataError(f"the poses do not fit one arm: {reasons}. {DISTURBED}")

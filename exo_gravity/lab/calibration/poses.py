@@ -1,0 +1,220 @@
+"""Which poses the calibration visits: given ones, or the most informative ones that the motors can hold.
+
+What holds the arm is expected with a mean and a standard deviation for every pose. Each joint has moments of its own,
+in the Nm that its motor is commanded: its unknown torque scale is then part of them. They start from the parameter
+file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman update).
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import LAWS, Torque, regressor
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
+from exo_gravity.lab.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
+
+UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
+UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing
+UNEXPLAINED = 0.05  # Nm: standard deviation of what no moment explains
+CANDIDATES = 800
+MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
+SHARE = 0.85  # of max_effort that a pose may need
+DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for; less where none does
+LEAST_DEVIATION = 1e-9  # Nm
+USUAL_FRICTION = 0.5  # Nm, until it is measured
+WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
+FIRST_EDGE = 0.1  # rad in addition, at the first pose
+EDGE = 0.02  # rad between a sweep's end and the soft wall
+TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
+SWEEP_SPEEDS = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  # rad/s, at which friction is measured
+SWEEP_TIME = 1.2  # s of such a sweep's half at steady speed
+SWEEP_AMPLITUDE = (0.05, 0.3)  # rad
+NOISE = 0.03  # Nm in any pose
+NOISE_SHARE = 0.02  # of the torque
+# deg of each joint, within the paper's ranges: from these a missing pose is suggested.
+GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
+
+
+class TorqueGuess:
+    """The commanded torque that holds the arm, as far as it is known.
+
+    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
+    """
+
+    def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
+        moments = np.asarray(moments, dtype=float)
+        deviation = UNSURE * np.abs(moments) + UNSURE_MOMENT
+        self.length = np.asarray(length, dtype=float)
+        self.tilt = tilt
+        self.gravity = gravity
+        self._mean = np.tile(moments, (JOINT_COUNT, 1))  # of each joint
+        self._covariance = np.tile(np.diag(deviation**2), (JOINT_COUNT, 1, 1))
+        self._arms = self._as_arms()
+
+    @property
+    def common_moments(self) -> np.ndarray:
+        """The moments (8,) in kg m as the joints show them on average; M_n is that of joint n."""
+        return np.append(np.diag(self._mean[:, :JOINT_COUNT]), self._mean[:, JOINT_COUNT:].mean(axis=0))
+
+    def torque(self, theta: Sequence[float]) -> Torque:
+        """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
+        law = LAWS["exact"]
+        return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
+
+    def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad.
+
+        direction: (3,), gravity's unit vector in the base frame; by default as at present.
+        """
+        rows = regressor(theta, self.tilt.direction if direction is None else direction, self.gravity)
+        mean = np.einsum("njk,jk->nj", rows, self._mean)
+        variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
+        return mean, np.sqrt(np.maximum(variance, 0.0))
+
+    def learn(self, theta: Vector, effort: Vector, spread: Vector) -> None:
+        """Take a measured torque `effort` (4,) Nm at `theta` (4,) rad, with its standard error `spread` (4,) Nm."""
+        rows = regressor(theta, self.tilt.direction, self.gravity)[0]
+        for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
+            covariance = self._covariance[joint]
+            gain = covariance @ row / (row @ covariance @ row + error**2 + UNEXPLAINED**2)
+            self._mean[joint] += gain * (torque - row @ self._mean[joint])
+            self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
+        self._arms = self._as_arms()
+
+    def _as_arms(self) -> list[ArmModel]:
+        return [
+            ArmModel.from_moments(self.length, np.maximum(row[:4], 0.0), row[4:], gravity=self.gravity)
+            for row in self._mean
+        ]
+
+
+class Itinerary:
+    """Visits given stations, then others until `count` poses are measured, each the one that shows the most.
+
+    given: by default the hanging arm. duration: s, of the whole tour, which the choice keeps within.
+    """
+
+    def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
+        self._limits, self._most, self._duration = limits, count, duration
+        self._home, self._candidates = hanging(limits), candidates(limits)
+        stations = given or [self._home]
+        self.count, self._given = max(count, len(stations)), iter(stations)
+
+    def next(
+        self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
+    ) -> Station | None:
+        """Return the next of the given stations, then the best of the candidates that can be held and reached.
+
+        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
+        of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
+        held.
+        """
+        station = next(self._given, None)
+        if station or len(taken) >= self._most:
+            return station
+        in_time = np.flatnonzero(self._is_in_time(self._most - len(taken), position, elapsed))
+        room = self._room(self._candidates[in_time], position, guess, friction)
+        if room.max() < 0.0:
+            raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
+        possible = in_time[room >= min(DEVIATIONS, math.floor(room.max()))]
+        seen, poses = list(taken) or [self._home.theta], self._candidates[possible]
+        index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
+        pose = self._candidates[index]
+        self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
+        return Station(tuple(pose.tolist()))
+
+    def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
+        home, way = (
+            np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
+            for pose in (np.array(self._home.theta), position)
+        )
+        budget = (self._duration - elapsed - home) / left
+        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
+        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
+        return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
+
+    def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
+        """Return the room (n,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
+
+        It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
+        known. friction: (4,) Nm, against which the arm is moved.
+        """
+        shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
+        sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
+        start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
+        mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
+        most = SHARE * np.array(self._limits.max_effort) - [own or USUAL_FRICTION for own in friction]
+        room = ((most - np.abs(mean)) / np.maximum(deviation, LEAST_DEVIATION)).min(axis=1).reshape(-1, len(poses))
+        is_home = np.arange(len(room))[:, None] >= len(room) - len(home)
+        return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
+
+
+def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
+    """Return the hanging arm, off the soft walls by FIRST_EDGE: friction is not known there at first."""
+    low, high = measurable(limits, amplitude)
+    return Station(tuple(np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE).tolist()), speed, amplitude)
+
+
+def friction_stations(limits: Limits) -> list[Station]:
+    """Return sweeps through the hanging arm at each speed; the first lets the controller learn the friction."""
+    speeds = (0.1, *SWEEP_SPEEDS)
+    amplitudes = np.clip(np.array(speeds) * SWEEP_TIME, *SWEEP_AMPLITUDE).tolist()
+    return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
+
+
+def candidates(limits: Limits) -> np.ndarray:
+    """Return random poses (n, 4) in rad within `limits` in which no link points far upwards.
+
+    Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
+    """
+    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CANDIDATES, JOINT_COUNT))
+    down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
+    return np.asarray(poses[down.min(axis=1) >= -MOST_UPWARDS])
+
+
+def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest pose (4,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
+    margin = WALL_WIDTH + amplitude + EDGE
+    return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
+
+
+def next_pose(
+    taken: Sequence[Vector], candidates: np.ndarray, direction: Vector, moments: Vector, gravity: float
+) -> int:
+    """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
+
+    taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
+    frame. moments: (8,) kg m, a guess.
+    """
+    seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
+    information = np.diag(NATURAL**-2.0) + seen.T @ seen
+    rows = _sensitivity(candidates, direction, moments, gravity)
+    added = np.eye(JOINT_COUNT) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
+    return int(np.argmax(np.linalg.slogdet(added)[1]))
+
+
+def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
+    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (22,) are not known."""
+    poses = np.radians(list(itertools.product(*GRID)))
+    shown = _sensitivity(poses, direction, TYPICAL_MOMENTS, gravity) * NATURAL * hidden
+    best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
+    return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
+
+
+def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
+    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 22)."""
+    nothing = np.zeros((len(theta), JOINT_COUNT))
+    down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
+    rows = Rows(along_axes(theta, gravity), down, no_load, nothing, nothing)
+    unknowns = START.copy()
+    unknowns[MOMENT] = moments
+    noise = np.hypot(NOISE, NOISE_SHARE * rows.predicted(unknowns))
+    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(COUNT) < TILT.start))

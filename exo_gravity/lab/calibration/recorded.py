@@ -1,0 +1,148 @@
+"""Observations from a recording: poses that were passed slowly in both directions, and poses that were held.
+
+A pose that was passed there and back gives gravity and friction. A held pose gives gravity to within friction only: the
+arm would stay with any torque inside it.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.serde import SerdeError
+
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import BINS, Observation, Sweep, average, mean_direction
+from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.bag.joints import TYPES
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
+
+TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
+SPEED = (0.008, 0.35)  # rad/s: slower is held, faster has inertia
+SPEED_WINDOW = 0.2  # s over which the speed is taken
+EDGE = 0.25  # of the common way of two sweeps, left out at each end, where they turn
+LEAST_WAY = 0.03  # rad that each joint must turn in both directions
+LONGEST_TURN = 3.0  # s between a sweep and the one back
+HELD_TIME = 1.0  # s
+UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
+
+
+def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
+    """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
+
+    with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
+    """
+    bag = read_bag(path)
+    recording = recording_of(bag, arm)
+    effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
+    recording = replace(recording, position=recording.position.astype(float), effort=effort)
+    down = _down(path, arm, recording.time + bag.start / 1e9)
+    observations = list(_sweeps(recording, down))
+    if with_held:
+        observations += list(_held(recording, down, observations))
+    if not observations:
+        held = f", or held one for {HELD_TIME:g} s" if with_held else ""
+        raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
+    return observations
+
+
+def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
+    """Return the recording in `bag` that has the joints of `arm`, with its arrays in their order. Raises DataError."""
+    recording = next((r for r in bag.recordings if sorted(r.joint_names) == sorted(arm.joint_names)), None)
+    if recording is None:
+        found = "; ".join(", ".join(r.joint_names) for r in bag.recordings)
+        raise DataError(f"{bag.path}: the joints are {found}: must include {', '.join(arm.joint_names)}")
+    return recording.in_order(arm.joint_names)
+
+
+def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
+    """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
+    if not arm.compensator["use_imu"]:
+        return np.tile(Tilt.of(arm.side).direction, (len(times), 1))
+    stamps, tilts = zip(*tilts_of(path, arm.side), strict=True)
+    components = np.array([tilt.direction for tilt in tilts]).T
+    return np.stack([np.interp(times, stamps, component) for component in components], axis=1)
+
+
+def tilts_of(path: Path, side: str, required: bool = True) -> Iterator[tuple[float, Tilt]]:
+    """Yield the trunk's tilts in a recording, for the `side` arm, each with its stamp in s. Raises DataError."""
+    for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE, required):
+        yield stamp / 1e9, Tilt.of(side, message.vector.y, message.vector.x)
+
+
+def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
+    """Yield stamp in ns and message of each message of `topic` in a recording.
+
+    Raises DataError if a message is unreadable, or if a `required` one is missing.
+    """
+    storage, found = Storage(path), False
+    for *_, stamp, data in storage.messages(lambda name, kind: (name, kind) == (topic, msgtype)):
+        try:
+            yield stamp, TYPES.deserialize_cdr(data, msgtype)
+        except (SerdeError, ValueError) as error:
+            raise DataError(f"{path}: {topic}: {error}") from None
+        found = True
+    if required and not found:
+        topics = ", ".join(sorted(storage.topics)) or "none"
+        raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
+
+
+def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
+    """Yield an observation for every two runs one after the other in which all joints turn to and fro.
+
+    It is what the middle of the way shows that both runs have in common.
+    """
+    time, position = recording.time, recording.position
+    runs = [run for span in recording.while_carried(-math.inf, math.inf) for run in _runs(recording, *span)]
+    used = 0  # samples: each run is used once
+    for there, back in pairwise(runs):
+        ends = position[[there.start, there.stop - 1, back.start, back.stop - 1]]
+        way, way_back = ends[1] - ends[0], ends[3] - ends[2]
+        is_late = time[back.start] - time[there.stop - 1] > LONGEST_TURN
+        if there.start < used or is_late or np.any(way * way_back >= 0.0):
+            continue
+        low = np.maximum(ends[:2].min(axis=0), ends[2:].min(axis=0))
+        high = np.minimum(ends[:2].max(axis=0), ends[2:].max(axis=0))
+        middles = []
+        for run in (there, back):
+            is_inside = np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - EDGE)
+            middles.append(np.flatnonzero(np.all(is_inside, axis=1)) + run.start)
+        if np.any(high - low < LEAST_WAY) or min(map(len, middles)) < 2 * BINS:
+            continue
+        used = back.stop
+        speeds = [np.ptp(position[part[[0, -1]]], axis=0) / np.ptp(time[part]) for part in middles]
+        seen, _ = average([Sweep(position[part], recording.effort[part], down[part]) for part in middles])
+        yield seen._replace(friction=np.sign(way) * seen.friction, speed=np.mean(speeds, axis=0))
+
+
+def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
+    """Yield the runs between `start` and `end` s in which every joint turns slowly without turning round."""
+    first, beyond = np.searchsorted(recording.time, start), np.searchsorted(recording.time, end, "right")
+    time, position = recording.time[first:beyond], recording.position[first:beyond]
+    later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW), len(time) - 1)
+    speed = (position[later] - position) / np.maximum(time[later] - time, 1e-3)[:, None]
+    is_slow = np.all((np.abs(speed) >= SPEED[0]) & (np.abs(speed) <= SPEED[1]), axis=1)
+    way = np.where(is_slow, np.sign(speed) @ (27, 9, 3, 1), 0.5)
+    edges = np.flatnonzero(np.diff(way, prepend=np.nan, append=np.nan) != 0.0)
+    for low, high in pairwise(edges.tolist()):
+        if is_slow[low] and high - low > 4 * BINS:
+            yield slice(int(first) + low, int(first) + high)
+
+
+def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:
+    """Yield an observation for every pose that was held, as uncertain as the friction of `sweeps`."""
+    friction = np.abs(np.median([s.friction for s in sweeps], axis=0)) if sweeps else np.full(4, UNKNOWN_FRICTION)
+    for start, end in still_spans(recording, in_blocks(recording)):
+        if end - start >= HELD_TIME:
+            part = (recording.time >= start) & (recording.time <= end)
+            effort = recording.effort[part]
+            spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))
+            theta = recording.position[part].mean(axis=0)
+            yield Observation(theta, mean_direction(down[part]), effort.mean(axis=0), friction, spread)

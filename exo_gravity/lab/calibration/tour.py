@@ -1,0 +1,245 @@
+"""The tour of a calibration: moves the arm slowly from pose to pose and measures what each of them needs to be held.
+
+Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is
+gravity, half of the difference is friction. What was measured improves the expected torque, which carries the arm and
+distinguishes a hand on it from its weight. The tour begins and ends at the hanging arm; after trouble it withdraws its
+efforts.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
+from exo_gravity.core.arm.gravity import Torque, load_moments
+from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.tilt import Tilt, angle_between
+from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.compensation.tracking import (
+    FOLLOWED,
+    Line,
+    Observation,
+    Station,
+    Sweep,
+    Tracker,
+    average,
+    followed,
+)
+from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
+
+MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
+MAX_SKIPPED = 2  # poses in which a joint may stick
+STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
+REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
+# What stops a tour.
+MAX_ERROR = 0.12  # rad between a joint and the slow reference
+FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
+MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+DEVIATIONS = 3.0  # of the expected torque
+UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
+PERSISTENCE = 0.25  # s for which a torque must be unexplained
+SATURATION = 0.1  # s for which a joint may want more than its max_effort
+MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
+LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
+MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
+MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
+
+
+class Tour:
+    """One tour. Call `wait` for each joint state until the arm is carried, then `step`; and `plan` again and again.
+
+    measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
+    the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
+    """
+
+    def __init__(
+        self, limits: Limits, guess: TorqueGuess, itinerary: Itinerary, rate: float, load: tuple[float, float] = (0, 0)
+    ) -> None:
+        self.measured: list[Observation] = []
+        self.trouble = ""
+        self.done = False
+        self.progress = "choosing the first pose"
+        self.elapsed = 0.0
+        self._limits, self._most = limits, np.array(limits.max_effort)
+        self._guess, self._itinerary, self._load = guess, itinerary, load
+        self._tracker = Tracker(rate, limits.max_effort)
+        self._first_tilt = guess.tilt
+        self._now = -math.inf
+        self._position = np.zeros(JOINT_COUNT)  # rad, at the end of the present line
+        self._skipped = 0  # poses
+        self._awaits_plan, self._undecided = False, 0.0  # whether a pose is to be chosen, and s since then
+        self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
+        self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
+        self._unexplained = np.zeros(JOINT_COUNT)  # s
+        self._refreshed = -math.inf
+        self._matrix, self._uncertain = np.eye(JOINT_COUNT), np.zeros(JOINT_COUNT)
+
+    def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the expected torque (4,) in Nm at `position` (4,) rad, while the arm is not yet carried."""
+        self._guess.tilt = tilt
+        return self._guess.torque(position)
+
+    def step(self, now: float, position: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> Torque | None:
+        """Return the effort (4,) in Nm at `now` s, None after trouble.
+
+        position, velocity: (4,), rad and rad/s. tilt: of the trunk or the stand.
+        """
+        if self.trouble:
+            return None
+        expected = self.wait(position, tilt)
+        if self.done:  # the bridge lets the arm down: it is no longer watched
+            return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
+        if self._now == -math.inf:
+            self._first_tilt, self._now, self._position = tilt, now, np.array(position)
+            self._tracker.lines = self._way()
+        dt, self._now = now - self._now, now
+        self.elapsed += dt
+        self._undecided = self._undecided + dt if self._awaits_plan else 0.0
+        if now - self._refreshed > REFRESH_PERIOD:
+            self._refreshed, moments = now, self._guess.common_moments[:JOINT_COUNT]
+            self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
+            self._uncertain = self._guess.torques(np.array([position]))[1][0]
+        effort = self._tracker.step(dt, position, velocity, expected, tilt.direction, self._matrix)
+        self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
+        return None if self.trouble else effort
+
+    def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
+        """Return what is wrong after `dt` s with the motion, or ''; velocity: (4,) rad/s."""
+        if dt > MAX_GAP:
+            return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
+        if self._undecided > LONGEST_CHOICE:
+            return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
+        if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
+            return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
+        for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, velocity, strict=True):
+            if not abs(behind) <= MAX_ERROR:
+                reason = "a hand is on the arm, or the joint is blocked"
+                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
+            if not abs(speed) <= FASTEST:
+                return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
+        return ""
+
+    def _wrong_torque(self, dt: float) -> str:
+        """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
+        for i in np.flatnonzero(self._tracker.saturated > SATURATION):
+            most = f"max_effort = {self._most[i]:g} Nm"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
+        torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
+        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
+        self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
+        for i in np.flatnonzero(self._unexplained > PERSISTENCE):
+            beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
+            return f"{self._limits.joint_names[i]}: {beyond}: is a hand on the arm?"
+        return ""
+
+    def plan(self) -> None:
+        """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`.
+
+        Any error of the choice ends the tour: without a next pose the arm would be held for ever.
+        """
+        if not self._awaits_plan:
+            return
+        try:
+            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
+            self._plan = self._itinerary.next(taken, self._position, self.elapsed, self._guess, self._friction), ""
+        except ExoGravityError as error:
+            self._plan = (None, str(error))
+        except Exception as error:
+            self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
+        self._awaits_plan = False
+
+    def _way(self) -> Iterator[Line]:
+        """Yield each line of the tour when it begins; the arm is held until `plan` chose."""
+        home = np.array(self._limits.home)
+        while True:
+            self._awaits_plan = True
+            while self._awaits_plan:
+                yield Line(self._position, self._position)
+            station, self.trouble = self._plan
+            if station is None:
+                break
+            angles = " ".join(f"{math.degrees(angle):.0f}" for angle in station.theta)
+            self.progress = f"pose {len(self.measured) + 1} of {self._itinerary.count}: {angles} deg"
+            start, self._position = self._position, station.ends[0]
+            yield Line(start, self._position)
+            yield from self._sweeps(station)
+        self.progress = "back to the hanging arm"
+        yield Line(self._position, home)
+        self.done, self.progress = True, "done"
+        yield Line(home, home)
+
+    def _sweeps(self, station: Station) -> Iterator[Line]:
+        """Yield each sweep until enough were good, or a joint sticks too often; keep what they show."""
+        failures, sweeps = 0, list[Sweep]()
+        while len(sweeps) < 2 * station.cycles:
+            pair = yield from self._tracker.sweep(station)
+            sweeps += pair
+            share, was_known = followed(pair, station), bool(np.any(self._friction))
+            sticks = bool(np.min(share) < FOLLOWED)
+            if station.speed >= STEADY_SPEED:
+                self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
+                self._tracker.friction = self._friction
+            # Sweep again what passed without friction, or what a joint did not follow.
+            if sticks or not was_known:
+                sweeps = []
+            failures += sticks
+            if failures > MAX_FAILURES:
+                self._skipped += 1
+                if self._skipped > MAX_SKIPPED:
+                    name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
+                    self.trouble = f"{name}: it sticks: it follows {least:.0%} of a slow motion, must be {FOLLOWED:.0%}"
+                return
+        self._keep(station, sweeps)
+
+    def _keep(self, station: Station, sweeps: list[Sweep]) -> None:
+        """Keep what the `sweeps` show, and improve the expected torque with it, unless the passes differ."""
+        seen, unrest = average(sweeps)
+        theta = np.asarray(seen.theta)
+        effort = seen.effort + self._guess.torques(theta[None], seen.direction)[0][0]
+        allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(seen.friction), np.abs(effort)))
+        for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
+            if change > limit:
+                what = f"{change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}"
+                self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
+                return
+        weight, lever = self._load
+        self.measured.append(seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed))
+        before = self._guess.torque(theta.tolist())
+        self._guess.learn(theta, effort, seen.spread)
+        self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
+
+
+ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
+LIMITS = ("position_min", "position_max", "max_effort")
+BRIDGE = ("rate", *LIMITS)  # as can_bridge's
+DURATION = 230.0  # s of a tour, for which the poses are chosen
+CALIBRATOR = (
+    *(replace(param, fixed=True) for param in COMPENSATOR if param.name in ARM),
+    Param(
+        "first_moment", [0.0] * 4, "M1 to M4 as far as known, with the wearer", (0.0, MAX_MOMENT), "kg m", fixed=True
+    ),
+    Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
+    *(param for param in CAN_BRIDGE if param.name in BRIDGE),
+    Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
+    Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
+    Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
+    Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
+)
+
+
+def tour_of(values: Mapping[str, Any]) -> Tour:
+    """Return the tour that parameter values describe. Raises ParameterError."""
+    limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in LIMITS})
+    load = values["tour.load_mass"], values["tour.load_lever"]
+    moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
+    guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
+    count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
+    itinerary = Itinerary(limits, count, DURATION, given)
+    return Tour(limits, guess, itinerary, values["rate"], load)

@@ -1,0 +1,220 @@
+"""calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
+
+docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
+is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: two
+masses explain what the arm needs beyond the robot's moments, one on link 3 and one on link 4, at the centres of gravity
+of the body-mass table: torque shows only mass times distance.
+"""
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ModelError, moments_along
+from exo_gravity.core.arm.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.compensation.settings import wearer_of
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.lab.calibration import live
+from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
+from exo_gravity.lab.calibration.live import Say, tour_parameters
+from exo_gravity.lab.calibration.pose_fit import columns
+from exo_gravity.lab.calibration.poses import candidates, next_pose
+from exo_gravity.lab.calibration.recorded import observations_of
+from exo_gravity.lab.calibration.result import CalibrationResult, Change
+from exo_gravity.lab.inputs.arms import ConfiguredArm
+
+SCALE_POSES = 8  # of each tour of `calibrate scale`
+LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
+LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
+WEARER_POSES = 4  # the hanging arm and three others
+BREATHING = 0.1  # Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
+TYPICAL_BODY_MASS = 70.0  # kg
+# rad: a comfortable part of the joints' ranges.
+COMFORTABLE = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
+WORN = ("upper arm", "forearm and hand")  # on links 3 and 4
+LARGEST_ERROR = 0.25  # of a mass, as a standard error
+MOST = 15.0  # kg of a person's arm
+TABLE_RATIO = (0.6, 1.6)  # measured to tabled moments that are plausible
+
+
+def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
+    return moments_from(arm, _observations(options, arm, say, {"tour.poses": options.poses}))
+
+
+def _observations(
+    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = "",
+    moments: np.ndarray | None = None,
+) -> list[Observation]:  # fmt: skip
+    """Return what a tour measures, or what `options.bag` shows.
+
+    changes, moments: as for `tour_parameters`. request: what a person does first; they cannot reach a simulated device.
+    """
+    if options.bag:
+        return observations_of(options.bag, arm, with_held="tour.friction" not in changes)
+    nodes = tour_parameters(options.params, arm, changes, moments)
+    if request and f"{arm.namespace}/simulator" not in nodes:
+        options.wait(request)
+    return live.run_tour(options, nodes, say).complete(options.record)
+
+
+def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Measure the poses without and with the weight, and solve for scales and moments. Raises ParameterError."""
+    mass, lever = options.mass, options.lever
+    load_moments(arm.robot.length.tolist(), mass, lever)
+    if mass * lever < LEAST_MOMENT:
+        raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
+    poses = {"tour.poses": SCALE_POSES}
+    bare = _observations(options, arm, say, poses)
+    if options.bag:
+        weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
+        bare = [one._replace(effort=gravity_torque(arm.robot, one.theta, one.direction)) for one in bare]
+    else:
+        hang = f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
+        changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
+        weighed = _observations(options, arm, say, changes, hang)
+    return moments_from(arm, bare + weighed)
+
+
+def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
+    robot, (low, high) = arm.robot, TORQUE_SCALE_BOUNDS
+    found = identify(observations, robot.length, robot.gravity)
+    factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
+    scale = np.round(factor * arm.can_bridge["torque_scale"], 4).tolist()
+    impossible = tuple(
+        f"{name}: torque_scale = {value:g}: must be from {low:g} to {high:g}: check torque_range of its firmware"
+        for name, value in zip(arm.joint_names, scale, strict=True)
+        if not low <= value <= high
+    )
+    poses, taken = candidates(arm.limits), [one.theta for one in observations]
+    best = poses[next_pose(taken, poses, observations[-1].direction, moments_of(robot), robot.gravity)]
+    more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
+    changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
+    return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
+
+
+def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple[Change, ...]:
+    """Return the new values of the parameter file. What is unknown keeps its value."""
+    node, error = f"{arm.namespace}/compensator", found.error
+    unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
+    before = moments_of(arm.robot)
+    moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
+    changes = [
+        Change(node, "robot.moments", moments, f"{' '.join(MOMENTS)} {unit}, +-{_row(error)}, was {_row(before)}"),
+        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
+    ]
+    if np.all(np.isfinite(found.held_out).any(axis=0)):
+        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0)) * found.scale
+        changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
+    if not found.relative:
+        known = np.isfinite(found.scale_error)
+        share = np.where(known, found.scale_error / found.scale, ModelError().scale)
+        changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
+    if arm.compensator["law"] != "exact":
+        changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
+    if any(gain != 1.0 for gain in arm.compensator["gain"]):
+        changes.append(Change(node, "gain", [1.0] * 4, "now part of the moments and of torque_scale"))
+    return tuple(changes)
+
+
+def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
+    """Yield what the parameter file does not hold, in sentences."""
+    for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
+        yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
+    worst = float(np.nanmax(np.abs(found.held_out), initial=0.0))
+    yield f"largest torque error of a pose that was left out: {worst:.3f} Nm"
+    for index, reason in found.rejected:
+        yield f"pose {index + 1} was not used: {reason}"
+    yield from found.unknown
+
+
+def _row(values: np.ndarray) -> str:
+    return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
+
+
+def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
+    return friction_from(arm, _observations(options, arm, say, {"tour.friction": True}))
+
+
+def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
+    speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
+    curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
+    changes, refusals = [], []
+    for name, fit in zip(arm.joint_names, curves, strict=True):
+        coulomb, viscous, stribeck = fit.error
+        text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
+        more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
+        note = f"friction of {name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}"
+        changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
+        if fit.coulomb <= 0.0:
+            refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
+    return CalibrationResult(tuple(changes), (), tuple(refusals), arm, tuple(observations), curves=curves)
+
+
+def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
+    # Few poses, in a comfortable range, with the weight that the table expects.
+    low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
+    changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
+    expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
+    request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
+    return wearer_from(arm, _observations(options, arm, say, changes, request, expected))
+
+
+def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return the masses on links 3 and 4 that explain what the robot alone does not. Raises DataError if none do."""
+    if len(observations) < 3:
+        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
+    theta, direction, effort, spread = columns(observations)
+    cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
+    per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
+    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
+    matrix = (rows[..., :JOINT_COUNT] @ per_mass).reshape(-1, 2) * weight[:, None]
+    extra = (effort - rows @ moments_of(arm.robot)).ravel() * weight
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    mass = covariance @ matrix.T @ extra
+    remainder = extra - matrix @ mass
+    covariance *= max(1.0, float(remainder @ remainder) / (remainder.size - 2))
+    error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
+    moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
+    for part, own, e in zip(WORN, mass, error, strict=True):
+        if not 0.0 < own < MOST:
+            relaxed = "is the arm relaxed, the robot calibrated?"
+            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
+        if e > LARGEST_ERROR * own:
+            raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
+    node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
+    changes = (
+        Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
+        Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
+        Change(node, "model_error.wearer", round(float((moment_error / moments).max()), 3), "share of M3 and M4"),
+    )
+    body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
+    tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
+    ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
+    refusals: tuple[str, ...] = ()
+    compared = f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    if body_mass:
+        compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
+        if not np.all((ratio >= low) & (ratio <= high)):
+            refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
+    lines = f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm", compared
+    return CalibrationResult(changes, lines, refusals, arm, tuple(observations))
+
+
+def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass (4,) in kg and cog (4,) in m on each link: the file's if it gives both masses, else the table's."""
+    values = arm.compensator
+    if not tabled and all(values["wearer.mass"][2:]):
+        return values["wearer.mass"], values["wearer.cog"]
+    body_mass = values["wearer.body_mass"] or TYPICAL_BODY_MASS
+    return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})

@@ -1,0 +1,110 @@
+"""The arms of a parameter file: the one reader that the tools share.
+
+An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked as the nodes check them at start, so an
+unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, settings_of
+from exo_gravity.core.errors import ParameterError, named
+from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
+from exo_gravity.core.params import Param, values_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
+from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
+
+
+@dataclass(frozen=True, eq=False)
+class ConfiguredArm:
+    """One arm of a parameter file, checked."""
+
+    namespace: str  #: '/right'
+    can_bridge: Mapping[str, Any]  #: all parameter values by name
+    compensator: Mapping[str, Any]  #: all parameter values by name
+    motors: tuple[JointMotor, ...]
+    limits: Limits
+    robot: ArmModel  #: the arm without a wearer
+    name: str  #: the namespace without slashes, 'arm' for the root namespace
+    side: str  #: 'left' or 'right'
+    joint_names: tuple[str, ...]  #: from the shoulder to the elbow
+    low: np.ndarray  #: lower joint limits (4,) in rad
+    high: np.ndarray  #: upper joint limits
+
+    def settings(self) -> Settings:
+        """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
+        with named(f"{self.namespace}/compensator "):
+            return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
+
+
+def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
+    """Return the arm of `namespace` ('/right') in the nodes of a parameter file.
+
+    Raises ParameterError where a node is missing or a parameter is unknown or impossible.
+    """
+    can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
+    node = f"{namespace}/compensator"
+    given = nodes.get(node, {})
+    if given.get("law") == URDF_LAW:  # the law `exact` gives the torques of a URDF of this arm
+        kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
+        nodes = {**nodes, node: {**kept, "law": "exact"}}
+    compensator = node_values(nodes, node, compensator_table(given))
+    with named(f"{namespace}/can_bridge "):
+        motors, limits = motors_of(can_bridge), limits_of(can_bridge)
+    with named(f"{namespace}/compensator "):
+        # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
+        robot = settings_of({**compensator, "law": "exact"}).robot
+    name, names, side = namespace.strip("/") or "arm", tuple(compensator["joint_names"]), compensator["side"]
+    bounds = np.array(limits.position_min), np.array(limits.position_max)
+    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot, name, side, names, *bounds)
+
+
+def configured_arms(params: str | Path) -> list[ConfiguredArm]:
+    """Return every arm of a parameter file. Raises ParameterError if there is none."""
+    nodes = load(params)
+    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a compensator")
+    return [read_arm(nodes, namespace) for namespace in namespaces]
+
+
+def configured_arm(params: str | Path | None = None, side: str = "right") -> ConfiguredArm:
+    """Return the only arm of `side` in a parameter file, by default in the packaged exo.yaml. Raises ParameterError."""
+    path = params or packaged_config("exo.yaml")
+    found = [arm for arm in configured_arms(path) if arm.side == side]
+    if len(found) != 1:
+        raise ParameterError("params", str(path), f"a file with one compensator whose side is {side}, not {len(found)}")
+    return found[0]
+
+
+def with_cog_at_link_ends(arm: ArmModel) -> ArmModel:
+    """Return the arm under the paper's assumptions: d_n = l_n, c_n = 1 and g = 9.8 m/s^2. Raises ParameterError."""
+    arm.check_masses("the paper's assumptions")
+    return ArmModel(arm.length, arm.length, arm.mass, gravity=9.8)
+
+
+def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, Any]:
+    """Return every parameter of `node` by name, checked against its `table`. Raises ParameterError."""
+    if node not in nodes:
+        raise ParameterError("params", sorted(nodes), f"a file with {node}")
+    with named(f"{node} "):
+        return values_of(table, nodes[node], OPTIONS)
+
+
+def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dict[str, Any]:
+    """Return every parameter of the compensator or can_bridge of `arm` in a recording, {} if it has none of that node.
+
+    parameters: YAML text by node. One that the recorded version lacked has its default.
+    """
+    node = node_of(arm, executable)
+    if node not in parameters:
+        return {}
+    given = yaml.load(parameters[node], Loader)[node]["ros__parameters"]
+    table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
+    return {param.name: param.default for param in table} | given

@@ -1,0 +1,132 @@
+"""The figures of a report: the paper's plot of positions, velocities and torques; the drift; the wearer's torque.
+
+A long recording is drawn as the minimum and maximum of each of 2,000 intervals, so that no peak is lost.
+"""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from exo_gravity.lab.observer.momentum import COVER
+from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
+from exo_gravity.lab.report.table import joint_labels, per_minute
+from exo_gravity.lab.report.wearer_share import WearerPart
+from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
+from exo_gravity.lab.trial.recording import Recording, in_blocks
+
+INTERVALS = 2_000  # per curve
+WIDTH = 11.0  # inches
+START = 5  # blocks of 0.1 s, from whose mean the drift is drawn
+
+
+def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
+    """Return positions, velocities and torques over time, with holds and pushes shaded and holds numbered."""
+    figure = Figure(figsize=(WIDTH, 8.2), layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=(1.25, 1.0, 1.25))
+    panels = (
+        ("Position (deg)", np.degrees(recording.position)),
+        ("Velocity (deg/s)", np.degrees(recording.velocity)),
+        ("Torque (Nm)", recording.effort),
+    )
+    for axis, (label, values) in zip(axes, panels, strict=True):
+        for column, name, colour in zip(values.T, joint_labels(recording), JOINT_COLOURS, strict=True):
+            axis.plot(*_envelope(recording.time, column), color=colour, lw=1.1, label=name)
+        for hold in analysis.holds:
+            axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0, label="hold")
+        for motion in analysis.motions:
+            if motion.kind in ("push", "slip"):
+                axis.axvspan(motion.start, motion.end, color=PUSH_COLOUR, lw=0, zorder=0, label="push")
+        axis.set_ylabel(label)
+        make_plain(axis)
+    for command in recording.command.T if np.isfinite(recording.command).any() else ():
+        time, torque = _envelope(recording.time, command)
+        axes[2].plot(time, torque, color=INK, lw=0.6, ls=(0, (4, 3)), label="commanded")
+    for number, hold in enumerate(analysis.holds, 1):
+        middle = (hold.start + hold.end) / 2
+        axes[0].annotate(
+            str(number), (middle, 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center", color=INK, fontsize=9,
+        )  # fmt: skip
+    axes[2].set_xlabel("Time (s)")
+    axes[2].set_xlim(recording.time[0], recording.time[-1])
+    handles, names = axes[2].get_legend_handles_labels()
+    entries = dict(zip(names, handles, strict=True))  # each once
+    columns = len(entries) if sum(map(len, entries)) < 90 else 4
+    figure.legend(
+        entries.values(), entries.keys(), loc="outside upper center", ncols=columns, frameon=False, fontsize=9
+    )
+    return figure
+
+
+def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
+    """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
+    figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
+    upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.1)))
+    axes = upper.subplots(1, 4, sharex=True, sharey=True)
+    for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
+        for hold in analysis.holds:
+            within = blocks.between(hold.start, hold.end)
+            angle = np.degrees(blocks.mean[within, joint])
+            time, away = blocks.time[within] - hold.start, angle - angle[:START].mean()
+            axis.plot(time, away, color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
+        axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+        axis.set_xlabel("Time in the hold (s)")
+        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        make_plain(axis)
+        axis.margins(x=0)
+    axes[0].set_ylabel("Deviation from the start (deg)")
+    reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
+    axes[0].set_ylim(-1.15 * reach, 1.15 * reach)
+    _rates(lower.subplots(), recording, analysis, criteria)
+    return figure
+
+
+def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> None:
+    numbers = np.arange(1, len(analysis.holds) + 1)
+    rates = per_minute([hold.drift_rate for hold in analysis.holds])
+    errors = per_minute([hold.drift_rate_uncertainty for hold in analysis.holds])
+    for joint, name in enumerate(joint_labels(recording)):
+        axis.errorbar(
+            numbers + 0.12 * (joint - 1.5), rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2,
+            color=JOINT_COLOURS[joint], label=name,
+        )  # fmt: skip
+    axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+    if math.isfinite(criteria.max_rate):
+        bound = per_minute(criteria.max_rate)
+        axis.axhspan(-bound, bound, color=HOLD_COLOUR, zorder=-1, label=f"allowed: ±{bound:g} deg/min")
+        axis.legend(loc="upper left", bbox_to_anchor=(0, 1.14), ncols=5, frameon=False, fontsize=9)
+    axis.set_xticks(numbers)
+    axis.set_xlim(0.4, len(numbers) + 0.6)
+    axis.set_xlabel("Hold")
+    axis.set_ylabel("Drift (deg/min)")
+    make_plain(axis)
+
+
+def wearer(recording: Recording, part: WearerPart) -> Figure:
+    """Return the wearer's torque at each joint and his share over time, with their 95 % bands."""
+    figure, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
+    axes = figure.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
+    rows = [*curve.torque.T, 100.0 * part.sliding.value]
+    bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
+    names = [f"{label} (Nm)" for label in joint_labels(recording)]
+    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*JOINT_COLOURS, INK], strict=True)
+    for axis, values, band, name, colour in columns:
+        axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
+        axis.plot(curve.time, values, color=colour, lw=1.0)
+        axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        axis.set_title(name, loc="left", fontsize=9, color=colour)
+        make_plain(axis)
+    axes[-1].set_ylim(-60.0, 160.0)
+    axes[-1].set_xlabel("Time (s)")
+    return figure
+
+
+def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a line through the minimum and maximum of each interval."""
+    if len(time) <= 2 * INTERVALS:
+        return time, values
+    edges = np.linspace(0, len(time), INTERVALS, endpoint=False).astype(int)
+    ends = np.stack([np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)], axis=1)
+    return np.repeat(time[edges], 2), ends.ravel()

@@ -1,0 +1,81 @@
+"""Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
+
+import argparse
+import os
+from ctypes.util import find_library
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import one_float
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.tools.cli import missing
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
+NEEDED = ("mujoco", "imageio", "av", "PIL")
+MAX_SPEED = 100.0
+# The libraries by which MuJoCo draws without a screen, and its name for each.
+BACKENDS = {"EGL": "egl", "OSMesa": "osmesa"}
+NO_GRAPHICS = (
+    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): "
+    "apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6"
+)
+
+
+class Clip(NamedTuple):
+    """A clip to write."""
+
+    path: Path
+    step: float  #: s of the recording from one frame to the next
+    frame_rate: int  #: frames per second
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add --video and --video-speed."""
+    option = parser.add_argument
+    option("--video", metavar="FILE", help="write a clip of the arms, drawn without a screen: FILE.mp4 or FILE.gif")
+    option("--video-speed", type=float, default=1.0, metavar="X", help="speed of the clip (%(default)s)")
+
+
+def requested(video: str | None, speed: float) -> Clip | None:
+    """Return the clip of the command line, None for none.
+
+    Raises ParameterError for a wrong file or speed, and if a package or OpenGL is missing.
+    """
+    if video is None:
+        return None
+    path = Path(video)
+    if path.suffix.lower() not in FRAME_RATE:
+        raise ParameterError("video", video, f"a file that ends with {' or '.join(FRAME_RATE)}")
+    if not path.absolute().parent.is_dir():
+        raise ParameterError("video", video, "a file in a folder that exists")
+    frame_rate = FRAME_RATE[path.suffix.lower()]
+    clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED) / frame_rate, frame_rate)
+    problems = [missing(module, "video") for module in NEEDED if not find_spec(module)]
+    if not problems and not backend():
+        problems = [NO_GRAPHICS]
+    if problems:
+        raise ParameterError("video", video, f"left out: {problems[0]}")
+    return clip
+
+
+def backend() -> str:
+    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides. '' if it finds no library."""
+    chosen = os.environ.get("MUJOCO_GL", "disabled")
+    if chosen not in ("disabled", *BACKENDS.values()):
+        return chosen
+    found = (name for library, name in BACKENDS.items() if chosen in ("disabled", name) and find_library(library))
+    return next(found, "")
+
+
+def write(bag: Bag, clip: Clip, console: "Console") -> None:
+    """Write the clip of a recording, and print where it is. Raises DataError."""
+    os.environ["MUJOCO_GL"] = backend()
+    from exo_gravity.lab.report.clip import write_clip
+
+    write_clip(bag, *clip, console)
+    console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

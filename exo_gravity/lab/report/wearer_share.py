@@ -1,0 +1,64 @@
+"""The wearer's torque and share in a report, by the same observer that runs in the compensator.
+
+It needs the compensator's parameters and, if that used an IMU, `/imu/data`. Parameters that were changed during the
+recording are those of its start.
+"""
+
+from bisect import bisect_left
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.settings import settings_of
+from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.inputs.arms import recorded_of
+from exo_gravity.lab.observer.momentum import COVER
+from exo_gravity.lab.observer.share import WINDOW, Share, WearerCurve, observed, share_of, while_between
+from exo_gravity.lab.trial.recording import Recording
+
+
+class WearerPart(NamedTuple):
+    """What the wearer of one arm did while it was carried."""
+
+    curve: WearerCurve
+    sliding: Share  #: over the last second, at each time of the curve
+    whole: Share  #: over the recording
+
+
+def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
+    """Return what the wearer of an arm did, None if no wearer is set or the arm was never carried.
+
+    Raises ParameterError or DataError that says why it is not known.
+    """
+    values = recorded_of(bag.parameters, recording.name, "compensator")
+    settings = settings_of({**values, "law": "exact"}) if values else None
+    if settings is None or not any(settings.wearer_mass):
+        return None  # without a wearer in the model, his arm's weight would count as his torque
+    times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
+    if settings.use_imu and not times:
+        raise DataError("the recording has no /imu/data")
+
+    def trunk_at(now: float) -> tuple[Tilt, Floats3]:
+        if not settings.use_imu:
+            return Tilt.of(settings.side), ZERO
+        row = rows[min(bisect_left(times, now), len(rows) - 1)]
+        return Tilt.of_felt(settings.side, row[3:]), turning_in_base(settings.side, row[:3])
+
+    curve = observed(settings, recording.time, (recording.position, recording.velocity, recording.effort), trunk_at)
+    curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
+    return WearerPart(curve, share_of(curve, WINDOW), share_of(curve)) if len(curve.time) else None
+
+
+def sentence(part: WearerPart) -> str:
+    """Return the share over the recording, with its 95 % band."""
+    share = part.whole
+    if not np.isfinite(share.value):
+        return "The wearer's arm hung all the time: there was nothing to carry."
+    band = COVER * float(share.deviation)
+    value = f"{100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
+    doubt = "" if abs(share.value) > band else ": not distinguishable from zero"
+    return f"The wearer carried {value}{doubt}."

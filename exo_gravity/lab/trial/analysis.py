@@ -1,0 +1,264 @@
+"""The analysis of a trial: the holds of a recording, the drift in each, the response to pushes, and the verdict.
+
+Drift is the slope of Huber's M-estimator (Huber 1964) fitted to means over parts of the hold. Averaging resolves less
+than one position code, and a brief touch of the arm has little weight. The standard uncertainty combines the scatter
+with one code over the length of the hold, because a reading that changed once may have been about to change at the
+start.
+
+Whether the arm held is judged within any 10 s of a hold, over the whole hold if a rate is given, and from release to
+the end of a scripted hold. The last criterion fails an arm that falls at once and then hangs still.
+
+SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.lab.trial.recording import MARGIN, Blocks, Recording, Span, in_blocks, still_spans
+from exo_gravity.sim.script import TRUNK_ACTIONS
+
+MIN_HOLD = 2.0  # s
+WINDOW = 10.0  # s, over which `Hold.stray` is judged
+POSE_TIME = 0.5  # s before and after a motion, over which its first and last pose are averaged
+PUSH_OFFSET = 0.35  # rad (20 degrees); a motion that ends farther away is a move to another pose
+HUBER = 1.345  # standard deviations; gives 95 % efficiency on normal noise
+MAX_PARTS = 30  # parts of a hold, to whose means the slope is fitted
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """A span in which the arm was left alone and still."""
+
+    start: float  #: s
+    end: float  #: s
+    pose: np.ndarray  #: (4,) rad, mean
+    drift: np.ndarray  #: (4,) rad, from the first part of the hold to its last
+    drift_rate: np.ndarray  #: (4,) rad/s
+    drift_rate_uncertainty: np.ndarray  #: (4,) rad/s, standard uncertainty; NaN if the joint never changed its code
+    stray: np.ndarray  #: (4,) rad, largest range within any 10 s
+    velocity_rms: np.ndarray  #: (4,) rad/s as measured: half a velocity code for a motor at rest
+    torque_rms: np.ndarray  #: (4,) Nm, measured
+    torque_error: np.ndarray  #: (4,) Nm, RMS of commanded minus measured
+    after: str  #: kind of the motion before it, or 'start'
+
+    @property
+    def duration(self) -> float:
+        """Length in s."""
+        return self.end - self.start
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion between two holds, or after the last one.
+
+    Without a script, a motion that ends within 20 degrees of its start is taken for a push.
+    """
+
+    #: 'push', 'move', an action of the trunk ('bow', 'lean', 'walk', 'sit'), 'slip' (the arm moved during a hold of the
+    #: script), 'gap' (nothing was recorded) or 'let down' (the arm was not carried throughout)
+    kind: str
+    start: float  #: s
+    end: float  #: s
+    peak: np.ndarray  #: (4,) rad, signed, largest distance from the pose before
+    residual: np.ndarray  #: (4,) rad, pose after minus pose before; NaN if the arm was not still again
+    until_still: float  #: s from the first movement; NaN likewise
+    speed: np.ndarray  #: (4,) rad/s, peak
+
+
+@dataclass(frozen=True, eq=False)
+class Release:
+    """A scripted hold from release on, for as long as the arm was carried."""
+
+    start: float  #: s
+    end: float  #: s
+    after: str  #: the script's action before it
+    offset: np.ndarray  #: (4,) rad, at its end
+    still: bool  #: whether the arm was still at its end
+
+
+@dataclass(frozen=True, eq=False)
+class TrialAnalysis:
+    """The result of `analyse`."""
+
+    holds: tuple[Hold, ...]
+    motions: tuple[Motion, ...]
+    releases: tuple[Release, ...]
+
+
+def analyse(recording: Recording, min_hold: float = MIN_HOLD) -> TrialAnalysis:
+    """Return the holds of at least `min_hold` s, the motions between them and, with a script, the releases."""
+    blocks = in_blocks(recording)
+    steps = np.abs(np.diff(recording.position, axis=0))
+    smallest = steps.min(axis=0, initial=math.inf, where=steps > 1e-6)
+    resolution = np.where(np.isfinite(smallest), smallest, 0.0)  # rad, one position code; 0 if no step occurred
+    shortest = max(min_hold, 4 * blocks.length) - 1e-6  # a slope requires three whole blocks
+    spans = [(start, end) for start, end in still_spans(recording, blocks) if end - start >= shortest]
+    motions = tuple(_motion(recording, blocks, *ends) for ends in pairwise(spans))
+    kinds = ["start", *(motion.kind for motion in motions)]
+    holds = tuple(_hold(recording, blocks, resolution, span, kind) for span, kind in zip(spans, kinds, strict=False))
+    motions += tuple(_last_motions(recording, blocks, spans[-1])) if spans else ()
+    return TrialAnalysis(holds, motions, tuple(_releases(recording, blocks)))
+
+
+def _last_motions(recording: Recording, blocks: Blocks, last: Span) -> Iterator[Motion]:
+    """Yield the motions after the `last` hold: one while the arm was carried, and the let-down."""
+    recorded = float(recording.time[-1])
+    released = recording.carried[-1][1] if recording.carried else recorded
+    end = min([released, *(step.end for step in recording.steps[-1:])])
+    if end - last[1] > MIN_HOLD:
+        yield _motion(recording, blocks, last, (end, end))
+    # A virtual wearer continues with the next step even if the arm is not carried. That is not part of the let-down.
+    going_on = (step.start for step in recording.steps if step.start > released and step.action != "done")
+    down = min([recorded, *going_on])
+    if down - released > blocks.length:
+        yield _motion(recording, blocks, (last[0], released), (down, down))
+
+
+def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Span, after: str) -> Hold:
+    within = blocks.between(*span)
+    samples = slice(*blocks.sample[[within.start, within.stop]])
+    mean = blocks.mean[within]
+    parts = np.array_split(np.arange(len(mean)), min(len(mean), MAX_PARTS))
+    part_time = np.array([blocks.time[within][part].mean() for part in parts])
+    part_mean = np.array([mean[part].mean(axis=0) for part in parts])
+    rate, scatter = robust_slope(part_time, part_mean, resolution)
+    width = min(len(mean), max(1, round(WINDOW / blocks.length)))
+    windows = np.lib.stride_tricks.sliding_window_view(mean, width, axis=0)
+    effort, command = recording.effort[samples], recording.command[samples]
+    return Hold(
+        *span,
+        pose=mean.mean(axis=0),
+        drift=part_mean[-1] - part_mean[0],
+        drift_rate=rate,
+        drift_rate_uncertainty=np.where(resolution, np.hypot(scatter, resolution / (span[1] - span[0])), math.nan),
+        stray=(windows.max(axis=-1) - windows.min(axis=-1)).max(axis=0),
+        velocity_rms=_rms(recording.velocity[samples]),
+        torque_rms=_rms(effort),
+        torque_error=_rms(command - effort),
+        after=after,
+    )
+
+
+def robust_slope(x: np.ndarray, y: np.ndarray, resolution: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the slope (k,) of y (m, k) over x (m,), m > 2, and its standard uncertainty (k,) from the scatter.
+
+    This is Huber's M-estimator by reweighted least squares. resolution: (k,); half of it is the smallest scale used.
+    """
+    weight = np.ones_like(y)
+    for _ in range(30):
+        total = weight.sum(axis=0)
+        dx = x[:, None] - (weight * x[:, None]).sum(axis=0) / total
+        dy = y - (weight * y).sum(axis=0) / total
+        spread = (weight * dx * dx).sum(axis=0)
+        slope = (weight * dx * dy).sum(axis=0) / spread
+        residual = np.abs(dy - slope * dx)
+        scale = np.maximum(1.4826 * np.median(residual, axis=0), resolution / 2) + 1e-12
+        weight = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-12))
+    return slope, np.sqrt((weight * residual**2).sum(axis=0) / (len(x) - 2) / spread)
+
+
+def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Motion:
+    """Return the motion from the end of span `left` to the start of `right`, which is empty if no hold followed."""
+    before = blocks.mean[blocks.between(max(left[0], left[1] - POSE_TIME), left[1])].mean(axis=0)
+    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + POSE_TIME))].mean(axis=0)
+    within = blocks.between(left[1], right[0])
+    samples = slice(*blocks.sample[[within.start, within.stop]])
+    away = np.vstack((np.zeros(JOINT_COUNT), recording.position[samples] - before))
+    settled, residual = right[1] > right[0], after - before
+    return Motion(
+        kind=_kind(recording, left[1], right[0], bool(blocks.empty[within].any()), residual),
+        start=left[1],
+        end=right[0],
+        peak=away[np.abs(away).argmax(axis=0), np.arange(JOINT_COUNT)],
+        residual=residual if settled else np.full(JOINT_COUNT, math.nan),
+        until_still=max(0.0, right[0] - left[1] - MARGIN) if settled else math.nan,
+        speed=np.abs(recording.velocity[samples]).max(axis=0, initial=0.0),
+    )
+
+
+def _kind(recording: Recording, start: float, end: float, empty: bool, residual: np.ndarray) -> str:
+    actions = {step.action for step in recording.steps if step.start < end - 1e-6 and step.end > start + 1e-6}
+    if tuple(recording.while_carried(start, end)) != ((start, end),):
+        return "let down"
+    if empty:
+        return "gap"
+    if not recording.steps:
+        return "push" if np.all(np.abs(residual) < PUSH_OFFSET) else "move"
+    return next((action for action in ("move", "push", *TRUNK_ACTIONS) if action in actions), "slip")
+
+
+def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
+    after = "start"
+    for step in recording.steps:
+        parts = recording.while_carried(step.start, min(step.end, float(recording.time[-1])))
+        start, end = next(parts, (step.start, step.start))
+        # A hold that was cut short shows the hand that has just let go, not the arm.
+        if step.action == "hold" and end - start >= min(MIN_HOLD, step.end - step.start):
+            within = blocks.between(start, end)
+            offset = blocks.mean[within.stop - 1] - blocks.mean[within.start]
+            yield Release(start, end, after, offset, bool(blocks.still[within.stop - 1]))
+        after = step.action
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square (4,) of the finite values among (n, 4); NaN for a joint that has none."""
+    mean: np.ndarray = np.ma.masked_invalid(np.square(values, dtype=float)).mean(axis=0).filled(math.nan)
+    return np.sqrt(mean)
+
+
+@dataclass(frozen=True)
+class HoldCriteria:
+    """How far a held arm may drift."""
+
+    max_stray: float = math.radians(0.5)  #: rad within any 10 s of a hold
+    max_stray_after_push: float = math.radians(2.0)  #: rad, the same for a hold after a push
+    max_rate: float = math.inf  #: rad/s over a hold
+    max_offset: float = math.radians(2.0)  #: rad between release and the end of a scripted hold
+    #: s, shortest hold that is judged by its rate: over a shorter one, a single position code is already a large rate
+    rated_from: float = 0.0
+
+    def stray_allowed(self, hold: Hold) -> float:
+        """Return how far a joint may stray within any 10 s of `hold`, rad."""
+        return self.max_stray_after_push if hold.after == "push" else self.max_stray
+
+    def stayed(self, release: Release) -> bool:
+        """Return whether the arm stayed where it was let go; after a push it may move."""
+        return release.after == "push" or bool(np.max(np.abs(release.offset)) <= self.max_offset)
+
+
+def failures(recording: Recording, trial: TrialAnalysis, criteria: HoldCriteria) -> list[str]:
+    """Return one sentence for each criterion that the arm failed; an empty list if it held."""
+    found = []
+    if not trial.holds:
+        never = "carried" if recording.carried == () else "still for long enough to count as a hold"
+        found.append(f"the arm was never {never}")
+    for hold in trial.holds:
+        most = criteria.stray_allowed(hold)
+        for name, stray, rate in zip(recording.joint_names, hold.stray, hold.drift_rate, strict=True):
+            where = f"{hold.start:.1f}-{hold.end:.1f} s: {name}"
+            if stray > most:
+                found.append(f"{where} strayed {_degrees(stray)} within 10 s, more than {_degrees(most)}")
+            if abs(rate) > criteria.max_rate and hold.duration >= criteria.rated_from:
+                per_minute, allowed = _degrees(60.0 * rate), _degrees(60.0 * criteria.max_rate)
+                found.append(f"{where} drifted {per_minute} per minute, more than {allowed}")
+    for motion in trial.motions:
+        peak = np.max(np.abs(motion.peak))
+        if motion.kind == "slip" and peak > criteria.max_stray:
+            where = f"{motion.start:.1f}-{motion.end:.1f} s: the arm"
+            found.append(f"{where} slipped by {_degrees(peak)} during a hold")
+    for release in trial.releases:
+        where = f"{release.start:.1f}-{release.end:.1f} s: the arm"
+        if not release.still:
+            found.append(f"{where} was still moving at the end of a hold")
+        elif not criteria.stayed(release):
+            found.append(f"{where} moved {_degrees(np.max(np.abs(release.offset)))} from where it was let go")
+    return [f"{recording.name}: {sentence}" for sentence in found]
+
+
+def _degrees(angle: float) -> str:
+    return f"{math.degrees(angle):.2f} degrees"

@@ -1,0 +1,208 @@
+"""A trial in real time: starts the nodes, follows the script on the recorder's lines, and stops the nodes.
+
+A trial on the simulated device that fails because this computer was too busy is repeated: nothing is worn, and every
+attempt starts all nodes anew. A trial on a real arm is never repeated. Each simulator measures how long it was not run
+and how long it got no command: its arm, motors and bus are programs on this computer, so a long gap means that the
+computer ran other programs instead.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import params_of
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.lab.inputs.parameter_file import load, stages
+from exo_gravity.lab.trial.screen import LEAD, TrialScreen
+from exo_gravity.lab.trial.session import Session
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.tools.launcher import Launcher, Stopping
+
+RECORDER = "/recorder"
+START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder runs
+START_TIMEOUT = 60.0  # s until the arm must be carried
+GRACE = 0.5  # s recorded after the last step
+RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
+ATTEMPTS = 3
+BUSY_CODE = 3
+ADVICE = "Close other programs and try again. The arm has no fault."
+LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
+# Faults that a busy computer can cause; '' stands for a trial that ended early without a fault. A connected simulated
+# motor always replies and the compensator always answers: if they are late, the computer is, also without a long gap.
+POSSIBLE = {
+    "": "",
+    FaultCode.MOTOR_SILENT.value: "the replies of the simulated motors came too late",
+    FaultCode.COMMAND_STALE.value: "the efforts came too late",
+    FaultCode.COMMAND_WITHDRAWN.value: "",
+    FaultCode.SIGN_UNPROVEN.value: "",
+    FaultCode.TORQUE_NOT_DELIVERED.value: "",
+}
+
+Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
+
+
+def is_guided(params: Path) -> bool:
+    """Return whether a person performs the script, because the parameter file has no simulator."""
+    return not any(node.endswith("/simulator") for node in load(params))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Who performs which script on which nodes, and where that is recorded."""
+
+    path: Path  #: of the script
+    script: TrialScript
+    params: Path | None  #: the parameter file of the nodes; None on arms that are carried already
+    guided: bool  #: whether a person performs the script; otherwise the virtual wearer of a simulator does
+    session: Session
+    folder: Path
+
+    def prepare(self, with_recorder: bool = True) -> Path:
+        """Write the trial's own parameter file into the new folder, and return its path. Raises ParameterError."""
+        content: dict[str, Any] = yaml.safe_load(self.params.read_text(encoding="utf-8")) if self.params else {}
+        for node, entry in content.items():
+            if node.endswith("/simulator"):
+                entry["ros__parameters"]["trial"] = str(self.path)
+        if with_recorder:
+            of_whom = {param.name: getattr(self.session, param.name) for param in params_of(Session)}
+            content[RECORDER] = {"ros__parameters": {"output": str(self.folder / "bag"), "live": True, **of_whom}}
+        path = self.folder / "params.yaml"
+        try:
+            self.folder.mkdir(parents=True)
+            text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            expected = f"a writable folder ({error.strerror})"
+            raise ParameterError("output", str(self.folder.parent), expected) from None
+        return path
+
+
+@dataclass(frozen=True)
+class TrialEnd:
+    """How a trial ended."""
+
+    trouble: str = ""  #: why it ended before the script, or ''
+    code: int = 0  #: the exit code for that
+    busy: str = ""  #: what was late because this computer was too busy, which is why it ended, or ''
+
+
+def run_attempts(
+    trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]
+) -> TrialEnd:
+    """Run a trial that is prepared; repeat it if this computer was too busy. on_progress: as in `TrialScreen`."""
+    # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
+    unguided = START_TIME if trial.params is None else None
+    lead = LEAD if trial.guided else unguided
+    bridges = [node.lstrip("/") for node in stages(load(trial.params))[0]] if trial.params else []
+    for attempt in range(1, ATTEMPTS + 1):
+        end = run_nodes(trial, TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress), stopped)
+        if not end.busy or attempt == ATTEMPTS:
+            break
+        trial.folder.rename(f"{trial.folder}_attempt_{attempt}")
+        trial.prepare()
+        again = f"attempt {attempt + 1} of {ATTEMPTS}"
+        console.print(f"this computer was too busy: {end.busy}; {again}", markup=False, soft_wrap=True)
+    return end
+
+
+def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
+    """Run the nodes of a trial until the script is done, a fault latches or `stopped` is set."""
+    last_errors: dict[str, str] = {}
+    path = trial.folder / "log.txt"
+    with path.open("w", 1, encoding="utf-8") as log, screen.live, ThreadPoolExecutor(1) as pool:
+
+        def on_line(node: str, line: str) -> None:
+            if node == RECORDER and line.startswith("{"):
+                screen.take(line)
+                return
+            log.write(f"{datetime.now():%H:%M:%S.%f} {node.lstrip('/')} {line}\n")
+            if line.startswith(("FATAL ", "ERROR ")):
+                last_errors[node] = line.partition(" ")[2]
+
+        launcher = Launcher(trial.folder / "params.yaml", on_line)
+        ending = threading.Event()
+        nodes = pool.submit(launcher.run, ending)
+        trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
+        recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
+        down_by = time.monotonic() + DESCENT_TIMEOUT
+        while is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
+            time.sleep(0.05)  # the recording shows how the arm comes down
+        if not nodes.done():
+            screen.end("letting the arm down and closing the recording")
+        ending.set()
+        dead = nodes.result()
+    # A fault is excused on a simulated device alone that this trial has started.
+    may_be_busy = trial.params and not (stopped.is_set() or recorder_failed)
+    busy = too_busy(screen.status) if may_be_busy else ""
+    if dead:
+        node, code = dead
+        trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
+        # The watchdog kills a bridge that has not run for too long.
+        killed = node.endswith("/can_bridge") and code == -signal.SIGKILL
+        return TrialEnd(trouble, 2 if code == 2 else 1, busy if killed else "")
+    if not trouble:
+        return TrialEnd()
+    recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
+    return TrialEnd(f"{trouble}{recorder}", 1, busy)
+
+
+def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
+    """Wait until the script is done; return '' or why the wait ended earlier."""
+    deadline = time.monotonic() + START_TIMEOUT + screen.script.duration
+    while not stopped.wait(0.05) and not nodes.done():
+        if (code := recorder_code()) is not None:
+            return f"the recorder ended with exit code {code} before the trial was done"
+        if screen.silence > RECORDER_TIMEOUT:
+            return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
+        if message := fault_of(screen.status)[1]:
+            return message
+        if screen.done:
+            stopped.wait(GRACE)
+            return ""
+        if screen.is_let_down:
+            return "an arm is not active any more"
+        if time.monotonic() > deadline:
+            return f"the trial did not finish in time: {'; '.join(screen.faults) or 'no node reports a fault'}"
+    return "stopped by the operator" if stopped.is_set() else ""
+
+
+def is_falling(status: Status) -> bool:
+    """Return whether an arm is being let down."""
+    return any(values.get("state") == State.LETTING_DOWN.value for values in status.values())
+
+
+def fault_of(status: Status) -> tuple[str, str]:
+    """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
+    for name, values in status.items():
+        if values.get("fault", "none") != "none":
+            return str(values["fault"]), f"{name}: {values['message']}"
+    return "", ""
+
+
+def too_busy(status: Status) -> str:
+    """Return what was late and, if it is known, by how much; '' if the simulated device ran in time.
+
+    status: of all nodes, after a trial that ended early. A simulated fault is a reason by itself.
+    """
+    simulators = {name: values for name, values in status.items() if "longest stall (ms)" in values}
+    code, _ = fault_of(status)
+    if code not in POSSIBLE or any(values["disconnected"] == "yes" for values in simulators.values()):
+        return ""
+    for name, values in simulators.items():
+        stall, silence = float(values["longest stall (ms)"]), float(values["longest silence (ms)"])
+        if stall >= LONG_GAP:
+            return f"{name} was not run for {stall:.0f} ms"
+        if silence >= LONG_GAP:
+            return f"{name.removesuffix('simulator')}can_bridge was not run for {silence:.0f} ms"
+    return POSSIBLE[code] if simulators else ""

@@ -1,0 +1,103 @@
+"""What a viewer shows around the arms: gravity, the torque and the limits of each joint, and the state of each arm.
+
+Every shape is given in the trunk's axes, so that a viewer needs no transforms for it. A joint's range is an arc around
+its axis, and its torque a second, smaller arc, which spans `TORQUE_SPAN` at the joint's torque limit.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from exo_gravity.core.numbers import Vector
+from exo_gravity.core.safety.drive import CARRYING, State
+from exo_gravity.core.safety.limits import WALL_WIDTH
+from exo_gravity.lab.view.urdf import ArmDescription, arm_pose
+
+Colour = tuple[float, float, float, float]
+
+ARROW, LINE, TEXT, SPHERE = "arrow", "line", "text", "sphere"
+GREEN, AMBER, RED = (0.20, 0.70, 0.30, 1.0), (0.95, 0.65, 0.10, 1.0), (0.85, 0.15, 0.15, 1.0)
+GREY, BLUE = (0.60, 0.60, 0.60, 1.0), (0.20, 0.45, 0.85, 1.0)
+RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.075  # m
+TORQUE_SPAN = math.radians(270.0)
+ARC_STEP = math.radians(6.0)
+GRAVITY_FROM, GRAVITY_LENGTH = (0.30, 0.0, 0.10), 0.25  # m, in front of the chest
+STATE_HEIGHT = 0.20  # m above the shoulder
+RESTING = 0.05  # rad/s, below which a carried arm is held; twice the step of the motors' speed
+LIMIT_WIDTH, TORQUE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.004, 0.016, 0.012, 0.035, 0.05  # m
+
+
+class Shape(NamedTuple):
+    """One thing to draw.
+
+    group: 'gravity', 'torques', 'limits' or 'states'. kind: ARROW from the first point to the second, LINE through the
+    points, TEXT or SPHERE at the first point. points: (n, 3) m. size: m, width of a line, height of a text, diameter.
+    """
+
+    group: str
+    kind: str
+    points: np.ndarray
+    size: float
+    colour: Colour
+    text: str = ""
+
+
+class ArmView(NamedTuple):
+    """What is known of one arm now."""
+
+    arm: ArmDescription
+    theta: Sequence[float]  #: (4,) rad
+    velocity: Sequence[float]  #: (4,) rad/s
+    effort: Sequence[float]  #: (4,) Nm, as the motors report it
+    state: str  #: of its bridge, '' if not known
+    message: str = ""  #: of its bridge
+
+
+def gravity_shapes(gravity: Vector | None) -> list[Shape]:
+    """Return the arrow of gravity for its unit vector (3,) in the trunk's axes; None: the tilt is not known."""
+    if gravity is None:
+        return [Shape("gravity", TEXT, np.array([GRAVITY_FROM]), TEXT_HEIGHT, RED, "no tilt")]
+    points = np.array((GRAVITY_FROM, np.add(GRAVITY_FROM, np.multiply(GRAVITY_LENGTH, gravity))))
+    return [Shape("gravity", ARROW, points, ARROW_WIDTH, BLUE)]
+
+
+def arm_shapes(view: ArmView) -> list[Shape]:
+    """Return what is drawn around one arm: range and torque of each joint, and what the arm's bridge does."""
+    limits, shapes = view.arm.limits, []
+    for n, (origin, axis, along) in enumerate(zip(*arm_pose(view.arm, view.theta), strict=False)):
+        low, high = limits.position_min[n] - view.theta[n], limits.position_max[n] - view.theta[n]
+        colour = GREY if low + WALL_WIDTH <= 0.0 <= high - WALL_WIDTH else RED
+        tip = origin + RANGE_RADIUS * along
+        shapes.append(Shape("limits", LINE, _arc(origin, axis, along, low, high, RANGE_RADIUS), LIMIT_WIDTH, colour))
+        shapes.append(Shape("limits", LINE, np.array((origin, tip)), LIMIT_WIDTH, colour))
+        effort, limit = view.effort[n], limits.max_effort[n]
+        share = max(-1.0, min(1.0, effort / limit)) if limit > 0.0 else 0.0
+        arc = _arc(origin, axis, along, 0.0, share * TORQUE_SPAN, TORQUE_RADIUS)
+        strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
+        shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
+        shapes.append(Shape("torques", TEXT, tip[None], TEXT_HEIGHT, strength, f"{round(effort, 2) + 0.0:.2f} Nm"))
+    colour, state = state_of(view)
+    above = np.add([view.arm.base], (0.0, 0.0, STATE_HEIGHT))
+    shapes.append(Shape("states", SPHERE, above, SPHERE_SIZE, colour))
+    over = np.add(above, (0.0, 0.0, SPHERE_SIZE))
+    return [*shapes, Shape("states", TEXT, over, TEXT_HEIGHT, colour, f"{view.arm.side}: {state}")]
+
+
+def state_of(view: ArmView) -> tuple[Colour, str]:
+    """Return the colour and the words for what the arm's bridge does: 'active, holding' or the latched fault."""
+    if view.state == State.ACTIVE.value:
+        return GREEN, "active, holding" if max(map(abs, view.velocity)) < RESTING else "active, moving"
+    if view.state == State.FAULT.value:
+        return RED, view.message or view.state
+    powered = view.state in {state.value for state in (*CARRYING, State.LETTING_DOWN)}
+    return (AMBER if powered else GREY), view.state or view.message or "no state"
+
+
+def _arc(
+    origin: np.ndarray, axis: np.ndarray, along: np.ndarray, start: float, end: float, radius: float
+) -> np.ndarray:
+    """Return points (n, 3) on the arc around `axis` from angle `start` to `end` in rad from the direction `along`."""
+    angles = np.linspace(start, end, 2 + int(abs(end - start) / ARC_STEP))[:, None]
+    return np.asarray(origin + radius * (np.cos(angles) * along + np.sin(angles) * np.cross(axis, along)))

@@ -1,0 +1,229 @@
+"""The robot description (URDF) of one arm or of both, made from the same values as the control law.
+
+Every frame has the trunk's axes (REP-103: x forward, y left, z up) while the arm hangs at theta = 0. So the origins of
+the joints are plain offsets, and the description needs no rotations: they and the axes are those of the hanging arm,
+link 1 sideways and links 2 to 4 down. The right arm is the mirror image, so positive angles are abduction and flexion
+on both sides. The gain c_n is no part of a description, and neither is gravity.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ZEROS, ArmModel
+from exo_gravity.core.arm.kinematics import frames
+from exo_gravity.core.compensation.settings import robot_of
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.limits import Limits, limits_of
+
+Point = tuple[float, ...]  # (3,)
+
+ROOT = "trunk"
+NO_TURN = (0.0, 0.0, 0.0)  # rad
+HALF_BREADTH = 0.15  # m from the middle of the trunk to the axis of joint 1, if `shoulder` is not given
+# The parameters of `robot_model`.
+# fmt: off
+ROBOT_MODEL = (
+    Param("rate", 30.0, "joint states of all arms per second", (1.0, 100.0), "Hz", fixed=True),
+    Param("meshes", "", "address of a folder with LINK.stl for each link, as package://NAME/FOLDER; empty: tubes",
+          fixed=True),
+)
+# fmt: on
+COLOURS = {
+    "person": (0.80, 0.76, 0.70, 0.6),
+    "tube": (0.16, 0.17, 0.19, 1.0),
+    "motor": (0.55, 0.58, 0.62, 1.0),
+    "centre_of_gravity": (0.85, 0.25, 0.15, 1.0),
+}
+TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
+DRAWN_RADIUS = 0.0125  # m, of the carbon tubes (the paper, appendix A)
+MOTOR: dict[str, Any] = {"radius": 0.042, "length": 0.04}  # m, between AK60-6 and AK80-9
+COG_RADIUS = 0.018  # m
+CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
+
+
+@dataclass(frozen=True, eq=False)
+class ArmDescription:
+    """What a description, and a picture, states about one arm."""
+
+    side: str  #: 'left' or 'right'
+    robot: ArmModel  #: without a wearer
+    mass: Vector  #: (4,) kg, used if `robot` is given by its moments
+    limits: Limits  #: names, position, speed and torque limits of the joints
+    damping: Vector = ZEROS  #: (4,) Nm s/rad, 0 for unknown
+    friction: Vector = ZEROS  #: (4,) Nm, 0 for unknown
+    shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
+
+    @property
+    def outward(self) -> float:
+        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
+        return 1.0 if self.side == "left" else -1.0
+
+    @property
+    def base(self) -> Point:
+        """Origin of joint 1 in the trunk's axes, m."""
+        given = tuple(map(float, self.shoulder))
+        return given if any(given) else (0.0, self.outward * HALF_BREADTH, 0.0)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links (4,), and of the frame at the far end of link 4."""
+        return (*(f"{self.side}_link_{n}" for n in range(1, JOINT_COUNT + 1)), f"{self.side}_end")
+
+
+def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> ArmDescription:
+    """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
+    return ArmDescription(
+        compensator["side"],
+        robot_of(compensator),
+        compensator["robot.mass"],
+        limits_of(can_bridge),
+        compensator["friction.identified"][JOINT_COUNT:],
+        compensator["friction.identified"][:JOINT_COUNT],
+        compensator["inertial.shoulder_from_imu"],
+    )
+
+
+def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where `arm` is at `theta` (4,) rad, in the trunk's axes.
+
+    The origins (5, 3) in m of the four joints and the far end, the axes (4, 3) about which the joints turn, and unit
+    vectors (4, 3) along the links.
+    """
+    length = arm.robot.length
+    links = frames(length.tolist(), theta)
+    along = _in_trunk(arm, [link.along for link in links])
+    axes = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
+    origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
+    return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+
+
+def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
+    """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
+    x, y, z = np.array(points).T
+    return np.stack((y, arm.outward * x, -z), axis=1)
+
+
+def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
+    """Return the URDF of one arm a side, with the root link `trunk`.
+
+    meshes: address of a folder (package:// or file://) with LINK.stl for every link, each in the frame of its joint and
+    in m; '' draws tubes and motors. Raises ParameterError if two arms are on one side, or a link has no mass.
+    """
+    sides = [arm.side for arm in arms]
+    if not arms or len(set(sides)) != len(sides):
+        raise ParameterError("side", sides, "one arm for each side that is described")
+    x, _, z = (sum(column) / len(arms) for column in zip(*(arm.base for arm in arms), strict=True))
+    person = (
+        _visual("person", "box", (x, 0.0, z - CHEST[2] / 2), size=CHEST),
+        _visual("person", "sphere", (x, 0.0, z + HEAD_HEIGHT), radius=HEAD_RADIUS),
+    )
+    trunk = _link(ROOT, meshes, *person, *(_visual("motor", "cylinder", arm.base, **MOTOR) for arm in arms))
+    materials = (_element("material", _element("color", rgba=rgba), name=name) for name, rgba in COLOURS.items())
+    parts = (_arm(arm, names, meshes) for arm, names in zip(arms, joint_names(arms), strict=True))
+    robot = _element("robot", *materials, trunk, *(part for arm in parts for part in arm), name="exo_gravity")
+    ElementTree.indent(robot)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
+
+
+def joint_names(arms: Sequence[ArmDescription]) -> list[tuple[str, ...]]:
+    """Return the four joint names of each arm; with the side in front if the arms share a name."""
+    names = [arm.limits.joint_names for arm in arms]
+    if len({name for four in names for name in four}) == JOINT_COUNT * len(arms):
+        return names
+    return [tuple(f"{arm.side}_{name}" for name in four) for arm, four in zip(arms, names, strict=True)]
+
+
+def _bodies(arm: ArmDescription) -> list[tuple[float, Point]]:
+    """Return mass in kg and centre of gravity (3,) in m of each link, in the frame of its joint.
+
+    Moments across the links (moments.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
+    Y4 of links 3 and 4. An arm given by its moments has the masses `arm.mass`, and its centres of gravity, also beyond
+    the links, follow from the moments. Raises ParameterError if a link has no mass.
+    """
+    robot = arm.robot
+    mass = [float(m) for m in (arm.mass if robot.by_moments else robot.mass)]
+    if not all(m > 0.0 for m in mass):
+        raise ParameterError("robot.mass", mass, "above 0 kg for each link of a robot description")
+    along = robot.cog
+    if robot.by_moments:
+        carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
+        along = (robot.first_moment - robot.length * carried) / mass
+    a1, a2, a3, a4 = along.tolist()
+    w, z, y3, y4 = (moment / m for moment, m in zip(robot.off_axis, mass, strict=True))
+    out = arm.outward
+    centres = (w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)
+    return list(zip(mass, centres, strict=True))
+
+
+def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Element]:
+    """Yield the joints and links of one arm."""
+    limits, lengths = arm.limits, arm.robot.length.tolist()
+    _, axes, along = arm_pose(arm, (0.0,) * JOINT_COUNT)
+    parent, origin = ROOT, arm.base
+    for n, (mass, centre) in enumerate(_bodies(arm)):
+        end = tuple((lengths[n] * along[n]).tolist())
+        lower, upper = limits.position_min[n], limits.position_max[n]
+        largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
+        moving = [_element("axis", xyz=axes[n]), _element("limit", lower=lower, upper=upper, **largest)]
+        if arm.damping[n] or arm.friction[n]:
+            moving.append(_element("dynamics", damping=arm.damping[n], friction=arm.friction[n]))
+        yield _joint(names[n], "revolute", parent, arm.links[n], origin, *moving)
+        drawn = []
+        if lengths[n]:
+            middle = tuple((lengths[n] / 2 * along[n]).tolist())
+            drawn.append(_visual("tube", "cylinder", middle, along[n], radius=DRAWN_RADIUS, length=lengths[n]))
+        if n + 1 < JOINT_COUNT:
+            drawn.append(_visual("motor", "cylinder", end, axes[n + 1], **MOTOR))
+        drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
+        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, lengths[n], sideways=n == 0))
+        parent, origin = arm.links[n], end
+    yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
+    yield _element("link", name=arm.links[-1])
+
+
+def _joint(name: str, kind: str, parent: str, child: str, origin: Point, *moving: Element) -> Element:
+    ends = _element("parent", link=parent), _element("child", link=child)
+    return _element("joint", _element("origin", xyz=origin, rpy=NO_TURN), *ends, *moving, name=name, type=kind)
+
+
+def _tube(mass: float, centre: Point, length: float, sideways: bool) -> Element:
+    """Return the inertial element of a thin tube, which points along y if `sideways` and along z if not."""
+    along = mass * TUBE_RADIUS**2
+    across = along / 2 + mass * length**2 / 12
+    iyy, izz = (along, across) if sideways else (across, along)
+    inertia = _element("inertia", ixx=across, iyy=iyy, izz=izz, ixy=0.0, ixz=0.0, iyz=0.0)
+    return _element("inertial", _element("origin", xyz=centre, rpy=NO_TURN), _element("mass", value=mass), inertia)
+
+
+def _link(name: str, meshes: str, *drawn: Element, inertial: Element | None = None) -> Element:
+    """Return a link that shows the mesh NAME.stl in the folder `meshes`, an address, or without one what is `drawn`."""
+    if meshes:
+        mesh = _element("mesh", filename=f"{meshes.rstrip('/')}/{name}.stl")
+        drawn = (_element("visual", _element("geometry", mesh)),)
+    return _element("link", *([] if inertial is None else [inertial]), *drawn, name=name)
+
+
+def _visual(material: str, shape: str, centre: Point, axis: Vector = (0.0, 0.0, 1.0), **size: float | Point) -> Element:
+    """Return a shape; axis: one of the frame's axes, of a cylinder, which in URDF lies along z."""
+    turn = (abs(axis[1]) * math.pi / 2, abs(axis[0]) * math.pi / 2, 0.0)
+    geometry = _element("geometry", _element(shape, **size))
+    return _element("visual", _element("origin", xyz=centre, rpy=turn), geometry, _element("material", name=material))
+
+
+def _element(tag: str, *children: Element, **attributes: str | float | Sequence[float]) -> Element:
+    """Return an element. Numbers are written with every digit, so that nothing is rounded."""
+    element = Element(tag)
+    for name, value in attributes.items():
+        numbers = (value,) if isinstance(value, float | int) else value
+        # + 0.0: no negative zero
+        element.set(name, value if isinstance(value, str) else " ".join(repr(float(x) + 0.0) for x in numbers))
+    element.extend(children)
+    return element

@@ -1,0 +1,98 @@
+"""The script of a trial: a list of timed steps for the wearer, as `docs/trials.md` lists them.
+
+A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from typing import Any
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import MAX_PAYLOAD
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import four_floats, one_float
+
+MAX_DURATION = 3600.0  # s
+TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
+# Steps with one number or four: how these are checked, the least, the largest, and their unit.
+VALUED: dict[str, tuple[Callable[..., Any], float, float, str]] = {
+    "move": (four_floats, -3.5, 3.5, "rad"),
+    "push": (four_floats, -20.0, 20.0, "Nm"),
+    "bow": (one_float, -1.6, 1.6, "rad"),
+    "lean": (one_float, -0.8, 0.8, "rad"),
+    "load": (one_float, 0.0, MAX_PAYLOAD, "kg"),
+}
+TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: an `action` and its `value`.
+
+    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'load': the mass
+    (1,) in kg; 'hold', 'walk', 'sit': ().
+    """
+
+    action: str
+    duration: float
+    value: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, entry: Any, where: str) -> "Step":
+        """Return the step described by a mapping from YAML; `where` is its name in a ParameterError."""
+        keys = set(entry) if isinstance(entry, Mapping) else set()
+        action = next(iter(keys - {"over"}), "")
+        name = f"{where}.{action}"
+        if action in TIMED and keys == {action}:
+            return cls(action, one_float(name, entry[action], TIMED[action], MAX_DURATION, "s"))
+        if action in VALUED and keys == {action, "over"}:
+            checked, low, high, unit = VALUED[action]
+            value = np.ravel(checked(name, entry[action], low, high, unit)).tolist()
+            return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), tuple(value))
+        expected = (
+            "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
+            "{walk: s}, {sit: s} or {load: kg, over: s}"
+        )
+        raise ParameterError(where, entry, expected)
+
+
+@dataclass(frozen=True)
+class TrialScript:
+    """A named list of steps."""
+
+    name: str
+    steps: tuple[Step, ...]
+
+    @classmethod
+    def parse(cls, content: Any) -> "TrialScript":
+        """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
+        if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
+            raise ParameterError("script", content, "a mapping with the keys name and steps only")
+        steps = content["steps"]
+        if not isinstance(steps, list) or not steps:
+            raise ParameterError("steps", steps, "a list of at least one step")
+        return cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+
+    @property
+    def duration(self) -> float:
+        """Total length of all steps in s."""
+        return sum(step.duration for step in self.steps)
+
+    def at(self, elapsed: float) -> tuple[int, float]:
+        """Return the index of the active step `elapsed` s after the start, and the time since that step began.
+
+        After the last step the index is len(steps).
+        """
+        index = bisect_right(self._ends, elapsed)
+        return index, elapsed - (self._ends[index - 1] if index else 0.0)
+
+    @cached_property
+    def _ends(self) -> tuple[float, ...]:
+        return tuple(accumulate(step.duration for step in self.steps))
+
+
+IDLE = TrialScript("nothing", ())  #: its wearer leaves the arm alone

@@ -1,1 +1,0 @@
-"""The subcommands of `calibrate`: one module each, with what they share."""

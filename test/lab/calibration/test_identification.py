@@ -1,0 +1,199 @@
+"""Identification from held poses: right on random devices, with stated errors, and with what it cannot show."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, Tilt
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.lab.calibration.identification import identify
+from exo_gravity.lab.calibration.pose_fit import COMMON, TYPICAL_MOMENTS
+from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+
+from ...support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best, off_axis_of
+
+
+@cache
+def twenty():
+    """Twenty devices, and the result of a tour of each."""
+    return [(device, identify(device.tour(), LENGTH)) for device in map(Device, range(100, 120))]
+
+
+def test_the_moments_of_20_random_devices_are_right_to_2_percent_or_twice_the_standard_error():
+    for device, found in twenty():
+        wrong = np.abs(found.moments - device.moments)
+        assert np.all((wrong < 2.0 * found.error) | (wrong < 0.02 * device.moments.max()))
+
+
+def test_most_moments_lie_within_2_percent():
+    wrong = np.abs([(found.moments - device.moments)[1:4] / device.moments[1:4] for device, found in twenty()])
+    assert np.median(wrong) < 0.01 and wrong.max() < 0.04
+
+
+def test_two_standard_errors_cover_90_to_99_percent_of_the_moments_and_the_scales():
+    size = np.array([(found.moments - device.moments) / found.error for device, found in twenty()])
+    scale = np.array([(found.scale - device.scale) / found.scale_error for device, found in twenty()])
+    covered = np.abs(np.hstack((size, scale))) < 2.0
+    assert 0.90 <= covered.mean() <= 0.99
+
+
+def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
+    size = []
+    for device in map(Device, range(200, 210)):
+        factor = 1.0 + COMMON * device.rng.normal(size=(2, 4))
+        observations = [
+            one._replace(effort=device.offset + (one.effort - device.offset) * factor[int(one.load_mass > 0.0)])
+            for one in device.tour(bare=8, weighed=8)
+        ]
+        found = identify(observations, LENGTH)
+        size.append((found.moments - device.moments) / found.error)
+        size.append((found.scale - device.scale) / found.scale_error)
+    assert 0.90 <= np.mean(np.abs(np.concatenate(size)) < 2.0) <= 0.99
+
+
+def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak():
+    rng = np.random.default_rng(7)
+    theta = rng.uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
+    for device, found in twenty():
+        true = device.effort(theta, LEANING)
+        wrong = regressor(theta, LEANING) @ found.moments / found.scale + found.offset - true
+        assert np.all(np.sqrt(np.mean(wrong**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
+
+
+def test_the_prediction_of_a_pose_from_the_others_is_nearly_as_good_as_its_measurement():
+    for _, found in twenty():
+        assert np.nanmax(np.abs(found.held_out)) < 0.15
+        assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 3.0 * np.linalg.norm(found.residual)
+
+
+def test_the_held_out_prediction_is_that_of_a_fit_without_the_pose():
+    observations = Device(1).tour()
+    found, without = identify(observations, LENGTH), identify(observations[1:], LENGTH)
+    direction = LEANING + np.cross(without.tilt, LEANING)
+    predicted = regressor(observations[0].theta, direction / np.linalg.norm(direction))[0] @ without.moments
+    predicted = predicted / without.scale + without.offset
+    np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
+
+
+def test_friction_is_half_the_difference_of_both_directions():
+    device = Device(2)
+    found = identify(device.tour(), LENGTH)
+    np.testing.assert_allclose(found.friction, device.friction / device.scale, atol=0.01)
+
+
+def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torque_is_right():
+    device = Device(3)
+    found = identify(device.tour(bare=12, weighed=0), LENGTH)
+    assert found.relative and "common factor" in found.unknown[0] and found.singular_values[-1] < 1e-3
+    weighed = identify(Device(3).tour(), LENGTH)
+    assert not weighed.relative and weighed.singular_values[-1] > 1.0 and "common factor" not in weighed.unknown[0]
+    assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
+    factor = found.moments[1] / device.moments[1]
+    assert factor == pytest.approx(np.prod(device.scale[1:]) ** (-1.0 / 3.0), rel=0.01)
+    np.testing.assert_allclose(found.moments / factor, device.moments, atol=0.004)
+    np.testing.assert_allclose(found.scale / factor, device.scale, rtol=0.03)
+
+
+def test_a_light_weight_leaves_moments_and_scales_as_uncertain_as_each_other():
+    device = Device(3)
+    light = [device.observe(theta, weight=(0.05, 0.25)) for theta in best(LEANING, 4, WEIGHT)]
+    found = identify(device.tour(weighed=0) + light, LENGTH)
+    assert found.scale_error[1] > 0.01 * found.scale[1]
+    assert found.error[2] / found.moments[2] == pytest.approx(found.scale_error[2] / found.scale[2], rel=0.2)
+
+
+def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
+    device = Device(4)
+    found = identify(device.tour(UPRIGHT), LENGTH)
+    assert "M1, W, torque scale 1: joint 1 carries nothing" in found.unknown[0]
+    unseen = [MOMENTS.index("M1"), MOMENTS.index("W")]
+    assert np.all(np.isinf(found.error[unseen])) and np.isinf(found.scale_error[0])
+    seen = [k for k in range(8) if k not in unseen]
+    assert np.all(np.abs(found.moments - device.moments)[seen] < 4.0 * found.error[seen])
+
+
+def test_the_first_moment_is_never_negative_and_its_error_stays_honest():
+    device = Device(30)
+    device.moments[0] = -0.003
+    found = identify(device.tour(Tilt.of("right", 0.05, 0.05).direction), LENGTH)
+    assert found.moments[0] == 0.0 and found.error[0] > 0.002
+
+
+def test_a_moment_of_which_next_to_nothing_is_known_stays_0():
+    found = identify(Device(31).tour(Tilt.of("right", 0.003, 0.002).direction), LENGTH)
+    assert np.isinf(found.error[0]) and found.moments[0] == 0.0
+
+
+def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
+    device, off = Device(5), np.array((0.0, 0.0, 0.0, np.radians(5.0)))
+    observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
+    found = identify(observations, LENGTH)
+    turned = np.arctan2(*(device.moments[[7, 3]])) + off[3]
+    assert np.arctan2(found.moments[7], found.moments[3]) == pytest.approx(turned, abs=0.02)
+    assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
+
+
+def test_a_weight_shows_an_error_of_joint_3s_zero():
+    observations = [o._replace(theta=np.subtract(o.theta, (0.0, 0.0, 0.05, 0.0))) for o in Device(17).tour()]
+    found = identify(observations, LENGTH)
+    said = next(sentence for sentence in found.unknown if "The weight shows joint 3's zero" in sentence)
+    assert float(said.split("zero ")[1].split()[0]) == pytest.approx(np.degrees(0.05), abs=1.0)
+    assert not any("The weight shows" in sentence for sentence in identify(Device(17).tour(), LENGTH).unknown)
+
+
+def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
+    rng = np.random.default_rng(16)
+    device = Device(16)
+
+    def uncertain(poses):
+        return np.log(identify([device.observe(theta) for theta in poses], LENGTH).error).sum()
+
+    chosen = uncertain(best(LEANING, 10))
+    drawn = [uncertain(rng.permutation(CANDIDATES)[:10]) for _ in range(5)]
+    assert chosen < min(drawn)
+
+
+def held(arm, theta, moments, weight=(0.0, 0.0)):
+    """Move the simulated arm slowly through the pose in both directions; return what holds it, as commanded."""
+    passes = []
+    arm.move_base(np.multiply(STANDARD_GRAVITY, LEANING))
+    for way in (1.0, -1.0):
+        arm.reset(theta - way * 0.1)
+        guess, summed, efforts = regressor([theta], LEANING)[0] @ moments, np.zeros(4), []
+        for step in range(1300):
+            target = theta + way * (0.1e-3 * step - 0.1)  # rad; 0.1 rad/s
+            error = target - arm.positions
+            summed += 1e-3 * error
+            effort = guess + 80.0 * error + 400.0 * summed + 2.0 * (way * 0.1 - np.array(arm.velocities))
+            effort = np.round(np.clip(effort, -9.0, 9.0) / CODE) * CODE
+            arm.step(effort)
+            if np.all(np.abs(arm.positions - theta) < 0.02):
+                efforts.append(effort)
+        passes.append((np.mean(efforts, axis=0), np.std(efforts, axis=0) / np.sqrt(len(efforts) / 20.0)))
+    (up, up_spread), (down, down_spread) = passes
+    return Observation(theta, LEANING, (up + down) / 2, (up - down) / 2, np.hypot(up_spread, down_spread) / 2, *weight)
+
+
+def test_an_arm_simulated_by_mujoco_is_found_from_slow_passes_in_both_directions():
+    links, beside = DEFAULT_LINKS, np.array(((0.0, 0.01, -0.012, 0.008), (0.012, -0.01, 0.005, 0.01)))
+    friction = {"coulomb_friction": (0.2, 0.3, 0.15, 0.1), "stribeck_friction": (0.05,) * 4}
+    weight = {"wearer_mass": (0.0, 0.0, 0.0, WEIGHT[0]), "wearer_cog": (0.0, 0.0, 0.0, WEIGHT[1])}
+    bare, weighed = (
+        SimulatedArm(ArmConfig(links, cog_y=beside[0], cog_z=beside[1], **friction, **load)) for load in ({}, weight)
+    )
+    guess = np.array(TYPICAL_MOMENTS)
+    observations = [held(bare, np.array(theta), guess) for theta in best(LEANING, 8)]
+    guess = guess + load_moments(LENGTH, *WEIGHT)
+    observations += [held(weighed, np.array(theta), guess, WEIGHT) for theta in best(LEANING, 4, WEIGHT)]
+    found = identify(observations, LENGTH)
+    true = moments_of(ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, *beside)))
+    wrong = np.abs(found.moments - true)
+    assert np.all((wrong < 0.02 * true.max()) | (wrong < 2.0 * found.error))
+    np.testing.assert_allclose(found.scale, 1.0, atol=0.02)
+    np.testing.assert_allclose(found.friction, friction["coulomb_friction"], atol=0.08)
+    assert found.rejected == ()

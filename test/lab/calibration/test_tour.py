@@ -1,0 +1,273 @@
+"""A tour on the simulated device: what it measures, within which limits it moves, and what stops it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.arm.gravity import load_moments, moments_of
+from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.calibration.identification import fit_friction
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, measurable
+from exo_gravity.lab.calibration.tour import Tour
+from exo_gravity.sim import ArmConfig, SimulatedArm
+from exo_gravity.sim.arm import DEFAULT_LINKS
+
+from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device, fixed
+
+LIMITS = Limits(NAMES, sign_check_torque=0.0)
+POSE = Station((0.1, 0.5, 0.6, 0.7))
+TWO = POSE, Station((0.0, 0.3, 0.5, 0.4))
+SCALES = (0.8, 1.2, 0.9, 1.0)
+WEIGHT = (1.0, 0.28)  # kg, m from the elbow
+WEIGHED = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
+
+
+def expected(tour, links, scales=(1.0,) * 4):
+    """The commanded torque (n, 4) in Nm that holds the true arm in each measured pose."""
+    return np.array([gravity_torque(links, o.theta, o.direction) / scales for o in tour.measured])
+
+
+def efforts(tour):
+    return np.array([o.effort for o in tour.measured])
+
+
+@pytest.fixture(scope="module")
+def wrong_file():
+    """A tour of four poses of an arm whose masses, centres of gravity and torque scales differ from the file's."""
+    links = DEFAULT_LINKS
+    truth = ArmModel(links.length, links.cog * 0.9, links.mass * (1.2, 0.8, 1.15, 0.8))
+    motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
+    run = TourRun(truth=ArmConfig(truth), motors=motors)
+    return run, run.run(Itinerary(LIMITS, 4, 80.0)), truth
+
+
+def test_a_tour_of_four_poses_ends_hanging_in_time(wrong_file):
+    run, tour, _ = wrong_file
+    assert tour.trouble == "" and tour.done and len(tour.measured) == 4
+    assert tour.elapsed < 90.0
+    assert run.safety.fault is None and run.safety.state is State.DISABLED
+    np.testing.assert_allclose(run.log[-1][1:5], LIMITS.home, atol=0.1)
+
+
+def test_the_mean_of_both_directions_is_gravity_and_half_the_difference_is_friction(wrong_file):
+    _, tour, truth = wrong_file
+    error = efforts(tour) - expected(tour, truth, SCALES)
+    assert np.abs(error).max() < 0.02  # of up to 5 Nm
+    friction = np.median([o.friction for o in tour.measured], axis=0)
+    np.testing.assert_allclose(friction * SCALES, (0.2, 0.4, 0.2, 0.2), atol=0.02)
+
+
+def test_errors_are_within_a_few_of_the_stated_standard_errors(wrong_file):
+    _, tour, truth = wrong_file
+    spread = np.array([o.spread for o in tour.measured])
+    ratio = np.abs(efforts(tour) - expected(tour, truth, SCALES)) / spread
+    assert np.mean(ratio < 2.0) > 0.9 and ratio.max() < 6.0
+
+
+def test_a_tour_that_is_done_does_not_watch_the_bridge_let_the_arm_down(wrong_file):
+    _, tour, _ = wrong_file
+    moved, still, upright = (0.0, 0.5, 0.4, 0.8), (0.0,) * 4, Tilt.of("right")
+    later = [tour.step(1000.0 + cycle / 100.0, moved, still, upright) for cycle in range(300)]
+    assert None not in later and not tour.trouble
+
+
+def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
+    run, _, _ = wrong_file
+    positions = np.array(run.log)[:, 1:5]
+    assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
+    assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MAX_SPEED
+    assert not run.acted
+
+
+class Grip:
+    """A hand that holds joint 3 where it was at `start` s, with a spring of 60 Nm/rad and the damping of an arm."""
+
+    def __init__(self, start):
+        self.start, self.held = start, None
+
+    def __call__(self, time, device):
+        if time < self.start:
+            return None
+        self.held = device.arm.positions[2] if self.held is None else self.held
+        return 0.0, 0.0, 60.0 * (self.held - device.arm.positions[2]) - 3.0 * device.arm.velocities[2], 0.0
+
+
+def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
+    run = TourRun(disturb=Grip(18.0))
+    tour = run.run(fixed(TWO))
+    assert tour.trouble.startswith("flexion: ") and "a hand" in tour.trouble and "the limit is" in tour.trouble
+    assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN and not run.device.powered
+    assert len(tour.measured) >= 1  # what was measured is kept
+
+
+def test_a_saturated_joint_is_named_with_its_limit():
+    limits = replace(LIMITS, max_effort=(3.0, 9.0, 1.0, 3.0))
+    tour = TourRun(limits=limits).run(fixed([Station((0.0, 0.3, 1.2, 0.2))]))
+    assert tour.trouble.startswith("flexion: saturated") and "max_effort = 1 Nm" in tour.trouble
+    assert tour.elapsed < 15.0
+
+
+def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_measured():
+    def unplug(time, device):
+        device.motors[1].unplugged = time > 18.0
+
+    run = TourRun(disturb=unplug)
+    tour = run.run(fixed(TWO))
+    assert run.safety.fault.code is FaultCode.MOTOR_SILENT and "abduction" in run.safety.fault.reason
+    assert tour.measured and not tour.done
+
+
+def test_a_joint_that_slips_between_two_passes_is_named():
+    """A slip shows as a torque that differs between two passes of the same angle."""
+
+    def slip(time, device):
+        return 0.0, 0.0, min(0.5, 0.2 * max(0.0, time - 10.0)), 0.0
+
+    tour = TourRun(disturb=slip).run(fixed([Station((0.0, 0.3, 0.5, 0.4), cycles=4)]))
+    assert tour.trouble.startswith("flexion: ") and "between two passes" in tour.trouble
+    assert not tour.measured
+
+
+def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
+    run = TourRun()
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
+        tour = Tour(run.limits, guess, fixed([POSE]), 100.0)
+        assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
+        assert tour.step(now, (0.0,) * 4, (0.0,) * 4, Tilt.of("right", *tilt)) is None
+        assert words in tour.trouble
+
+
+def test_the_arm_is_held_until_the_next_pose_is_chosen():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    tour = Tour(LIMITS, guess, fixed([POSE]), 100.0)
+    for cycle in range(200):
+        assert tour.step(0.01 * cycle, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) == pytest.approx((0.0,) * 4, abs=0.01)
+    tour.plan()
+    efforts = [tour.step(2.0 + 0.01 * i, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) for i in range(30)]
+    assert efforts[-1][3] > 0.05 and "pose 1 of 1" in tour.progress
+
+
+class Broken(Itinerary):
+    """Pose choice with a defect."""
+
+    def next(self, *state):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+
+def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_reason():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    tour, step = Tour(LIMITS, guess, Broken(LIMITS, 1, 60.0), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
+    assert tour.step(0.0, *step) is not None
+    tour.plan()
+    assert None in [tour.step(0.01 * cycle, *step) for cycle in range(1, 40)]  # withdrawn: the bridge lets the arm down
+    assert tour.trouble == "the next pose could not be chosen: LinAlgError: Singular matrix"
+
+
+def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    tour, step = Tour(LIMITS, guess, fixed([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
+    efforts = [tour.step(0.05 * cycle, *step) for cycle in range(610)]
+    assert efforts[590] is not None and efforts[-1] is None
+    assert tour.trouble.startswith("the next pose was not chosen within 30 s")
+
+
+def test_a_line_keeps_speed_and_acceleration_and_arrives():
+    line = Line(np.zeros(4), np.array((1.0, -0.5, 0.0, 0.2)))
+    times = np.arange(0.0, line.duration, 0.001)
+    positions, speeds = (np.array(column) for column in zip(*map(line.at, times), strict=True))
+    assert np.abs(speeds).max() <= MAX_SPEED + 1e-9
+    assert np.abs(np.diff(speeds, axis=0)).max() <= ACCELERATION * 0.001 + 1e-9
+    np.testing.assert_allclose(np.diff(positions, axis=0)[500:-500], 0.001 * speeds[500:-501], atol=1e-5)
+    np.testing.assert_allclose(line.at(math.inf)[0], (1.0, -0.5, 0.0, 0.2))
+
+
+def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angles():
+    slope, friction, sweeps = np.diag((1.0, 2.0, 3.0, 0.5)), np.array((0.2, 0.4, 0.1, 0.3)), []
+    for sign in (1.0, -1.0, 1.0, -1.0):
+        offset = sign * np.linspace(-0.03, 0.03, 60)[:, None] - sign * 0.01  # behind the reference
+        position = np.array((0.1, 0.2, 0.3, 0.4)) + offset
+        effort = 1.0 + position @ slope.T + sign * friction
+        down = np.tile((0.0, 0.0, 1.0), (60, 1))
+        sweeps.append(Sweep(position, effort - position @ slope.T, down))  # minus the expected one
+    seen, _ = average(sweeps)
+    np.testing.assert_allclose(seen.friction, friction, atol=1e-9)
+    np.testing.assert_allclose(seen.effort, 1.0, atol=1e-9)
+
+
+def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
+    links = DEFAULT_LINKS
+    truth = ArmModel(links.length, links.cog * 0.9, links.mass * 1.2)
+    guess = TorqueGuess(links.length, moments_of(links), Tilt.of("right", 0.1), links.gravity)
+    poses = candidates(LIMITS)[:60]
+    torque = gravity_torque(truth, poses, guess.tilt.direction) / SCALES
+    before = guess.torques(poses)
+    for theta, effort in zip(poses[:10], torque[:10], strict=True):
+        guess.learn(theta, effort, (0.003,) * 4)
+    mean, deviation = guess.torques(poses)
+    assert np.abs(before[0] - torque).max() > 0.4 and np.abs(mean - torque).max() < 0.1
+    assert np.all(deviation <= before[1] + 1e-9)
+    np.testing.assert_allclose(guess.torque(poses[0].tolist()), mean[0], atol=1e-9)
+
+
+def test_chosen_poses_are_within_the_limits_and_can_be_held():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    limits = replace(LIMITS, max_effort=(3.0, 4.0, 1.8, 3.0))
+    itinerary = Itinerary(limits, 4, 120.0)
+    low, high = measurable(LIMITS, POSE.amplitude)
+    taken = np.empty((0, 4))
+    while station := itinerary.next(taken, np.array(LIMITS.home), 10.0 * len(taken), guess, (0.2,) * 4):
+        theta = np.array(station.theta)
+        assert np.all(theta >= low) and np.all(theta <= high)
+        assert np.all(np.abs(guess.torque(station.theta)) < 0.85 * np.array(limits.max_effort))
+        taken = np.vstack((taken, theta))
+    assert len(taken) == 4
+
+
+@pytest.mark.parametrize(("mass", "lever", "tolerance"), [(0.0, 0.0, 0.012), (*WEIGHT, 0.025)])
+def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
+    arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
+    moments = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
+    assert_close_to_device(LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
+
+
+def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
+    guess = TorqueGuess(DEFAULT_LINKS.length, WEIGHED, Tilt.of("right", 0.05, 0.2), 9.81)
+    itinerary, taken = Itinerary(LIMITS, 8, 160.0), np.empty((0, 4))
+    itinerary.next(taken, np.zeros(4), 0.0, guess, (0.0,) * 4)  # the hanging arm
+    while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
+        ways = [*station.ends, *(share * np.array(station.theta) for share in np.linspace(0.0, 1.0, 20))]
+        assert np.all(np.abs(guess.torques(np.array(ways))[0]) < 0.95 * np.array(LIMITS.max_effort))
+        taken = np.vstack((taken, station.theta))
+    assert len(taken) == 8
+
+
+def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
+    weak = replace(LIMITS, max_effort=(0.1,) * 4)
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    itinerary, state = Itinerary(weak, 4, 120.0), (np.zeros((1, 4)), np.zeros(4), 0.0, guess, (0.0,) * 4)
+    itinerary.next(*state)  # the hanging arm
+    with pytest.raises(DataError, match="max_effort"):
+        itinerary.next(*state)
+
+
+def test_friction_over_speed_is_fitted_with_and_without_stribeck():
+    speed = np.array((0.02, 0.05, 0.1, 0.18, 0.3))
+    plain = fit_friction(speed, 0.2 + 0.05 * speed)
+    assert plain.stribeck == 0.0
+    np.testing.assert_allclose((plain.coulomb, plain.viscous), (0.2, 0.05), atol=1e-9)
+    fit = fit_friction(speed, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)))
+    np.testing.assert_allclose(fit.fitted, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), atol=0.005)
+    assert fit.coulomb == pytest.approx(0.2, abs=0.01)
+    with pytest.raises(DataError, match="at 1 speeds"):
+        fit_friction(speed[:1], speed[:1])

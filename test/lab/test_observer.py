@@ -1,0 +1,219 @@
+"""The wearer's torque: momentum and C^T v against Pinocchio, the estimate against MuJoCo and known torques."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.arm.arm import ModelError
+from exo_gravity.core.arm.kinematics import links_of, turning_in_base
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.terms.catalogue import Friction
+from exo_gravity.core.compensation.terms.terms import TermSettings
+from exo_gravity.lab.observer.momentum import BANDWIDTH, COVER, MomentumObserver
+from exo_gravity.lab.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
+from exo_gravity.sim import ArmConfig, SimulatedArm
+from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
+from exo_gravity.sim.trunk_motion import TrunkState
+
+from ..core.test_gravity_oracles import random_arm
+from ..core.test_kinematics import NO_ROTORS, ROUNDING, with_rods
+
+LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
+EXACT = ModelError((0.0,) * 4, (0.0,) * 4, 0.0, 0.0)
+COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)
+SETTINGS = Settings(
+    "right", DEFAULT_LINKS, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), model_error=EXACT,
+    terms=TermSettings(friction=Friction(0.0, (*COULOMB, *VISCOUS))),
+)  # fmt: skip
+WHOLE = DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog)
+TILT = Tilt.of("right", 0.1, -0.05)
+POSE = (0.2, 0.8, 0.5, 0.7)
+
+
+def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_motions():
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        arm = random_arm(rng)
+        pin, model, data = with_rods(arm)
+        links = links_of(arm)._replace(rotors=NO_ROTORS)
+        for theta, velocity in rng.uniform(-3.0, 3.0, (20, 2, 4)):
+            momentum, coriolis = links.momentum(theta, velocity)
+            mass = pin.crba(model, data, theta)
+            mass = np.triu(mass) + np.triu(mass, 1).T
+            assert momentum == pytest.approx(mass @ velocity, abs=ROUNDING)
+            matrix = pin.computeCoriolisMatrix(model, data, theta, velocity)
+            assert coriolis == pytest.approx(matrix.T @ velocity, abs=ROUNDING)
+
+
+def test_a_base_that_turns_adds_the_momentum_of_an_arm_that_turns_with_it():
+    # About joint 1's own axis the base's turning is that of joint 1, for momentum and kinetic energy alike.
+    links, rng = links_of(DEFAULT_LINKS)._replace(rotors=NO_ROTORS), np.random.default_rng(2)
+    for theta, velocity in rng.uniform(-2.0, 2.0, (20, 2, 4)):
+        turned = links.momentum(theta, velocity, (0.0, 0.0, 0.7))
+        same = links.momentum(theta, velocity + np.array((0.7, 0.0, 0.0, 0.0)))
+        assert turned == (pytest.approx(same[0]), pytest.approx(same[1]))
+
+
+def still(effort, tilt=TILT, settings=SETTINGS, pose=POSE):
+    """Return the estimate of an arm that stands at `pose` under the motors' `effort`."""
+    observer = MomentumObserver(settings)
+    for n in range(100):
+        estimate = observer.update(n * PERIOD, (pose, (0.0,) * 4, effort), tilt)
+    return estimate
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_what_the_motors_do_not_carry_of_a_still_arm_is_the_wearers(side):
+    tilt = Tilt.of(side, 0.2, -0.1)
+    needed = gravity_torque(WHOLE, POSE, tilt.direction)
+    given = (0.3, -1.0, 2.0, 0.5)
+    estimate = still(needed - given, tilt, replace(SETTINGS, side=side))
+    assert estimate.torque == pytest.approx(given, abs=1e-9)
+    own = ArmModel(DEFAULT_LINKS.length, LOAD.cog, LOAD.mass)
+    assert estimate.weight == pytest.approx(gravity_torque(own, POSE, tilt.direction))
+
+
+def test_a_torque_within_the_band_is_not_distinguishable_from_zero():
+    needed = gravity_torque(WHOLE, POSE, TILT.direction)
+    deviation = np.array(still(needed).deviation)
+    assert not any(still(needed).distinguishable)
+    inside, outside = (still(needed - share * COVER * deviation) for share in (0.9, 1.1))
+    assert not any(inside.distinguishable) and all(outside.distinguishable)
+
+
+def simulated(seconds, torque_of, base=None):
+    """Yield time, joints, wearer's torque and tilt of a MuJoCo arm of slender rods with the wearer's arm in it.
+
+    torque_of: time -> torque (4,) of the wearer in Nm, on top of motors that lead the arm along a path. base: time ->
+    TrunkState.
+    """
+    arm = SimulatedArm(
+        ArmConfig(DEFAULT_LINKS, LOAD.mass, LOAD.cog, coulomb_friction=COULOMB, viscous_friction=VISCOUS)
+    )
+    arm.reset(POSE)
+    for n in range(round(seconds / PERIOD)):
+        now = n * PERIOD
+        state = base(now) if base else TrunkState(TILT.pitch, TILT.roll)
+        gravity, turning, spin_up = felt_in_base("right", state, DEFAULT_LINKS.gravity)
+        arm.move_base(gravity, turning, spin_up)
+        tilt = TILT._replace(direction=tuple(np.divide(gravity, np.linalg.norm(gravity))))
+        tilt = tilt._replace(magnitude=float(np.linalg.norm(gravity)) / DEFAULT_LINKS.gravity)
+        theta, velocity, given = np.array(arm.positions), np.array(arm.velocities), np.array(torque_of(now))
+        wanted = POSE + np.array((0.2, 0.3, 0.4, 0.4)) * math.sin(2.5 * now)
+        needed = gravity_torque(WHOLE, theta, tilt.direction) - given
+        effort = needed + (20.0, 30.0, 20.0, 8.0) * (wanted - theta) - (1.0, 2.0, 1.0, 0.4) * velocity
+        yield now, (theta.tolist(), velocity.tolist(), effort.tolist()), given, tilt, turning
+        arm.step(effort + given, round(PERIOD / 0.001))
+
+
+def wearer(now):
+    """Return a torque of the wearer that changes as in a reach."""
+    return 0.4 * math.sin(3.0 * now), 2.0 + math.sin(4.0 * now), math.cos(3.0 * now), 0.3
+
+
+def errors(samples, settings=SETTINGS, after=1.0, with_turning=True):
+    """Return estimate minus truth, and its deviation, (n, 4) Nm each."""
+    observer, found = MomentumObserver(settings), []
+    for now, joints, given, tilt, turning in samples:
+        estimate = observer.update(now, joints, tilt, turning if with_turning else (0.0, 0.0, 0.0))
+        if now > after:
+            found.append((np.subtract(estimate.torque, given), estimate.deviation))
+    return np.moveaxis(np.array(found), 1, 0)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values), axis=0))
+
+
+def test_the_estimate_follows_a_known_torque_on_a_moving_arm_in_mujoco():
+    error, deviation = errors(simulated(6.0, wearer))
+    assert np.all(rms(error) < (0.1, 0.2, 0.1, 0.06))
+    assert np.mean(np.abs(error) < COVER * deviation) > 0.9
+
+
+def test_without_friction_in_the_settings_the_band_is_wide_enough():
+    unknown = replace(SETTINGS, terms=TermSettings())
+    error, deviation = errors(simulated(4.0, wearer), unknown)
+    assert np.mean(np.abs(error) < COVER * deviation) > 0.9
+
+
+def test_the_turning_of_the_base_is_accounted_for():
+    def bowing(now):
+        return TrunkState(pitch=0.3 * math.sin(3.0 * now), pitch_rate=0.9 * math.cos(3.0 * now),
+                          pitch_acceleration=-2.7 * math.sin(3.0 * now))  # fmt: skip
+
+    whole, without = (rms(errors(simulated(5.0, wearer, bowing), with_turning=w)[0]) for w in (True, False))
+    assert np.linalg.norm(whole) < 0.3 < 0.6 * np.linalg.norm(without)
+
+
+def test_a_torque_that_rises_steadily_is_followed_without_lag():
+    observer, needed = MomentumObserver(SETTINGS), gravity_torque(WHOLE, POSE, TILT.direction)
+    for n in range(200):
+        given = np.array((0.0, 2.0 * n * PERIOD, 0.0, 0.0))
+        estimate = observer.update(n * PERIOD, (POSE, (0.0,) * 4, (needed - given).tolist()), TILT)
+    # The effort acts from its sample on: the estimate is of the sample before.
+    assert estimate.torque[1] == pytest.approx(given[1], abs=2.5 * PERIOD)
+
+
+def test_after_a_gap_the_observer_starts_anew_from_a_still_arm():
+    observer, needed = MomentumObserver(SETTINGS), gravity_torque(WHOLE, POSE, TILT.direction)
+    observer.update(0.0, (POSE, (0.0,) * 4, (0.0,) * 4), TILT)
+    estimate = observer.update(1.0, (POSE, (0.0,) * 4, needed.tolist()), TILT)
+    assert estimate.torque == pytest.approx((0.0,) * 4, abs=1e-9)
+
+
+def test_each_error_of_the_model_widens_the_band():
+    needed = gravity_torque(WHOLE, POSE, TILT.direction).tolist()
+    narrow = np.array(still(needed).deviation)
+    for name, value in (("torque", (0.3,) * 4), ("scale", (0.1,) * 4), ("wearer", 0.1), ("tilt", 0.05)):
+        wider = still(needed, settings=replace(SETTINGS, model_error=replace(EXACT, **{name: value})))
+        assert np.all(np.array(wider.deviation) >= narrow) and wider.deviation[1] > 1.05 * narrow[1], name
+
+
+def curve(share, count=500, deviation=0.1):
+    """Return the curve of a wearer who gives `share`, a number or (n,), of a weight that changes."""
+    time = PERIOD * np.arange(count)
+    weight = np.column_stack((np.zeros(count), 8.0 + np.sin(time), 4.0 * np.cos(time), np.ones(count)))
+    return WearerCurve(time, np.reshape(share, (-1, 1)) * weight, np.full((count, 4), deviation), weight)
+
+
+def test_the_share_is_that_of_the_weight_that_the_wearer_gives():
+    assert share_of(curve(0.35)).value == pytest.approx(0.35)
+    assert share_of(curve(0.35), 1.0).value == pytest.approx(np.full(500, 0.35))
+
+
+def test_the_sliding_share_forgets_what_was_more_than_a_second_ago():
+    steps = np.repeat((0.2, 0.8), 250)
+    sliding = share_of(curve(steps), 1.0).value
+    assert sliding[249] == pytest.approx(0.2) and 0.2 < sliding[300] < 0.8
+    assert sliding[-1] == pytest.approx(0.8)
+
+
+def test_a_longer_time_does_not_narrow_the_band_of_the_share():
+    short, long = (share_of(curve(0.5, count)).deviation for count in (100, 2000))
+    assert long == pytest.approx(short, rel=0.3)
+    assert share_of(curve(0.5, deviation=0.2)).deviation == pytest.approx(2.0 * share_of(curve(0.5)).deviation)
+
+
+def test_a_hanging_arm_has_no_share():
+    hanging = curve(0.5)._replace(weight=np.full((500, 4), 0.1))
+    assert np.isnan(share_of(hanging).value)
+    assert np.isnan(share_of(while_between(curve(0.5), ())).value)
+
+
+def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_are_left_out():
+    time = np.arange(0.0, 2.0, 0.002)
+    needed = np.tile(gravity_torque(WHOLE, POSE, TILT.direction), (len(time), 1))
+    needed[400:500] = np.nan
+    joints = np.tile(POSE, (len(time), 1)), np.zeros_like(needed), needed
+    found = observed(SETTINGS, time, joints, lambda now: (TILT, turning_in_base("right", (0.0, 0.0, 0.0))))
+    assert np.diff(found.time[:50]) == pytest.approx(PERIOD)
+    assert not np.any((found.time > 0.8) & (found.time < 0.998))
+    assert found.torque == pytest.approx(0.0, abs=1e-9)
+    assert BANDWIDTH * PERIOD < 0.5  # the sampled low-pass is still one

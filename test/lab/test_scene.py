@@ -1,0 +1,101 @@
+"""What viewers show: the arm's pose against Pinocchio and the description, arcs, and the words for each state."""
+
+import math
+
+import numpy as np
+import pinocchio
+import pytest
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.view.scene import (
+    AMBER,
+    GREEN,
+    GREY,
+    LINE,
+    RANGE_RADIUS,
+    RED,
+    TORQUE_RADIUS,
+    TORQUE_SPAN,
+    ArmView,
+    arm_shapes,
+    gravity_shapes,
+    state_of,
+)
+from exo_gravity.lab.view.urdf import ArmDescription, arm_pose, urdf
+
+NAMES = ("rotation", "abduction", "flexion", "elbow")
+ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))
+STILL = (0.0,) * 4
+
+
+def arm(side="left"):
+    return ArmDescription(side, ROBOT, (), Limits(NAMES))
+
+
+def view(theta=STILL, velocity=STILL, effort=STILL, state="active", message="", side="left"):
+    return ArmView(arm(side), theta, velocity, effort, state, message)
+
+
+def lines(shapes, group):
+    return [shape for shape in shapes if (shape.group, shape.kind) == (group, LINE)]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_pose_is_that_of_the_description(side):
+    model = pinocchio.buildModelFromXML(urdf([arm(side)]))
+    data, rng = model.createData(), np.random.default_rng(1)
+    for theta in rng.uniform(-math.pi, math.pi, (50, 4)):
+        pinocchio.framesForwardKinematics(model, data, theta)
+        origins, axes, _ = arm_pose(arm(side), theta)
+        frames = [data.oMf[model.getFrameId(name)] for name in arm(side).links]
+        assert origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
+        # The description's own axes, in the frames of the links, which turn about them.
+        local = [(0, 0, -1), (1, 0, 0), (0, -1, 0), (0, -1, 0)]
+        mirrored = [(0, 0, 1), (-1, 0, 0), (0, -1, 0), (0, -1, 0)]
+        turned = [f.rotation @ a for f, a in zip(frames, local if side == "left" else mirrored, strict=False)]
+        assert axes == pytest.approx(np.array(turned), abs=1e-12)
+
+
+def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle():
+    theta = (0.3, 0.8, 0.5, 1.0)
+    origins, _, _ = arm_pose(arm(), theta)
+    shapes = lines(arm_shapes(view(theta)), "limits")
+    for n, (arc, needle) in enumerate(zip(shapes[0::2], shapes[1::2], strict=True)):
+        assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(RANGE_RADIUS)
+        link = origins[n + 1] - origins[n]
+        start, tip = needle.points
+        assert (tip - start) / RANGE_RADIUS == pytest.approx(link / np.linalg.norm(link), abs=1e-12)
+
+
+def test_a_joint_near_its_limit_is_red():
+    shapes = lines(arm_shapes(view((0.0, 3.10, 0.0, 0.0))), "limits")
+    assert [shape.colour for shape in shapes] == [GREY, GREY, RED, RED, GREY, GREY, GREY, GREY]
+
+
+def test_a_torque_spans_its_share_of_the_limit_in_its_direction_and_is_red_at_the_limit():
+    shapes = lines(arm_shapes(view(effort=(0.0, 4.5, -1.0, 3.0))), "torques")
+    origins, axes, _ = arm_pose(arm(), STILL)
+    for n, share in enumerate((0.0, 0.5, -1.0 / 3.0, 1.0)):
+        start, end = ((shapes[n].points[i] - origins[n]) / TORQUE_RADIUS for i in (0, -1))
+        turn = math.atan2(np.cross(start, end) @ axes[n], start @ end)
+        assert math.remainder(turn - share * TORQUE_SPAN, math.tau) == pytest.approx(0.0, abs=1e-9)
+    assert [shape.colour for shape in shapes] == [GREEN, GREEN, GREEN, RED]
+
+
+def test_gravity_points_along_its_vector_and_without_a_tilt_there_is_no_arrow():
+    (arrow,) = gravity_shapes((0.0, 0.6, -0.8))
+    direction = arrow.points[1] - arrow.points[0]
+    assert direction / np.linalg.norm(direction) == pytest.approx((0.0, 0.6, -0.8))
+    (text,) = gravity_shapes(None)
+    assert (text.kind, text.text) == ("text", "no tilt")
+
+
+def test_the_state_is_shown_by_colour_and_words():
+    assert state_of(view()) == (GREEN, "active, holding")
+    assert state_of(view(velocity=(0.0, -0.3, 0.0, 0.0))) == (GREEN, "active, moving")
+    assert state_of(view(state="fault", message="fault: no reply")) == (RED, "fault: no reply")
+    assert state_of(view(state="ramping in")) == (AMBER, "ramping in")
+    assert state_of(view(state="letting down"))[0] == AMBER
+    assert state_of(view(state="disabled")) == (GREY, "disabled")
+    assert state_of(view(state="")) == (GREY, "no state")
