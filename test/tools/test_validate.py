@@ -13,9 +13,10 @@ import yaml
 from exo_gravity.core import ArmModel
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab import anfis_training as anfis
+from exo_gravity.lab import comparison
 from exo_gravity.lab.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.lab.inputs.references import REFERENCES
-from exo_gravity.tools import comparison, validate
+from exo_gravity.tools import validate
 
 DOWN = np.array(((0.0, 0.0, 1.0),))
 
