@@ -84,7 +84,7 @@ setup(
     packages=find_packages(include=[package_name, package_name + ".*"]),
     package_data={
         package_name: ["py.typed"],
-        f"{package_name}.nodes.ros": ["fastdds*.xml"],
+        f"{package_name}.hardware": ["fastdds*.xml"],
         f"{package_name}.panel": ["strings.json", "static/*", "static/vendor/*"],
     },
     data_files=[

@@ -25,7 +25,7 @@ from exo_gravity.core.motors.joint_motor import REPLY_SHARE
 from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import UNKNOWN
 from exo_gravity.hardware.clock import favour
-from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine
 
 from .direct_arm import DirectArm, run_paced
 

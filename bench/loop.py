@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.tools.launcher import Launcher
+from exo_gravity.lab.processes import Launcher
 
 from .direct_arm import DirectArm
 from .node_log import NodeLog

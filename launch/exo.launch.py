@@ -16,7 +16,7 @@ from launch.substitutions import LaunchConfiguration
 
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.tools.launcher import RECOVERY_TIMEOUT, STOP_TIMEOUT, SUPERVISED
+from exo_gravity.lab.processes import RECOVERY_TIMEOUT, STOP_TIMEOUT, SUPERVISED
 
 LONGEST_STOP = DESCENT_TIMEOUT + RECOVERY_TIMEOUT + 2 * STOP_TIMEOUT  # s, of the launcher
 ARGUMENTS = (  # name, default, description

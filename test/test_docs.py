@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode
-from exo_gravity.tools.launcher import node_modules
+from exo_gravity.lab.processes import node_modules
 
 from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2, commands_of, words_of
 from .support.waiting import PATIENCE

@@ -3,7 +3,7 @@
 import sys
 from importlib.util import find_spec
 
-from exo_gravity.tools.cli import missing
+from exo_gravity.lab.packages import missing
 
 if not find_spec("yaml"):  # the core was installed alone; every tool reads parameter files
     print(f"exo_gravity: {missing('yaml', 'report')}", file=sys.stderr)

@@ -12,9 +12,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 
 from exo_gravity.core.errors import ExoGravityError
-
-# Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
-APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl", "yaml")
+from exo_gravity.lab.packages import missing
 
 
 def non_negative(text: str) -> float:
@@ -26,13 +24,6 @@ def non_negative(text: str) -> float:
     if not number >= 0.0:
         raise argparse.ArgumentTypeError(f"{text}: must be a number, 0 or more")
     return number
-
-
-def missing(module: str, extra: str) -> str:
-    """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
-    module = module.partition(".")[0]
-    apt = f"apt install python3-{module}, or " if module in APT else ""
-    return f"the Python package {module} is not installed: {apt}pip install 'exo_gravity[{extra}]'"
 
 
 @contextmanager

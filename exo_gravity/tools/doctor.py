@@ -1,325 +1,30 @@
 """doctor --params FILE: whether this computer is fit to carry the arms of a parameter file.
 
 It reads the computer's settings, and measures for ten seconds how late a thread like the control loop's wakes up. Each
-line has what it looked at, what it found and what is wanted; below it stands the command that mends it. What only
-delays threads (the kernel, the governor, ...) is judged by its effect: where the measured wake-ups are in time it is a
-note. What the computer does not state, as in a container, is unknown, and no fault.
+line has what it looked at, what it found and what is wanted; below it stands the command that fixes it.
 
 Exit code 0: fine. 1: warnings. 2: no one may wear an arm that this computer controls; also wrong use or wrong file.
 """
 
 import argparse
-import json
-import os
-import resource
-import socket
-import subprocess
 import sys
-import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from enum import IntEnum
-from multiprocessing import get_context
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from exo_gravity.core.errors import ExoGravityError, named
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE, Traffic, motors_of, traffic_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, FROZEN, check_bridge, limits_of
-from exo_gravity.hardware.clock import favour, request_real_time
-from exo_gravity.lab.inputs.arms import node_values
-from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, load, packaged_config, stages
+from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.lab.computer import Finding, Level, examine
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.tools.cli import extras, non_negative, require_ros
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
-SLOW_WAKE = 0.1  # of a period, for which a CPU may wake from its deepest idle state
-MIDDLEWARE = "rmw_fastrtps_cpp"  # the one that the package was tried with, and Jazzy's default
-SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")  # a look at these takes microseconds
-CPUS, CLOCKS = "sys/devices/system/cpu", "sys/devices/system/clocksource/clocksource0"
-GROUP = "239.255.0.1"  # of the multicast datagram
-IFF_UP = 1
-LIMITS = "sudo tee -a /etc/security/limits.d/exo_gravity.conf; then log in again"
-UP = "sudo ip link set {0} down; sudo ip link set {0} up type can bitrate {1} restart-ms 100"
-MENDS = {  # the command for each finding about the computer
-    "kernel": "Ubuntu: sudo pro enable realtime-kernel; Debian: sudo apt install linux-image-rt-amd64",
-    "CPU governor": f"echo performance | sudo tee /{CPUS}/cpu*/cpufreq/scaling_governor",
-    "idle states": "echo 1 | sudo tee {deep}",
-    "clock source": f"echo tsc | sudo tee /{CLOCKS}/current_clocksource",
-    "nice value": f"echo '*  -  nice  -20' | {LIMITS}",
-    "CPUs for the nodes": "start the launcher without taskset, or in a container with more CPUs",
-    "real-time limits": rf"printf '* - rtprio 99\n* - memlock unlimited\n' | {LIMITS}",
-}
-
-
-class Level(IntEnum):
-    """How bad a finding is."""
-
-    FINE = 0
-    UNKNOWN = 1  #: the computer does not state it
-    NOTE = 2  #: could be better, without an effect that was seen
-    WARNING = 3
-    FAULT = 4  #: no one may wear an arm that this computer controls
-
-
 STYLES = {Level.FINE: "green", Level.UNKNOWN: "dim", Level.NOTE: "", Level.WARNING: "yellow", Level.FAULT: "bold red"}
 
 
-class Finding(NamedTuple):
-    """One row. mend: the command that mends it, '' for none."""
-
-    what: str
-    found: str
-    wanted: str
-    level: Level = Level.FINE
-    mend: str = ""
-
-
-class Wakeups(NamedTuple):
-    """Wake-ups of a thread like the control loop's."""
-
-    lateness: np.ndarray  #: s after each cycle was due
-    nice: int  #: the nice value that it got
-    refused: tuple[str, ...] = ()  #: a sentence for each real-time setting that was asked for and is not permitted
-
-
-def judged(what: str, found: str, wanted: str, is_fine: bool, otherwise: Level, mend: str) -> Finding:
-    """Return a finding: FINE or `otherwise`; UNKNOWN where nothing was found."""
-    if not found:
-        return Finding(what, "not stated", wanted, Level.UNKNOWN)
-    return Finding(what, found, wanted) if is_fine else Finding(what, found, wanted, otherwise, mend)
-
-
-def _text(path: Path) -> str:
-    """Return the content of a file, '' if it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8").strip()
-    except OSError:
-        return ""
-
-
-def measured(period: float, seconds: float, priority: int) -> Wakeups:
-    """Run `measure` in a separate process, show its progress, and return its result."""
-    from rich.progress import track
-
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        wakeups = pool.submit(measure, period, seconds, priority)
-        for _ in track(range(100), f"Wake-ups at {1.0 / period:g} Hz", transient=True):
-            wait((wakeups,), seconds / 100.0)
-        return wakeups.result()
-
-
-def measure(period: float, seconds: float, priority: int) -> Wakeups:
-    """Return how late a thread wakes up that is paced and favoured like the control loop of can_bridge.
-
-    period: s. priority: `thread_priority`.
-    """
-    lateness = np.zeros(max(1, round(seconds / period)))
-    refused: list[str] = []
-    favour(20)
-
-    def run() -> None:
-        deadline = time.monotonic()
-        for cycle in range(len(lateness)):
-            deadline += period
-            time.sleep(max(0.0, deadline - time.monotonic()))
-            lateness[cycle] = time.monotonic() - deadline
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    request_real_time(priority, refused.append)
-    thread.join()
-    return Wakeups(lateness, os.getpriority(os.PRIO_PROCESS, 0), tuple(refused))
-
-
-def of_wakeups(wakeups: Wakeups, period: float, timeout: float) -> Finding:
-    """Judge the wake-ups of a loop with `period` (s), whose arm is let down after `timeout` (s) without efforts."""
-    late, worst = float(np.mean(wakeups.lateness >= period / 2.0)), float(np.max(wakeups.lateness))
-    p99 = float(np.percentile(wakeups.lateness, 99))
-    return judged(
-        f"wake-ups at {1.0 / period:g} Hz",
-        f"p99 {1e3 * p99:.3g} ms, worst {1e3 * worst:.3g} ms, {late:.2%} late",
-        f"{LATE:.1%} late by half a period, none by {500.0 * timeout:.0f} ms",
-        late <= LATE and worst < timeout / 2.0,
-        Level.FAULT if worst >= timeout else Level.WARNING,
-        "see the notes and warnings below; end other programs, or lower `rate`",
-    )
-
-
-def of_computer(root: Path, wakeups: Wakeups, period: float, is_late: bool, priority: int) -> list[Finding]:
-    """Judge what may delay a loop with `period` (s) and `thread_priority`; is_late: whether wake-ups were late.
-
-    root: the folder that has /proc and /sys.
-    """
-    delays = Level.WARNING if is_late else Level.NOTE
-    cpus = root / CPUS
-    version, clock = _text(root / "proc/version"), _text(root / CLOCKS / "current_clocksource")
-    real_time = _text(root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version
-    release = " ".join(version.split()[2:3])
-    governors = {_text(path) for path in cpus.glob("cpu[0-9]*/cpufreq/scaling_governor")}
-    permitted = [path for path in sorted(cpus.glob("cpu0/cpuidle/state*")) if _text(path / "disable") != "1"]
-    waking = {path.name: 1e-6 * float(_text(path / "latency") or 0) for path in permitted}  # s
-    deep = [f"/{CPUS}/cpu*/cpuidle/{state}/disable" for state, late in waking.items() if late > SLOW_WAKE * period]
-    idle = f"a CPU wakes up within {1e6 * max(waking.values()):.0f} µs" if waking else ""
-    cores = len(os.sched_getaffinity(0))
-    soft = (resource.getrlimit(which)[0] for which in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK))
-    rtprio, memlock = ("unlimited" if limit == resource.RLIM_INFINITY else f"{limit}" for limit in soft)
-    required = f"as thread_priority {priority} requires" if priority else "none, thread_priority is 0"
-    rows = [
-        ("kernel", version and f"{release}, {'' if real_time else 'not '}PREEMPT_RT", "PREEMPT_RT", real_time, delays),
-        ("CPU governor", ", ".join(sorted(governors)), "performance", governors == {"performance"}, delays),
-        ("idle states", idle, f"{1e6 * SLOW_WAKE * period:.0f} µs", not deep, delays),
-        ("clock source", clock, "tsc, or a virtual machine's", clock not in SLOW_CLOCKS, delays),
-        ("nice value", f"{wakeups.nice}", "-20", wakeups.nice == -20, delays),
-        ("CPUs for the nodes", f"{cores}", "2", cores > 1, Level.WARNING),
-        ("real-time limits", f"rtprio {rtprio}, memlock {memlock}", required, not wakeups.refused, Level.WARNING),
-    ]
-    return [judged(*row, MENDS[row[0]].format(deep=" ".join(deep))) for row in rows]
-
-
-def of_middleware(middleware: str, reach: str, opening: str) -> Iterator[Finding]:
-    """Judge ROS's settings. reach: the discovery range. opening: the setting that lets other hosts in, '' for none."""
-    mend = f"export RMW_IMPLEMENTATION={MIDDLEWARE}"
-    yield judged("middleware", middleware, MIDDLEWARE, middleware == MIDDLEWARE, Level.WARNING, mend)
-    if reach == "OFF":
-        mend = "unset EXO_GRAVITY_DISCOVERY_RANGE"
-        yield Finding("discovery", reach, "LOCALHOST: the nodes must find each other", Level.FAULT, mend)
-    else:
-        wanted = "LOCALHOST or SROS2: no other host may command the arm"
-        mend = f"unset {opening.partition('=')[0]}; or enforce SROS2, docs/security.md"
-        yield judged("discovery", opening or reach, wanted, not opening, Level.WARNING, mend)
-
-
-def of_multicast(is_needed: bool) -> Finding:
-    """Send a multicast datagram to this computer, and judge whether it arrives. is_needed: by a simulated bus."""
-    found = "arrives"
-    try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.bind(("", 0))
-            member = socket.inet_aton(GROUP) + socket.inet_aton("0.0.0.0")
-            sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
-            sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)  # not beyond this computer
-            sock.settimeout(1.0)
-            sock.sendto(b"doctor", (GROUP, sock.getsockname()[1]))
-            sock.recv(16)
-    except OSError as error:
-        found = f"{error.strerror or error}"
-    wanted, mend = "for udp_multicast" if is_needed else "not needed", "sudo ip route add 224.0.0.0/4 dev lo"
-    return judged("multicast", found, wanted, found == "arrives" or not is_needed, Level.FAULT, mend)
-
-
-def of_load(name: str, traffic: Traffic, rate: float) -> Finding:
-    """Judge the load of a bridge's bus at `rate` (Hz)."""
-    share, most = traffic.load(rate), int(REPLY_SHARE * traffic.largest_rate)
-    found = f"{share:.0%} at {rate:g} Hz, {traffic.load(rate, worst=True):.0%} at worst"
-    level = Level.FAULT if share > 1.0 else Level.WARNING
-    fine, mend = share <= 1.0 and not traffic.is_crowded(rate), f"set `rate` to {most} in the file"
-    return judged(f"{name}: bus load", found, f"{REPLY_SHARE:.0%}, 100% at worst", fine, level, mend)
-
-
-def of_interface(name: str, root: Path, bitrate: int, frames: int) -> Iterator[Finding]:
-    """Judge a SocketCAN interface by /sys below `root` and by what `ip` reports.
-
-    bitrate: bit/s that the parameter file states. frames: those sent until a silent motor is noticed: a shorter queue
-    overflows before, and hides which motor it was.
-    """
-    folder = root / "sys/class/net" / name
-    if not folder.exists():
-        yield Finding(name, "no such interface", "a CAN interface", Level.FAULT, "plug the adapter in; ip link")
-        return
-    info = _link(name).get("linkinfo", {})
-    data, is_virtual = info.get("info_data", {}), info.get("info_kind") == "vcan"
-    is_up, state, wanted = int(_text(folder / "flags") or "0", 16) & IFF_UP, data.get("state", ""), "ERROR-ACTIVE"
-    up = f"sudo ip link set {name} up" if is_virtual else UP.format(name, bitrate)
-    if not is_up or state in ("BUS-OFF", "STOPPED"):
-        yield Finding(f"{name}: state", state if is_up else "down", wanted, Level.FAULT, up)
-        return
-    if is_virtual:
-        yield Finding(f"{name}: state", "up, virtual", "up")
-        return
-    mend = f"check bit rate, termination and plugs, docs/wiring.md; then {up}"
-    yield judged(f"{name}: state", state, wanted, state == wanted, Level.WARNING, mend)
-    queue, mend = int(_text(folder / "tx_queue_len") or 0), f"sudo ip link set {name} txqueuelen 1000"
-    yield judged(f"{name}: txqueuelen", f"{queue}", f"{frames}", queue >= frames, Level.WARNING, mend)
-    actual, restart = data.get("bittiming", {}).get("bitrate"), data.get("restart_ms", 0)
-    found, wanted = f"{actual} bit/s" if actual else "", f"{bitrate} bit/s"
-    yield judged(f"{name}: bit rate", found, wanted, actual == bitrate, Level.FAULT, up)
-    found = f"after {restart} ms" if restart else "never"
-    yield judged(f"{name}: restart", found if data else "", "after 100 ms", restart > 0, Level.WARNING, up)
-
-
-def _link(name: str) -> Mapping[str, Any]:
-    """Return what `ip` reports about an interface, {} if it reports nothing."""
-    try:
-        command = ["ip", "-json", "-details", "link", "show", name]
-        links = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=5.0).stdout)
-    except (OSError, ValueError, subprocess.SubprocessError):
-        return {}
-    return dict(links[0]) if links else {}
-
-
-def of_port(port: str, root: Path) -> Finding:
-    """Judge a serial port, whose USB adapter may keep bytes for some time."""
-    device = (root / port.partition("@")[0].lstrip("/")).resolve()
-    if not device.exists():
-        return Finding(port, "no such port", "a serial port", Level.FAULT, "plug it in; ls /dev/serial/by-id")
-    timer = f"sys/bus/usb-serial/devices/{device.name}/latency_timer"
-    latency = _text(root / timer)
-    found, fine = f"{latency} ms" if latency else "none", latency in ("", "1")
-    return judged(f"{port}: latency", found, "1 ms", fine, Level.WARNING, f"echo 1 | sudo tee /{timer}")
-
-
-def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path) -> Iterator[Finding]:
-    """Judge the bus of each bridge, and each serial port. Raises ParameterError where a bridge would refuse its values.
-
-    bridges: the parameter values of each by its full name.
-    """
-    for node, values in bridges.items():
-        with named(f"{node} "):
-            rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
-            for bus in buses.values():
-                check_bridge(rate, motors_of(values), limits, bus.status_rate)
-        for channel, bus in buses.items():
-            yield of_load(f"{node} {channel}", bus, rate)
-            if values["can.interface"] == "socketcan":
-                frames = round((bus.replying + bus.reporting) * limits.reply_timeout * rate)
-                yield from of_interface(channel, root, bus.bitrate, frames)
-    ports = (str(given.get(key, "")) for given in nodes.values() for key in ("can.channel", "serial.port"))
-    for port in sorted({port.strip() for names in ports for port in names.split(",")}):
-        if port.startswith("/dev/"):
-            yield of_port(port, root)
-
-
-def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
-    """Return every finding; seconds: for which wake-ups are measured. Raises ParameterError."""
-    from exo_gravity.nodes.ros.run import keep_to_this_machine, open_to_others
-
-    check_buses(nodes)
-    bridges = {node: node_values(nodes, node, CAN_BRIDGE) for node in stages(nodes)[0]}
-    buses = list(of_buses(nodes, bridges, root))
-    settings = list(bridges.values()) or [{param.name: param.default for param in CAN_BRIDGE}]
-    period, priority = 1.0 / max(s["rate"] for s in settings), max(s["thread_priority"] for s in settings)
-    timeout = min(FROZEN, *(s["command_timeout"] for s in settings))
-    wakeups = measured(period, seconds, priority)
-    late = of_wakeups(wakeups, period, timeout)
-    keep_to_this_machine()
-    middleware, reach = os.environ.get("RMW_IMPLEMENTATION"), os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
-    return [
-        late,
-        *of_computer(root, wakeups, period, late.level > Level.FINE, priority),
-        *of_middleware(middleware or MIDDLEWARE, reach, open_to_others()),
-        of_multicast(any(s["can.interface"] == "udp_multicast" for s in settings)),
-        *buses,
-    ]
-
-
 def show(findings: Sequence[Finding], console: "Console") -> None:
-    """Print each finding, and below it the command that mends it, unwrapped."""
+    """Print each finding, and below it the command that fixes it, unwrapped."""
     heading = Finding("what", "found", "wanted")
     rows = (heading, *findings)
     what, found = max(len(row.what) for row in rows), max(len(row.found) for row in rows)
@@ -327,8 +32,8 @@ def show(findings: Sequence[Finding], console: "Console") -> None:
         level, style = ("", "bold") if row is heading else (row.level.name.lower(), STYLES[row.level])
         line = f"{level:<7}  {row.what:<{what}}  {row.found:<{found}}  {row.wanted}"
         console.print(line, style=style, markup=False, soft_wrap=True)
-        if row.mend:
-            console.print(f"{'':<7}  -> {row.mend}", markup=False, highlight=False, soft_wrap=True)
+        if row.remedy:
+            console.print(f"{'':<7}  -> {row.remedy}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:

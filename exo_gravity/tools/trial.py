@@ -28,12 +28,12 @@ from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.processes import stop_on_signals
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools.cli import extras
-from exo_gravity.tools.launcher import stop_on_signals
 
 if TYPE_CHECKING:
     from rich.console import Console

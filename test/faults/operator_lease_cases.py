@@ -19,7 +19,7 @@ import rclpy
 from diagnostic_msgs.msg import KeyValue
 from rclpy.signals import SignalHandlerOptions
 
-from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine
 
 from ..support import ROOT
 from .actions import send_signal

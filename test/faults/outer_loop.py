@@ -16,8 +16,8 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support import CONFIG
 

@@ -16,8 +16,8 @@ import yaml
 
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
 from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.lab.processes import Launcher
 from exo_gravity.tools import launcher
-from exo_gravity.tools.launcher import Launcher
 
 CONFIG = Path(__file__).parents[2] / "config" / "sim.yaml"
 VCAN = ("socketcan", "vcan0")

@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation import guidance
-from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine
 
 from ..support.compensator_rig import CompensatorRig
 from ..support.joint_state_feeder import PARTS, POSE

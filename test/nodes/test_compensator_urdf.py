@@ -17,9 +17,9 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation import compensator, guidance
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
-from exo_gravity.nodes.ros.run import keep_to_this_machine
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 from ..support.compensator_rig import CompensatorRig

@@ -14,9 +14,9 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.time import Time
 
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.imu import ImuDevice, ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
-from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..hardware.virtual_time import VirtualClock
 from ..support.fake_imu.chip import G

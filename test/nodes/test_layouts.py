@@ -21,8 +21,8 @@ from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from exo_gravity.lab.inputs.arms import configured_arms
+from exo_gravity.lab.processes import node_modules
 from exo_gravity.lab.view.urdf import ROOT
-from exo_gravity.tools.launcher import node_modules
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG

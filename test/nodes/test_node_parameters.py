@@ -9,9 +9,9 @@ import pytest
 import rclpy
 from rclpy.node import Node
 
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
-from exo_gravity.nodes.ros.run import keep_to_this_machine
 
 from ..support.waiting import wait_until
 

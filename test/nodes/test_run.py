@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.nodes.ros import run
-from exo_gravity.nodes.ros.run import handle_signals, keep_to_this_machine, open_to_others
+from exo_gravity.hardware import network
+from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
+from exo_gravity.nodes.ros.run import handle_signals
 
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 NAMES = (RANGE, ROS_RANGE, "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
-LOOPBACK = str(Path(run.__file__).with_name("fastdds.xml"))
+LOOPBACK = str(Path(network.__file__).with_name("fastdds.xml"))
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 
 

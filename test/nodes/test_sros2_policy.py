@@ -22,7 +22,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.storage import Storage
-from exo_gravity.tools.launcher import Launcher
+from exo_gravity.lab.processes import Launcher
 
 from ..support import CONFIG
 from ..support.launched_nodes import PORTS

@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
-from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers
 
 from ..support.waiting import pause, wait_until

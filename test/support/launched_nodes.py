@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from exo_gravity.hardware.ownership.bus_lock import notes_file
-from exo_gravity.tools.launcher import Launcher
+from exo_gravity.lab.processes import Launcher
 
 from . import CONFIG
 from .ports import own_ports

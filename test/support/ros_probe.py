@@ -18,7 +18,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
-from exo_gravity.nodes.ros.run import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine
 
 from . import CONFIG
 from .node_thread import NodeThread

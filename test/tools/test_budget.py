@@ -36,7 +36,7 @@ def run(tmp_path, capsys):
 def plain(monkeypatch):
     """Figures take longest: draw blank ones in tests that do not look at them."""
     blank = Figure(figsize=(1, 1))
-    monkeypatch.setattr("exo_gravity.tools.budget._joint_figure", lambda *_: blank)
+    monkeypatch.setattr("exo_gravity.tools.budget.joint_figure", lambda *_: blank)
 
 
 @pytest.mark.usefixtures("plain")

@@ -10,8 +10,9 @@ import pytest
 import yaml
 
 from exo_gravity.core.motors.joint_motor import Traffic
+from exo_gravity.lab import computer as settings
+from exo_gravity.lab.computer import Finding, Level, Wakeups
 from exo_gravity.tools import doctor
-from exo_gravity.tools.doctor import Finding, Level, Wakeups
 
 CONFIG = Path(__file__).parents[2] / "config"
 IN_TIME = Wakeups(np.full(2500, 1e-4), -20)
@@ -26,7 +27,7 @@ def wakeups(late: int, by: float) -> Wakeups:
 
 
 def of_computer(root: Path, is_late: bool = False, woken: Wakeups = IN_TIME, priority: int = 0):
-    return {row.what: row for row in doctor.of_computer(root, woken, 0.004, is_late, priority)}
+    return {row.what: row for row in settings.of_computer(root, woken, 0.004, is_late, priority)}
 
 
 def tells(root: Path, link: object) -> None:
@@ -35,7 +36,7 @@ def tells(root: Path, link: object) -> None:
 
 
 def of_interface(root: Path, bitrate: int = 1_000_000):
-    rows = list(doctor.of_interface("can1", root, bitrate, 50))
+    rows = list(settings.of_interface("can1", root, bitrate, 50))
     return {row.what: row for row in rows if row.level}, max(row.level for row in rows)
 
 
@@ -86,8 +87,8 @@ def computer(tmp_path, monkeypatch):
     ],
 )
 def test_wake_ups_are_judged_by_how_many_are_late_and_by_the_worst(late: int, by: float, level: Level):
-    row = doctor.of_wakeups(wakeups(late, by), 0.004, 0.05)
-    assert row.level is level and bool(row.mend) == bool(level)
+    row = settings.of_wakeups(wakeups(late, by), 0.004, 0.05)
+    assert row.level is level and bool(row.remedy) == bool(level)
 
 
 def test_a_computer_that_could_not_be_better_gets_no_advice(computer):
@@ -120,14 +121,14 @@ def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate(
     (computer / f"{CPU}/cpu0/cpuidle/state2/disable").write_text("0")
     row = of_computer(computer)["idle states"]
     assert row.found == "a CPU wakes up within 410 µs"
-    assert row.mend == "echo 1 | sudo tee /sys/devices/system/cpu/cpu*/cpuidle/state2/disable"
+    assert row.remedy == "echo 1 | sudo tee /sys/devices/system/cpu/cpu*/cpuidle/state2/disable"
 
 
 def test_limits_matter_only_where_a_thread_priority_is_asked_for(computer):
     refused = IN_TIME._replace(refused=("thread_priority 50 is not permitted",))
     assert of_computer(computer)["real-time limits"].level is Level.FINE
     row = of_computer(computer, woken=refused, priority=50)["real-time limits"]
-    assert row.level is Level.WARNING and "rtprio 99" in row.mend
+    assert row.level is Level.WARNING and "rtprio 99" in row.remedy
     assert of_computer(computer, priority=50)["real-time limits"].level is Level.FINE
 
 
@@ -147,19 +148,19 @@ def test_one_cpu_is_too_few(computer, monkeypatch):
     ],
 )
 def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str, opening: str, level: Level):
-    assert max(row.level for row in doctor.of_middleware(middleware, reach, opening)) is level
+    assert max(row.level for row in settings.of_middleware(middleware, reach, opening)) is level
 
 
 def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
-    assert doctor.of_multicast(True).level is Level.FINE
-    monkeypatch.setattr(doctor, "GROUP", "10.0.0.1")  # no multicast address: refused
-    assert doctor.of_multicast(True).level is Level.FAULT and doctor.of_multicast(False).level is Level.FINE
+    assert settings.of_multicast(True).level is Level.FINE
+    monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
+    assert settings.of_multicast(True).level is Level.FAULT and settings.of_multicast(False).level is Level.FINE
 
 
 @pytest.mark.parametrize(("rate", "level"), [(250, Level.FINE), (900, Level.WARNING), (1100, Level.FAULT)])
 def test_the_bus_load_at_the_wanted_rate(rate: float, level: Level):
-    row = doctor.of_load("/right/can_bridge", Traffic(4), rate)
-    assert row.level is level and ("826" in row.mend) == bool(level)  # the table of docs/wiring.md
+    row = settings.of_load("/right/can_bridge", Traffic(4), rate)
+    assert row.level is level and ("826" in row.remedy) == bool(level)  # the table of docs/wiring.md
 
 
 def test_an_interface_as_docs_first_arming_sets_it_up_is_fine(computer):
@@ -178,14 +179,14 @@ def test_an_interface_as_docs_first_arming_sets_it_up_is_fine(computer):
 def test_what_ip_reports_of_an_interface(computer, change, what: str, level: Level, command: str):
     tells(computer, {"linkinfo": {"info_data": {**LINK["linkinfo"]["info_data"], **change}}})
     bad, worst = of_interface(computer)
-    assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].mend
+    assert list(bad) == [f"can1: {what}"] and worst is level and command in bad[f"can1: {what}"].remedy
 
 
 def test_an_interface_that_is_missing_or_down_and_a_queue_that_overflows_before_the_fault_is_noticed(computer):
     folder = computer / "sys/class/net/can1"
     (folder / "tx_queue_len").write_text("10\n")
     bad, worst = of_interface(computer)
-    assert worst is Level.WARNING and bad["can1: txqueuelen"].mend == "sudo ip link set can1 txqueuelen 1000"
+    assert worst is Level.WARNING and bad["can1: txqueuelen"].remedy == "sudo ip link set can1 txqueuelen 1000"
     (folder / "flags").write_text("0x40040\n")
     assert of_interface(computer)[1] is Level.FAULT
     shutil.rmtree(folder)
@@ -200,7 +201,7 @@ def test_without_ip_the_state_is_unknown_and_a_virtual_interface_has_none(comput
     (computer / "sys/class/net/can1/tx_queue_len").write_text("0\n")
     assert of_interface(computer) == ({}, Level.FINE)
     (computer / "sys/class/net/can1/flags").write_text("0x40040\n")
-    assert of_interface(computer)[0]["can1: state"].mend == "sudo ip link set can1 up"
+    assert of_interface(computer)[0]["can1: state"].remedy == "sudo ip link set can1 up"
 
 
 @pytest.fixture
@@ -208,7 +209,7 @@ def run(computer, monkeypatch, capsys):
     """Run doctor there, with wake-ups in time or as given; return its code and text."""
 
     def run(*arguments: object, woken: Wakeups = IN_TIME):
-        monkeypatch.setattr(doctor, "measured", lambda *_: woken)
+        monkeypatch.setattr(settings, "measured", lambda *_: woken)
         code = doctor.main([*map(str, arguments)], computer)
         output = capsys.readouterr()
         return code, output.out + output.err
@@ -253,7 +254,7 @@ def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
 
 
 def test_it_measures_in_a_separate_process_at_the_rate_of_the_file():
-    woken = doctor.measured(0.01, 0.2, 0)
+    woken = settings.measured(0.01, 0.2, 0)
     assert woken.lateness.shape == (20,) and (woken.lateness > -1e-6).all() and not woken.refused
 
 

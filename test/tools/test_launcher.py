@@ -16,16 +16,9 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.inputs.parameter_file import load, stages
+from exo_gravity.lab.processes import chosen, command_of, in_namespace, node_modules, stop_on_signals
 from exo_gravity.tools import launcher
-from exo_gravity.tools.launcher import (
-    chosen,
-    command_of,
-    in_namespace,
-    main,
-    node_modules,
-    stop_on_signals,
-    stop_with_owner,
-)
+from exo_gravity.tools.launcher import main, stop_with_owner
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"

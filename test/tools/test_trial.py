@@ -17,7 +17,8 @@ import pytest
 import yaml
 from rosbags.rosbag2 import Reader
 
-from exo_gravity.tools import launcher, report, trial
+from exo_gravity.lab import processes
+from exo_gravity.tools import report, trial
 from exo_gravity.tools.trial import main
 
 from ..support import csv_rows
@@ -174,7 +175,7 @@ def test_a_wrong_parameter_ends_with_exit_code_2_one_sentence_and_no_folder(run,
 @pytest.mark.usefixtures("without_pictures")
 def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
     def stop_on_signals() -> threading.Event:
-        stopped = launcher.stop_on_signals()
+        stopped = processes.stop_on_signals()
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         return stopped
 

@@ -30,7 +30,7 @@ from exo_gravity.lab.calibration.recorded import messages_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.tools.launcher import Launcher
+from exo_gravity.lab.processes import Launcher
 
 NODE = "/imu"
 IMU_TYPE = "sensor_msgs/msg/Imu"

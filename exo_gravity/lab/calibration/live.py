@@ -28,7 +28,7 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.tools.launcher import Launcher, stop_on_signals
+from exo_gravity.lab.processes import Launcher, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 REFRESH_PERIOD = 0.1  # s, of what the person is shown

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.lab.bag.content import Bag
-from exo_gravity.tools.cli import missing
+from exo_gravity.lab.packages import missing
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -24,10 +24,10 @@ from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.lab.inputs.parameter_file import load, stages
+from exo_gravity.lab.processes import Launcher, Stopping
 from exo_gravity.lab.trial.screen import LEAD, TrialScreen
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.tools.launcher import Launcher, Stopping
 
 RECORDER = "/recorder"
 START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder runs

@@ -31,11 +31,12 @@ from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
 from exo_gravity.nodes.ros.parameters import bus_of, declare
-from exo_gravity.nodes.ros.run import keep_to_this_machine, run
+from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s

@@ -1,0 +1,137 @@
+"""What an arm requires of its motors to carry its wearer's arm: a table, a verdict, and a map for each joint.
+
+Over all poses within the joint limits and over the trunk's tilt. Holding an arm up is continuous work, so rated torque
+decides; peak torque lasts for seconds.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.budget import (
+    JointBudget,
+    budget,
+    largest_support,
+    motor_for,
+    motor_torques,
+    torque_at,
+    workspace,
+)
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.errors import named
+from exo_gravity.lab.inputs.arms import ConfiguredArm
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
+HEADINGS = (
+    ("", "", "rated", "peak", "needs", "within", "within", "", "support", "motor that"),
+    ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated", "would do"),
+)
+LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}{:>12}"
+CELLS = 31  # of a map, along each axis
+REST = 5  # values of each angle that a map does not show
+OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
+
+
+@dataclass(frozen=True)
+class ArmBudget:
+    """What each joint of an arm needs to carry its wearer's arm."""
+
+    name: str  #: of the arm's namespace
+    carrying: ArmModel  #: with its share of the wearer's arm
+    support: float  #: 0..1, that share
+    motors: Sequence[str]
+    bounds: np.ndarray  #: of its workspace, (2, 6) rad
+    joints: tuple[JointBudget, ...]
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether a joint needs more than rated torque somewhere."""
+        return any(joint.torque > joint.rated for joint in self.joints)
+
+
+def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
+    """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
+
+    max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
+    """
+    motors = configured.can_bridge["motor"]
+    robot = configured.robot.with_payload(payload, configured.compensator["payload.cog"])
+    bounds = workspace(configured.low, configured.high, max_tilt)
+    with named(f"{configured.namespace}/compensator "):
+        load = wearer.on_links(robot.length)
+        torques = motor_torques(motors, configured.can_bridge["torque_scale"])
+        joints = budget(robot, load, support, bounds, *torques)
+        carrying = robot.with_wearer(*load, support)
+    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
+
+
+def table_lines(arm: ArmBudget) -> Iterator[str]:
+    """Yield the lines of a table with one row per joint."""
+    yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
+    for number, joint in enumerate(arm.joints):
+        *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
+        yield LINE.format(
+            f"{number + 1} {JOINTS[number]}",
+            arm.motors[number],
+            f"{joint.rated:.3g}",
+            f"{joint.peak:.3g}",
+            f"{joint.torque:.2f}",
+            f"{100 * joint.within_rated:.1f} %",
+            f"{100 * joint.within_peak:.1f} %",
+            f"{', '.join(pose)}; {pitch}, {roll}",
+            "none" if joint.support is None else f"{joint.support:.3f}",
+            motor_for(joint.torque) or "none",
+        )
+
+
+def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
+    """Yield the conclusion on `what` the arms `names` carry, the support that fits, and can_bridge's parameter."""
+    if arm.is_beyond:
+        yield f"{what} is beyond the motors of {names}."
+        yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
+        yield "The wearer can hardly move an AK80-64 by hand: its gear is 64:1."
+    else:
+        yield f"{what} is within rated torque everywhere on {names}."
+    fits = largest_support(arm.joints)
+    if fits is None:
+        yield "The robot alone needs more than rated torque somewhere: no support stays within it."
+    else:
+        yield f"The largest support within rated torque everywhere is {fits:g}."
+    moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
+    yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
+
+
+def joint_figure(arm: ArmBudget, joint: int) -> "Figure":
+    """Map the largest torque of a joint (0..3) over two angles: the maximum over the others and the trunk's tilt."""
+    from matplotlib.figure import Figure
+
+    other = OTHER[joint]
+    axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
+    axes[joint] = axes[other] = np.zeros(1)
+    rest = np.vstack((list(product(*axes)), arm.joints[joint].worst))
+    across, up = (np.linspace(low, high, CELLS) for low, high in arm.bounds.T[[joint, other]])
+    points = np.tile(rest, (CELLS * CELLS, 1))
+    grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+    points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
+    torque = np.abs(torque_at(arm.carrying, points)[:, joint])
+    largest = torque.reshape(CELLS, CELLS, len(rest)).max(axis=-1)
+    figure = Figure(figsize=(6.5, 5.2), layout="constrained")
+    axis = figure.subplots()
+    angles = np.degrees(across), np.degrees(up)
+    mesh = axis.pcolormesh(*angles, largest, cmap="cividis", vmin=0.0, shading="gouraud")
+    figure.colorbar(mesh, ax=axis, label=f"Largest torque at support {arm.support:g} (Nm)")
+    for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
+        if largest.min() < limit < largest.max():
+            axis.clabel(axis.contour(*angles, largest, [limit], colors="red", linestyles=style), fmt=f"{limit:g} Nm")
+    axis.set_title(f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}", loc="left", weight="bold")
+    axis.set_xlabel(f"Joint {joint + 1} (deg)")
+    axis.set_ylabel(f"Joint {other + 1} (deg); maximum over the other joints and the trunk's tilt")
+    return figure

@@ -1,0 +1,250 @@
+"""The processes of a parameter file: starts one per top-level key, watches them, and stops them.
+
+    /right/can_bridge  ->  the executable `can_bridge`, as node `can_bridge` in the namespace /right
+
+The bridges stop first, because they need the other nodes while they let the arms down. If this process dies, the nodes
+stop by themselves: each watches its standard input, whose other end `Launcher` holds.
+
+If a bridge dies, its watchdog lets the arm down. If both die, the bridge's executable is started once more, to let the
+arm down and nothing else.
+"""
+
+import _thread
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from subprocess import PIPE, STDOUT
+
+import yaml
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.lab.inputs.parameter_file import Loader, check_buses, load, stages
+
+NODES_PACKAGE = "exo_gravity.nodes."
+ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
+# What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
+PROGRAM = """import sys
+sys.path = [*filter(None, sys.path)]
+sys.argv[0] = {name!r}
+from {module} import main
+sys.exit(main())
+"""
+WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
+RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
+STOP_TIMEOUT = 5.0  # s for any other node to end
+SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node then ends with its standard input
+# Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
+RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
+ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+# A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
+OBSERVERS = ("/recorder", "/robot_model", "/panel")
+ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
+LOG_FORMAT = "{severity} {message}"
+
+Stopping = threading.Event
+
+
+def node_modules() -> dict[str, str]:
+    """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
+    try:
+        scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
+    except PackageNotFoundError:
+        return {}
+    return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
+
+
+def command_of(node: str, module: str = "") -> list[str]:
+    """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
+
+    module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
+    too.
+    """
+    name, modules = node.rpartition("/")[2], node_modules()
+    if name not in modules:
+        raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
+    return [sys.executable, "-c", PROGRAM.format(name=name, module=module or modules[name])]
+
+
+def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
+    """Return the `nodes` that match one of the shell patterns `only`; without patterns, all.
+
+    A pattern is compared with the full name: `/right/*`, `*/compensator`. Raises ParameterError if one matches no node.
+    """
+    names = list(nodes)
+    for pattern in only:
+        if not any(fnmatchcase(node, pattern) for node in names):
+            raise ParameterError("only", pattern, f"a pattern that matches one of {', '.join(names)}")
+    return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
+
+
+def in_namespace(params: Path, namespace: str) -> Path:
+    """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
+    if not namespace:
+        return params
+    content = yaml.load(params.read_text(encoding="utf-8"), Loader)
+    path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), params.name)
+    path.write_text(yaml.safe_dump({f"{namespace}{node}": entry for node, entry in content.items()}), encoding="utf-8")
+    return path
+
+
+class Launcher:
+    """The processes of one parameter file.
+
+    on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
+    starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
+    in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
+    compensator of an arm share one. Raises ParameterError.
+    """
+
+    def __init__(
+        self,
+        params: str | Path,
+        on_line: Callable[[str, str], None],
+        only: Sequence[str] = (),
+        more: Sequence[str] = (),
+        namespace: str = "",
+        log_level: str = "info",
+        one_process: bool = False,
+    ) -> None:
+        self._path = Path(params).resolve()
+        nodes = {**{node: {} for node in more}, **load(self._path)}
+        check_buses(nodes)
+        self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
+        names = chosen(nodes, only)
+        pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
+        # The compensator that shares the process of its can_bridge
+        self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}
+        self._commands = {node: self._command(node) for node in names if node not in self._guests.values()}
+        self._processes: dict[str, subprocess.Popen[str]] = {}
+        self._readers: dict[str, threading.Thread] = {}
+        self._on_line = on_line
+        self.maybe_powered: list[str] = []
+
+    def start(self) -> None:
+        """Start every node."""
+        for node in self._commands:
+            self._processes[node], self._readers[node] = self._start(node, SUPERVISED)
+
+    def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
+        """Start one node with more environment `variables`; return its process and the reader of its log."""
+        log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
+        environment = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": log_format, **os.environ, **variables}
+        process = subprocess.Popen(
+            self._commands[node], env=environment, stdin=PIPE, stdout=PIPE, stderr=STDOUT, text=True, errors="replace",
+            start_new_session=True,  # Ctrl-C in the terminal reaches only the launcher
+        )  # fmt: skip
+        reader = threading.Thread(target=self._read, args=(node, process), daemon=True)
+        reader.start()
+        return process, reader
+
+    def process(self, node: str) -> subprocess.Popen[str]:
+        """Return the process of a node by its full name."""
+        host = next((host for host, guest in self._guests.items() if guest == node), node)
+        return self._processes[host]
+
+    def exit_code(self, node: str) -> int | None:
+        """Return the exit code of a node that was started and has ended, else None."""
+        return self._processes[node].poll() if node in self._processes else None
+
+    def dead(self) -> tuple[str, int] | None:
+        """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
+        codes = ((node, self.exit_code(node)) for node in list(self._processes) if not node.endswith(OBSERVERS))
+        return next(((node, code) for node, code in codes if code is not None), None)
+
+    def stop(self) -> None:
+        """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
+
+        Sets `maybe_powered` to the bridges whose motors may still be on.
+        """
+        bridges, others, recorders = stages(self._processes)
+        self._terminate(bridges, DESCENT_TIMEOUT)
+        self.maybe_powered = [node for node in bridges if not self._is_off(node)]
+        self._terminate(others, STOP_TIMEOUT)
+        self._terminate(recorders, STOP_TIMEOUT)
+
+    def _terminate(self, nodes: list[str], timeout: float) -> None:
+        """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""
+        processes = [self._processes[node] for node in nodes]
+        for process in processes:
+            if process.poll() is None:
+                process.terminate()  # SIGTERM: SIGINT would print a traceback in a node that is still importing
+        deadline = time.monotonic() + timeout
+        for process in processes:
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for node in nodes:
+            if self.exit_code(node) in ENDED_WELL:
+                self._readers[node].join(STOP_TIMEOUT)
+
+    def _is_off(self, node: str) -> bool:
+        """Return whether the motors of a bridge that has ended are off; let its arm down if nothing else has.
+
+        The bridge's executable waits for the watchdog of the dead bridge, and lets the arm down if that has died too.
+        """
+        if self.exit_code(node) in ENDED_WELL:
+            return True
+        recovery, reader = self._start(node, RECOVERY)
+        try:
+            return recovery.wait(RECOVERY_TIMEOUT) == 0
+        except subprocess.TimeoutExpired:
+            recovery.kill()
+            return False
+        finally:
+            reader.join(STOP_TIMEOUT)
+
+    def run(self, stopping: Stopping) -> tuple[str, int] | None:
+        """Run the nodes until `stopping` is set or one ends; return the name and exit code of the one that ended."""
+        try:
+            self.start()
+            while not stopping.wait(0.05):
+                dead = self.dead()
+                if dead:
+                    return dead
+            return None
+        finally:
+            self.stop()
+
+    def _command(self, node: str) -> list[str]:
+        if guest := self._guests.get(node):
+            return [*command_of(node, ONE_PROCESS), *self._words(node), "--", *self._words(guest)]
+        return [*command_of(node), *self._words(node)]
+
+    def _words(self, node: str) -> list[str]:
+        node = f"{self._namespace}{node}"
+        namespace, name = node.rsplit("/", 1)
+        topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
+        remaps = [word for rule in (f"__node:={name}", f"__ns:={namespace or '/'}", *topics) for word in ("-r", rule)]
+        options = ("--enclave", node, "--params-file", str(self._path), "--log-level", self._log_level)
+        return ["--ros-args", *remaps, *options]
+
+    def _read(self, node: str, process: subprocess.Popen[str]) -> None:
+        names = (node, self._guests[node]) if node in self._guests else ()
+        loggers = {f"{self._namespace}{name}"[1:].replace("/", "."): name for name in names}
+        for line in process.stdout or ():
+            logger, _, rest = line.partition(" ")
+            name, text = (loggers[logger], rest) if logger in loggers else (node, line)
+            with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block
+                self._on_line(name, text.rstrip())
+
+
+def stop_on_signals() -> Stopping:
+    """Return an event that Ctrl-C, SIGTERM or a closed terminal sets; nohup keeps SIGHUP away."""
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+            # On a thread, which waits where the handler interrupts a holder of the event's lock.
+            signal.signal(number, lambda *_: _thread.start_new_thread(stopping.set, ()))
+    return stopping
