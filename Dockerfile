@@ -26,7 +26,7 @@ RUN apt-get update \
 
 # From PyPI: the simulator, the reports, the operator's page, orientation filter and I2C. NumPy stays
 # Ubuntu's, against which ROS's messages are compiled.
-COPY constraints/ros.txt constraints.txt
+COPY .ci/constraints/ros.txt constraints.txt
 RUN python3 -m pip install --no-cache-dir --break-system-packages --constraint constraints.txt \
     mcap mujoco rich rosbags smbus2 starlette uvicorn vqf websockets
 
@@ -34,6 +34,7 @@ COPY . src/exo_gravity
 RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravity
 
 # For a terminal of its own: source /workspace/install/setup.bash
-COPY --chmod=755 docker/entrypoint.sh /entrypoint.sh
-ENTRYPOINT ["/entrypoint.sh"]
+# A command runs with ROS 2 and this package sourced; the package's own commands are found by their names.
+ENV PATH="/workspace/install/exo_gravity/lib/exo_gravity:$PATH"
+ENTRYPOINT ["/bin/bash", "-c", "source /workspace/install/setup.bash && exec \"$@\"", "--"]
 CMD ["launcher"]

@@ -1,14 +1,25 @@
-"""Each test run has its own ROS domain, and its nodes communicate on this machine only."""
+"""What holds for every test: a ROS domain of its own on this machine alone, and which tests `colcon test` runs.
+
+A ROS host has what package.xml names; MuJoCo, Pinocchio and others come from PyPI alone. Under colcon, which sets
+COLCON=1, a test file that needs a missing package is therefore left out, and the end of the run lists those packages.
+Elsewhere (`make test`) a missing package is an error.
+"""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
 from exo_gravity.hardware.clock import favour
 
 from .support.ports import own_domain
+from .support.selection import missing_packages
+
+UNDER_COLCON = "COLCON" in os.environ
+left_out: Counter[str] = Counter()
 
 os.environ["ROS_DOMAIN_ID"] = str(own_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
@@ -22,7 +33,29 @@ def machine() -> None:
     favour(5)  # what a test receives is in time
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Leave out the tests that need a quiet machine, unless `-m` selects others."""
+    if UNDER_COLCON and not config.option.markexpr:
+        config.option.markexpr = "not real_time"
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Leave out a test file, or a folder's conftest.py with the folder, that needs a missing package."""
+    file = collection_path / "conftest.py" if collection_path.is_dir() else collection_path
+    if not UNDER_COLCON or file == Path(__file__) or file.suffix != ".py" or not file.is_file():
+        return None
+    missing = missing_packages(file)
+    left_out.update(missing)
+    return True if missing else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if isinstance(item, pytest.Function) and item.get_closest_marker("real_time"):
             item.fixturenames.insert(0, "machine")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """List the packages whose absence left tests out."""
+    for package, files in sorted(left_out.items()):
+        terminalreporter.write_line(f"not installed: {package}, which {files} test files or folders need")

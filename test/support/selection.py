@@ -1,31 +1,20 @@
-"""Which tests `colcon test` runs: those whose packages are installed, without the ones that need a quiet machine.
-
-A ROS host has what package.xml names; MuJoCo, Pinocchio and others come from PyPI alone. Under colcon, which sets
-COLCON=1, a test file that needs a missing package is therefore left out, and the end of the run lists those packages.
-Elsewhere (`make test`) a missing package is an error.
-"""
+"""Which packages a test file needs: what it imports, what that imports, and what it starts as a process."""
 
 from __future__ import annotations
 
 import ast
-import os
 import re
-from collections import Counter
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-import pytest
+from . import ROOT
 
-ROOT = Path(__file__).parent
-UNDER_COLCON = "COLCON" in os.environ
 # What a file starts as a process or by its path needs its packages too.
 STARTS = {
     "test/support/launched_nodes.py": ("exo_gravity.nodes.simulator", "exo_gravity.nodes.imu"),
-    "test/test_docs.py": ("docs.tables",),
     "test/test_examples.py": ("examples.simulated_loop", "examples.emg_assistance", "examples.teach_and_repeat"),
 }
-left_out: Counter[str] = Counter()
 
 
 def imports(path: Path) -> tuple[str, ...]:
@@ -75,25 +64,3 @@ def missing_packages(path: Path) -> set[str]:
         todo += more - files
         files |= more
     return missing
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Leave out the tests that need a quiet machine, unless `-m` selects others."""
-    if UNDER_COLCON and not config.option.markexpr:
-        config.option.markexpr = "not real_time"
-
-
-def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out a test file, or a folder's conftest.py with the folder, that needs a missing package."""
-    file = collection_path / "conftest.py" if collection_path.is_dir() else collection_path
-    if not UNDER_COLCON or file == Path(__file__) or file.suffix != ".py" or not file.is_file():
-        return None
-    missing = missing_packages(file)
-    left_out.update(missing)
-    return True if missing else None
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """List the packages whose absence left tests out."""
-    for package, files in sorted(left_out.items()):
-        terminalreporter.write_line(f"not installed: {package}, which {files} test files or folders need")

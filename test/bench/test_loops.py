@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from . import loop, loops
-from .loop import LoopRun
-from .table import show
-from .timing import LoopTiming
+from bench import loop, loops
+from bench.loop import LoopRun
+from bench.table import show
+from bench.timing import LoopTiming
 
 TIMING = LoopTiming(np.full(100, 1e-3), np.full(100, 2e-3), 100, 0, 0, 0, 0)
 

@@ -10,11 +10,10 @@ from unittest.mock import patch
 
 import pytest
 
+from bench.calibration.tour import run_tour
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools import calibrate
-
-from .calibration.tour import run_tour
 
 
 def test_too_few_poses_are_reported_with_the_one_that_is_missing_and_nothing_is_fitted(

@@ -1,8 +1,8 @@
 """Measures the operator's panel on the simulated device: delay from press to torque, processor load, late cycles.
 
-    python -m bench.panel press [N]     N presses of the space bar in a real browser, 50 by default, about 5 s each
-    python -m bench.panel load          both arms at 250 Hz, 40 s without the panel and 40 s with an open page
-    python -m bench.panel memory [N]    both arms at 50 Hz and an open page for N minutes, 60 by default
+    python -m test.panel.measure press [N]   N presses of the space bar in a real browser, 50 by default, 5 s each
+    python -m test.panel.measure load        both arms at 250 Hz, 40 s without the panel and 40 s with an open page
+    python -m test.panel.measure memory [N]  both arms at 50 Hz and an open page for N minutes, 60 by default
 
 `press` takes the time from the call that sends the key to the browser until the first CAN frame that fades: it has
 damping, which an active arm never has. Needs chromium, and the extras panel, sim, imu and test.
@@ -19,12 +19,13 @@ from pathlib import Path
 import yaml
 
 from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, unpack_command
-from test.faults.live_arm import resident
-from test.support.bus_listener import CAN_IDS, BusListener, Frame
-from test.support.launched_nodes import LaunchedNodes
-from test.support.panel_browser import chromium, enable, open_page, wait_for_state
-from test.support.ports import free_port
-from test.support.ros_probe import RosProbe
+
+from ..faults.live_arm import resident
+from ..support.bus_listener import CAN_IDS, BusListener, Frame
+from ..support.launched_nodes import LaunchedNodes
+from ..support.panel_browser import chromium, enable, open_page, wait_for_state
+from ..support.ports import free_port
+from ..support.ros_probe import RosProbe
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
 COMMANDS = (0x7F, 0x80, 0xFF)  # first byte: commands hold the position 0; see hardware/can/motor_bus.py

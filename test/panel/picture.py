@@ -1,18 +1,17 @@
 """Draws docs/panel.png, panel_session.png and panel_de.png: the page with two played arms, in a headless browser.
 
-`python -m docs.panel_picture`; needs chromium and the extras panel and test.
+`python -m test.panel.picture`; needs chromium and the extras panel and test.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from playwright.sync_api import Browser, FloatRect, Page
 
-from test.support.panel_browser import chromium, open_page, wait_for_state
-from test.support.panel_stage import Stage
+from ..support import ROOT
+from ..support.panel_browser import chromium, open_page, wait_for_state
+from ..support.panel_stage import Stage
 
-DOCS = Path(__file__).parent
+DOCS = ROOT / "docs"
 PAST = (
     ("2026-03-14 10:42:07", "P01", "two_poses"),
     ("2026-03-14 10:31:50", "P01", "demo"),
