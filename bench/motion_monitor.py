@@ -1,4 +1,4 @@
-"""`make motion-monitor`: what the monitor of unexplained torque sees, and what it costs (docs/safety.md has the table).
+"""`make study NAME=motion-monitor`: what the monitor of unexplained torque sees, and its cost, as in docs/safety.md.
 
 Offline, with the simulated arm, its CAN frames, the safety machine with its own limits and the compensator, judged by
 the arm's true motion. First compensators that are wrong, with a free arm; then an hour of wearers who

@@ -1,1 +1,1 @@
-"""What others use in place of a model, and the growth of an ANFIS with its inputs: `make baselines`."""
+"""What others use in place of a model, and the growth of an ANFIS with its inputs: `make study NAME=baselines`."""

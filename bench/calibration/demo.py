@@ -1,4 +1,4 @@
-"""The demo of `make calibrate-demo`: a simulated arm with a wrong parameter file, calibrated, and a picture of both.
+"""The demo of `make study NAME=calibrate-demo`: a simulated arm with a wrong file, calibrated, and a picture of both.
 
 The device is that of config/sim.yaml with centres of gravity off its links' axes and motors that give more or less than
 commanded; the file's masses are a fifth off. `calibrate gravity` runs on the nodes as on a real arm, for 4 minutes.
@@ -113,7 +113,7 @@ def main(folder: Path | None = None) -> int:
     folder = folder or Path("trials", f"calibrate_demo_{datetime.now():%Y%m%d_%H%M%S}")
     folder.mkdir(parents=True)
     old = folder / "old.yaml"
-    write_changes(packaged_config("sim.yaml"), old, DEVICE, "make calibrate-demo")
+    write_changes(packaged_config("sim.yaml"), old, DEVICE, "make study NAME=calibrate-demo")
     for name in ("new.yaml", "second.yaml", "third.yaml"):  # a busy computer can be late, which ends a tour
         new = folder / name
         code = calibrate.main(["gravity", "--params", str(old), "--output", str(new)])

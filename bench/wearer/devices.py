@@ -2,9 +2,9 @@
 
 `identify` and `wearer_from` work on what slow tours measure: torques of the true arm with friction of both signs, noise
 and 12-bit codes (test/support/random_device.py), gravity's direction as an IMU gives it that is mounted a degree off,
-and a relaxed person who breathes. The tours themselves are not simulated; `make calibrate-study` does that, and leaves
-errors of the same size. The body-mass table is wrong for the person by MASS_ERROR and COG_ERROR, and
-friction is found to WITHIN.
+and a relaxed person who breathes. The tours themselves are not simulated; `make study NAME=calibrate` does that, and
+leaves errors of the same size. The body-mass table is wrong for the person by MASS_ERROR and COG_ERROR, and friction is
+found to WITHIN.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What the command line of `calibrate` says when a tour shows too little: offline.
 
-`make calibrate-study` and `make calibrate-demo` show what a whole calibration gives.
+`make study NAME=calibrate` and `make study NAME=calibrate-demo` show what a whole calibration gives.
 """
 
 from __future__ import annotations

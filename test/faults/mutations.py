@@ -1,4 +1,4 @@
-"""`make mutations`: does the fault matrix see a defect? Each of these defects must turn a row unsafe.
+"""`make study NAME=mutations`: does the fault matrix see a defect? Each of these defects must turn a row unsafe.
 
     python -m test.faults.mutations [--only TEXT ...]
 

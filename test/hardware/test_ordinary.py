@@ -1,4 +1,4 @@
-"""The short version of `make ordinary`: ordinary equipment refuses no start and lets no arm down."""
+"""The short version of `make study NAME=ordinary`: ordinary equipment refuses no start and lets no arm down."""
 
 from __future__ import annotations
 

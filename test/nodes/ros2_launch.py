@@ -1,6 +1,6 @@
 """The launch file under `ros2 launch`, and the documents' commands of `ros2`, where ROS 2 is installed.
 
-`make ros2-launch` runs them; PyPI carries no `launch`. Judged by the simulated arm's true motion: the arm is let down
+Run them by their path; PyPI carries no `launch`. Judged by the simulated arm's true motion: the arm is let down
 before the simulator, and with it the motors, ends.
 """
 

@@ -1,4 +1,4 @@
-"""A SocketCAN link that goes down, on vcan0: `make socketcan`."""
+"""A SocketCAN link that goes down, on vcan0: `.ci/socketcan`."""
 
 from __future__ import annotations
 

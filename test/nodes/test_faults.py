@@ -1,4 +1,4 @@
-"""The deliberate defects of `make mutations` match the source that they change."""
+"""The deliberate defects of `make study NAME=mutations` match the source that they change."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ SUCCESS, RIGHT = "Set parameter successful", "/right/compensator"
 HOLD = "ros2 topic pub -r 5 /right/can_bridge/control diagnostic_msgs/msg/KeyValue"
 CALL = "ros2 service call /right/can_bridge"
 # Those of `ros2`, in an order in which a simulated arm that is not yet configured answers each, with what it prints.
-# `make ros2-launch` types them.
+# test/nodes/ros2_launch.py types them.
 ROS2 = {
     "SHARE=$(ros2 pkg prefix --share exo_gravity)": "",
     "POLICY=$(ros2 pkg prefix --share exo_gravity)/config/sros2/policy.xml": "",
@@ -42,7 +42,7 @@ ROS2 = {
     f'{HOLD} "{{key: anna, value: hold}}"': "publishing #3",
 }
 ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no test has
-    "ros2 launch exo_gravity exo.launch.py": "other tests of `make ros2-launch`",
+    "ros2 launch exo_gravity exo.launch.py": "other tests of test/nodes/ros2_launch.py",
     "ros2 service call /arm/compensator/clear_fault": "test/nodes/test_compensator_urdf.py, over the service",
     "ros2 service call /right/compensator/weigh": "test/nodes/test_wearer_efforts.py, over the service",
     "ros2 launch exo_gravity view.launch.py": "ros-jazzy-rviz2 and ros-jazzy-robot-state-publisher",
@@ -58,7 +58,7 @@ ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no 
     "sudo": "the computer's own set-up",
     "export": "the computer's own set-up",
     "colcon": "ROS; the workflow ros.yml runs it",
-    "pip install": "`make dist`, the workflow ros.yml",
+    "pip install": "`.ci/dist`, the workflow ros.yml",
     ".ci/": "continuous integration",
     ". .venv/bin/activate": "every test runs in it",
     "PROCESS=$(pgrep -x compensator); kill -STOP": "the fault matrix, by process ID",

@@ -57,7 +57,8 @@ def direct_needs(path: Path) -> tuple[frozenset[Path], frozenset[str]]:
 
 def missing_packages(path: Path) -> set[str]:
     """Return the packages that a file needs, through what it imports too, and that are not installed."""
-    missing, files, todo = set(), {path}, [path]
+    missing: set[str] = set()
+    files, todo = {path}, [path]
     while todo:
         more, absent = direct_needs(todo.pop())
         missing |= absent

@@ -1,4 +1,7 @@
-"""An arm whose compensator runs on another computer: carried over a fair wire; `make two-computers` has worse ones."""
+"""An arm whose compensator runs on another computer: carried over a fair wire.
+
+`make study NAME=two-computers` has worse ones.
+"""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ MOTION_SHARE = 0.3  # of what the trunk feels beyond its low-passed mean: sample
 REFERENCE = (0.0, 0.7, 0.6, 0.8)  # rad, a usual pose: its inertia weighs the velocity codes
 # Contact: the torque changes faster than a person's does, as at a table's edge.
 FOLLOWED_TIME = 0.1  # s, time constant of what a person's torque follows,
-LEAST = (3.0, 5.0, 3.0, 1.5)  # Nm beyond that: 1.3 times the most that `make wearer-study` saw of reaching wearers
+LEAST = (3.0, 5.0, 3.0, 1.5)  # Nm beyond that: 1.3 times the most that `make study NAME=wearer` saw of reaching wearers
 PAUSE = 1.0  # s without another one, after which a contact is a new one
 
 
