@@ -6,11 +6,14 @@ imports nothing that looks at arms from outside.
 
 import ast
 import importlib
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
+
+from .support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "exo_gravity"
@@ -138,3 +141,9 @@ def test_only_tools_print() -> None:
 def test_the_library_has_the_names_that_others_import(module: str, names: str) -> None:
     library = importlib.import_module(f"exo_gravity.{module}")
     assert not [missing for missing in names.split() if not hasattr(library, missing)]
+
+
+@pytest.mark.parametrize("module", ["tools.trial", "tools.report", "lab.trial.analysis", "nodes.panel.node"])
+def test_what_serves_real_arms_needs_no_simulator(module: str) -> None:
+    program = f"import sys; sys.modules['mujoco'] = None; import exo_gravity.{module}"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)

@@ -2,13 +2,20 @@
 
 It knows nothing of the compensator: CAN frames and IMU samples are the only connection. `SimulatedDevice.run` plays it
 in real time on any python-can bus; examples/simulated_loop.py plays it without a bus, as fast as possible.
+
+The names are imported when they are used: `sim.script` is read by trials and reports of real arms too, on computers
+without MuJoCo.
 """
 
-from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
-from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-from exo_gravity.sim.motor import Firmware, SimulatedMotor
-from exo_gravity.sim.virtual_wearer import VirtualWearer
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
+    from exo_gravity.sim.device import SimulatedDevice
+    from exo_gravity.sim.imu import ImuConfig, SimulatedImu
+    from exo_gravity.sim.motor import Firmware, SimulatedMotor
+    from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
     "STEP",
@@ -21,3 +28,17 @@ __all__ = [
     "SimulatedMotor",
     "VirtualWearer",
 ]
+MODULES = {
+    "arm": ("STEP", "ArmConfig", "SimulatedArm"),
+    "device": ("SimulatedDevice",),
+    "imu": ("ImuConfig", "SimulatedImu"),
+    "motor": ("Firmware", "SimulatedMotor"),
+    "virtual_wearer": ("VirtualWearer",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__} has no attribute {name}")
