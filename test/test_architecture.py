@@ -39,6 +39,14 @@ EXCEPTIONS: dict[str, set[str]] = {
 }
 
 
+STUDIES_THAT_IMPORT_TESTS = {
+    "bench/calibration/device.py",
+    "bench/ordinary/arm.py",
+    "bench/ordinary/rows.py",
+    "bench/wearer/devices.py",
+}
+
+
 def module_of(path: Path) -> str:
     """Return the name of a module within the package: 'core.arm.tilt', 'nodes.imu', '' for the package itself."""
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix("__init__").rstrip(".")
@@ -128,6 +136,16 @@ def test_only_tools_print() -> None:
         return {call.id for call in calls if isinstance(call, ast.Name)} & {"print"}
 
     assert not [module for module in breaches(prints) if not is_in(module, "tools")]
+
+
+def test_studies_and_drawings_import_no_test() -> None:
+    def of_test(path: Path) -> bool:
+        nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        modules = [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+        return any(is_in(module, "test") for module in modules)
+
+    paths = (path for folder in ("bench", "docs", "examples") for path in (ROOT / folder).rglob("*.py"))
+    assert {str(path.relative_to(ROOT)) for path in paths if of_test(path)} == STUDIES_THAT_IMPORT_TESTS
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,9 @@ from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.trial import run as running
 from exo_gravity.lab.trial.run import TrialEnd, follow, is_guided, too_busy
 from exo_gravity.lab.trial.screen import LEAD, TrialScreen, describe
+from exo_gravity.lab.trial.scripted import analysed, read_script
 from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.tools import trial
-from exo_gravity.tools.trial import analysed, read_script
 
 from ..support import synthetic_bags as made
 
