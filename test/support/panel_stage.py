@@ -23,6 +23,13 @@ from .ports import free_port
 LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
+#: What a subject's file holds.
+WEARER_FILE = {
+    "wearer.body_mass": 61.5,
+    "wearer.sex": "female",
+    "wearer.segment_length": [0.3, 0.25, 0.08],
+    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+}
 STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
 
 
@@ -45,7 +52,7 @@ class PlayedArms:
     contact: str = "none"  #: and of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: str = "off"  #: from which support to which it adapts
-    share: str = "unknown"  #: of his arm's weight that the wearer carries
+    share: str = "unknown"  #: of the weight of their arm that the wearer carries
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report

@@ -55,7 +55,7 @@ def read_bag(path: str | Path) -> Bag:
         problem = (
             f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(storage.topics))}"
         )
-        if not storage.topics or any(leaf(topic) == STATES for topic in storage.topics):
+        if not storage.topics or any(leaf(t) == STATES and kind == JOINT_STATE for t, kind in storage.topics.items()):
             problem = "the recording is empty: it has no messages"
         raise DataError(f"{path}: {'; '.join((problem, *contents.notes))}")
     start = min((contents.joints[name].first_arrival for name in states), default=0)
