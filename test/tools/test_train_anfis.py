@@ -10,7 +10,6 @@ from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.anfis_training import RIDGE, Projection, from_bag, from_gravload, train, train_law
-from exo_gravity.lab.calibration.recorded import TILT_TOPIC, TILT_TYPE
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.train_anfis import main
@@ -138,14 +137,9 @@ def test_too_few_poses_are_refused_in_one_sentence(tmp_path, recorded):
 
 
 def test_holds_on_a_tilted_trunk_are_left_out(tmp_path, recorded):
-    types = made.STORE.types
-    vector = types["geometry_msgs/msg/Vector3"](x=0.0, y=math.radians(5.0), z=0.0)
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    message = types[TILT_TYPE](header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=""), vector=vector)
-    data = bytes(made.STORE.serialize_cdr(message, TILT_TYPE))
-    tilted = [(TILT_TOPIC, TILT_TYPE, made.START + k * 100_000_000, data) for k in range(400)]
-    states = list(made.messages(made.trial(SPREAD[:8], hold=2.6, rate=40.0), script=False))
-    folder = made.write_bag(tmp_path / "tilted", sorted(states + tilted, key=lambda entry: entry[2]))
+    states = made.messages(made.trial(SPREAD[:8], hold=2.6, rate=40.0), script=False)
+    tilted = [made.tilt(0.1 * k, math.radians(5.0)) for k in range(400)]
+    folder = made.write_bag(tmp_path / "tilted", [*states, *tilted])
     with pytest.raises(DataError, match="0 holds with an upright trunk"):
         from_bag(folder, recorded, 2)
 
