@@ -8,7 +8,7 @@ import pytest
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.lease import LEASE_TIME
-from exo_gravity.panel.control import BURST, GONE, MAX_PAGES, REFILL, Control, Page, parse
+from exo_gravity.panel.control import LIMITS, Control, Page, parse
 
 from ..support.panel_stage import PlayedArms, PlayedFiles
 
@@ -144,15 +144,15 @@ def test_letting_down_has_no_rate_limit_and_everything_else_has_also_in_the_log(
     def statuses(count: int) -> list[int]:
         return [panel.status(panel.first, "clear_fault", "right") for _ in range(count)]
 
-    assert statuses(int(BURST) + 1) == [200] * int(BURST) + [429]
+    assert statuses(int(LIMITS.burst) + 1) == [200] * int(LIMITS.burst) + [429]
     panel.now += 1.0
-    assert statuses(int(REFILL) + 1) == [200] * int(REFILL) + [429]
+    assert statuses(int(LIMITS.refill) + 1) == [200] * int(LIMITS.refill) + [429]
     assert [panel.status(panel.first, "let_down") for _ in range(50)] == [200] * 50
     panel.notes.clear()
     panel.now += 10.0
     for _ in range(500):
         panel.ask(panel.first, "nonsense")
-    assert len(panel.notes) <= BURST
+    assert len(panel.notes) <= LIMITS.burst
 
 
 def test_a_refusal_of_the_device_reaches_the_page_and_the_log(panel):
@@ -196,20 +196,20 @@ def test_a_reloaded_page_keeps_its_number_and_control_and_no_other_secret_is_acc
 
 
 def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_and_a_new_page_takes_over(panel):
-    assert GONE > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
-    panel.now += GONE
+    assert LIMITS.gone > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
+    panel.now += LIMITS.gone
     assert not panel.is_gone()
     panel.now += 0.01
     panel.confirm(panel.second)
     assert panel.is_gone()
     panel.confirm(panel.first)
     assert not panel.is_gone()
-    panel.now += GONE + 0.1
+    panel.now += LIMITS.gone + 0.1
     assert panel.opened() is panel.holder
 
 
 def test_the_number_of_pages_is_limited_to_those_that_are_open(panel):
-    pages = [panel.first, panel.second, *(panel.opened() for _ in range(MAX_PAGES - 2))]
+    pages = [panel.first, panel.second, *(panel.opened() for _ in range(LIMITS.pages - 2))]
     assert panel.open("", "10.0.0.1") is None
     pages[5].connection = None
     panel.opened()

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.panel.server import ATTEMPT_WINDOW, ATTEMPTS, Access, PanelServer
+from exo_gravity.panel.server import SERVING, Access, PanelServer
 
 from ..support.panel_stage import Stage
 from ..support.waiting import PATIENCE
@@ -142,12 +142,12 @@ def test_elsewhere_than_on_loopback_a_random_token_is_made_unless_one_is_given()
 def test_wrong_tokens_block_their_address_for_a_while_and_those_of_many_addresses_block_all():
     now = 0.0
     access = access_at("0.0.0.0", TOKEN, lambda: now)
-    for _ in range(ATTEMPTS):
+    for _ in range(SERVING.attempts):
         assert not access.is_token("wrong", "10.0.0.1")
     assert not access.is_token(TOKEN, "10.0.0.1") and access.is_token(TOKEN, "10.0.0.2")
-    now += ATTEMPT_WINDOW + 1.0
+    now += SERVING.attempt_window + 1.0
     assert access.is_token(TOKEN, "10.0.0.1")
-    for n in range(10 * ATTEMPTS):
+    for n in range(10 * SERVING.attempts):
         access.is_token("wrong", f"10.0.1.{n}")
     assert not access.is_token(TOKEN, "10.0.0.1")
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.panel.view import LATE, LoadChanges
+from exo_gravity.panel.view import NEWS_DELAY, LoadChanges
 
 
 class PanelLook:
@@ -46,7 +46,7 @@ def test_a_change_of_load_shortly_before_a_fault_is_named_and_never_the_wearers_
     look = PanelLook()
     assert look.go(2.0, **load) is None
     assert look.fail() == cause
-    assert look.go(LATE) == cause
+    assert look.go(NEWS_DELAY) == cause
     assert look.go(60.0, support=0.3) == cause  # set while the arm is off
     look.fault = "none"
     assert look.go(10.0) is None
@@ -72,10 +72,10 @@ def test_a_slider_on_its_way_is_one_change():
 
 def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_later_one_is_not():
     look = PanelLook()
-    look.fail(LATE - 0.5)
+    look.fail(NEWS_DELAY - 0.5)
     assert look.go(0.1, support=0.6) == {"what": "support", "from": 0.1, "to": 0.6}
     look = PanelLook()
-    look.fail(LATE + 0.5)
+    look.fail(NEWS_DELAY + 0.5)
     assert look.go(0.1, support=0.6) is None
 
 

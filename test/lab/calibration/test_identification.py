@@ -10,7 +10,7 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.pose_fit import COMMON, TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.pose_fit import FIT, TYPICAL_MOMENTS
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 from ...support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best, off_axis_of
@@ -44,7 +44,7 @@ def test_moments_of_random_devices_are_right_to_2_percent_or_their_errors_which_
 def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
     found = []
     for device in map(Device, range(200, 210)):
-        factor = 1.0 + COMMON * device.rng.normal(size=(2, 4))
+        factor = 1.0 + FIT.common_error * device.rng.normal(size=(2, 4))
         observations = [
             one._replace(effort=device.offset + (one.effort - device.offset) * factor[int(one.load_mass > 0.0)])
             for one in device.tour(bare=8, weighed=8)
