@@ -89,11 +89,17 @@ def test_gravity_points_along_its_vector_and_without_a_tilt_there_is_no_arrow():
     assert (text.kind, text.text) == ("text", "no tilt")
 
 
-def test_the_state_is_shown_by_colour_and_words():
-    assert state_of(view()) == (GREEN, "active, holding")
-    assert state_of(view(velocity=(0.0, -0.3, 0.0, 0.0))) == (GREEN, "active, moving")
-    assert state_of(view(state="fault", message="fault: no reply")) == (RED, "fault: no reply")
-    assert state_of(view(state="ramping in")) == (AMBER, "ramping in")
-    assert state_of(view(state="letting down"))[0] == AMBER
-    assert state_of(view(state="disabled")) == (GREY, "disabled")
-    assert state_of(view(state="")) == (GREY, "no state")
+@pytest.mark.parametrize(
+    ("state", "more", "shown"),
+    [
+        ("active", {}, (GREEN, "active, holding")),
+        ("active", {"velocity": (0.0, -0.3, 0.0, 0.0)}, (GREEN, "active, moving")),
+        ("fault", {"message": "fault: no reply"}, (RED, "fault: no reply")),
+        ("ramping in", {}, (AMBER, "ramping in")),
+        ("letting down", {}, (AMBER, "letting down")),
+        ("disabled", {}, (GREY, "disabled")),
+        ("", {}, (GREY, "no state")),
+    ],
+)
+def test_the_state_is_shown_by_colour_and_words(state, more, shown):
+    assert state_of(view(state=state, **more)) == shown
