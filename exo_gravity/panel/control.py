@@ -108,8 +108,10 @@ class Page:
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    arms: `Arms` of nodes/panel/node.py. files: `Recordings`. note: called with a sentence for the log and the
-    recording. clock: monotonic s.
+    arms: `Arms` of nodes/panel/node.py.
+    files: `Recordings`.
+    note: called with a sentence for the log and the recording.
+    clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:

@@ -179,7 +179,8 @@ class PanelServer:
 class Access:
     """Passes on to `app` the requests and live connections of those who may use the panel.
 
-    host: the address at which the panel listens. token: '' for none on loopback, and for a random one elsewhere.
+    host: the address at which the panel listens.
+    token: '' for none on loopback, and for a random one elsewhere.
     clock: monotonic s.
     """
 

@@ -74,7 +74,8 @@ class LoadChanges:
     ) -> dict[str, Any]:
         """Return the states of `arms`, each with the `cause` of its fault or None. Call it with each new state.
 
-        nodes: the parameters of `can_bridge` and `compensator` by arm. now: monotonic s.
+        nodes: the parameters of `can_bridge` and `compensator` by arm.
+        now: monotonic s.
         """
         return {arm: {**state, "cause": self._cause(arm, state, nodes[arm][1], now)} for arm, state in arms.items()}
 

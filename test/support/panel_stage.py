@@ -37,7 +37,8 @@ STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active
 class PlayedArms:
     """`Arms` of the panel. calls: what was asked for, in order. problem: the answer to each call. errors: by arm.
 
-    leases: what pages asked for of control, in order. others: who else holds control, by arm.
+    leases: what pages asked for of control, in order.
+    others: who else holds control, by arm.
     """
 
     names: tuple[str, ...] = ("right", "left")

@@ -59,7 +59,8 @@ def measured(
 ) -> Recording:
     """Return what motors measure of the angles `exact` (n, joints) rad: quantised, with no velocity of 0.
 
-    noise: rad. effort, command: (n, joints) Nm; 1 Nm, and as the effort, where they are not given.
+    noise: rad.
+    effort, command: (n, joints) Nm; 1 Nm, and as the effort, where they are not given.
     """
     time = np.arange(len(exact)) / rate
     noisy = exact + noise * np.random.default_rng(1).standard_normal(exact.shape)
@@ -81,7 +82,9 @@ def trial(
 ) -> Recording:
     """Return a trial in which the arm moves to each pose in 2 s and holds it for `hold` s.
 
-    push: (joints,) rad by which the arm is moved in 0.4 s after the first hold. drift: rad/s in every hold. rate: Hz.
+    push: (joints,) rad by which the arm is moved in 0.4 s after the first hold.
+    drift: rad/s in every hold.
+    rate: Hz.
     fall_after: s after which the arm falls.
     """
     pieces: list[np.ndarray] = []
@@ -164,7 +167,8 @@ def tilt(seconds: float, pitch: float, roll: float = 0.0) -> Entry:
 def messages(recording: Recording, command_names: Sequence[str] | None = None, script: bool = True) -> Iterator[Entry]:
     """Yield the messages of a recording in their order of arrival.
 
-    command_names: of the joints in the efforts, where they differ. script: whether the wearer's steps are published.
+    command_names: of the joints in the efforts, where they differ.
+    script: whether the wearer's steps are published.
     """
     prefix = f"/{recording.name}"
     steps = [(START + round(step.start * 1e9), index, step) for index, step in enumerate(recording.steps)]

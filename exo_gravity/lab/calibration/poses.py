@@ -74,7 +74,9 @@ GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30,
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m. moments: (8,) kg m, as in `core.arm.gravity`, with the load. tilt: of the trunk or the stand.
+    length: (4,) m.
+    moments: (8,) kg m, as in `core.arm.gravity`, with the load.
+    tilt: of the trunk or the stand.
     """
 
     def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
@@ -127,7 +129,8 @@ class TorqueGuess:
 class Itinerary:
     """Visits given stations, then others until `count` poses are measured, each the one that shows the most.
 
-    given: by default the hanging arm. duration: s, of the whole tour, which the choice keeps within.
+    given: by default the hanging arm.
+    duration: s, of the whole tour, which the choice keeps within.
     """
 
     def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
@@ -141,9 +144,12 @@ class Itinerary:
     ) -> Station | None:
         """Return the next of the given stations, then the best of the candidates that can be held and reached.
 
-        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
-        of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
-        held.
+        taken: (n, 4) rad, the poses measured so far.
+        position: (4,) rad, where the arm is.
+        elapsed: s since the start of the tour.
+        friction: (4,) Nm, 0 if unknown.
+
+        Returns None after the last; raises DataError if no pose can be held.
         """
         station = next(self._given, None)
         if station or len(taken) >= self._most:
@@ -226,8 +232,10 @@ def next_pose(
 ) -> int:
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
-    taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
-    frame. moments: (8,) kg m, a guess.
+    taken: (4,) rad each, none at the start.
+    candidates: (n, 4) rad.
+    direction: (3,), gravity's unit vector in the base frame.
+    moments: (8,) kg m, a guess.
     """
     seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
     information = np.diag(NATURAL**-2.0) + seen.T @ seen

@@ -47,7 +47,9 @@ DETECTION = Detection()
 def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
 
-    with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
+    with_held: False for sweeps alone, which show friction.
+
+    Raises DataError if there are none.
     """
     bag = read_bag(path)
     recording = recording_of(bag, arm)

@@ -66,7 +66,8 @@ def _observations(
 ) -> list[Observation]:  # fmt: skip
     """Return what a tour measures, or what `options.bag` shows.
 
-    changes, moments: as for `tour_parameters`. request: what a person does first; they cannot reach a simulated device.
+    changes, moments: as for `tour_parameters`.
+    request: what a person does first; they cannot reach a simulated device.
     """
     if options.bag:
         return observations_of(options.bag, arm, with_held="tour.friction" not in changes)

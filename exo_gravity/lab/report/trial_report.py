@@ -65,7 +65,9 @@ def write(
 ) -> list[Path]:
     """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
 
-    formats: 'pdf' or 'svg', of each figure beside its PNG. Raises DataError if the folder can't be written.
+    formats: 'pdf' or 'svg', of each figure beside its PNG.
+
+    Raises DataError if the folder can't be written.
     """
     folder = Path(folder)
     sections: list[str] = []

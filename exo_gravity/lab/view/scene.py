@@ -50,8 +50,10 @@ RESTING = 0.05  # rad/s, below which a carried arm is held; twice the step of th
 class Shape(NamedTuple):
     """One thing to draw.
 
-    group: 'gravity', 'torques', 'limits' or 'states'. kind: ARROW from the first point to the second, LINE through the
-    points, TEXT or SPHERE at the first point. points: (n, 3) m. size: m, width of a line, height of a text, diameter.
+    group: 'gravity', 'torques', 'limits' or 'states'.
+    kind: ARROW from the first point to the second, LINE through the points, TEXT or SPHERE at the first point.
+    points: (n, 3) m.
+    size: m, width of a line, height of a text, diameter.
     """
 
     group: str
