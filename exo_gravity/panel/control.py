@@ -155,7 +155,7 @@ class Control:
         return self.holder is not None and self.clock() - self.holder.seen > LIMITS.gone
 
     @property
-    def elsewhere(self) -> str:
+    def other_operator(self) -> str:
         """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
         others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")

@@ -57,7 +57,7 @@ class Serving:
 SERVING = Serving()
 
 
-NONE_YET: Mapping[str, Any] = {}
+NOT_KNOWN: Mapping[str, Any] = {}
 FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages; the page was opened again
 COOKIE = "exo_gravity_panel"
 # Nothing from elsewhere, no inline script or style, and no frame around the page, in which a press could be stolen.
@@ -80,8 +80,8 @@ class PanelServer:
     """Serves the panel at `host` and `port`, on a thread."""
 
     def __init__(self, host: str, port: int, token: str, control: Control) -> None:
-        self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
-        self.setup = NONE_YET  #: what changes rarely, replaced likewise
+        self.state = NOT_KNOWN  #: what the pages show, replaced by a new object in any thread
+        self.setup = NOT_KNOWN  #: what changes rarely, replaced likewise
         self._control = control
         routes = [
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
@@ -146,7 +146,7 @@ class PanelServer:
     async def _send(self, connection: WebSocket, page: Page) -> None:
         """Send the page's number, then setup and state whenever they are new, until it is cancelled."""
         await connection.send_json({"type": "page", "page": page.secret, "number": page.number})
-        setup, state, number = NONE_YET, NONE_YET, 0
+        setup, state, number = NOT_KNOWN, NOT_KNOWN, 0
         while True:
             if self.setup is not setup:
                 setup = self.setup
@@ -154,7 +154,7 @@ class PanelServer:
             if self.state is not state:
                 state, number = self.state, number + 1
                 holder, gone = self._control.holder, self._control.is_gone()
-                where = {"gone": gone, "elsewhere": self._control.elsewhere}
+                where = {"gone": gone, "elsewhere": self._control.other_operator}
                 of_holder = {"page": holder.number, "address": holder.address, **where} if holder else None
                 await connection.send_json({"type": "state", "number": number, "control": of_holder, **state})
             await asyncio.sleep(SERVING.send_period)

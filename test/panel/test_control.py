@@ -232,7 +232,7 @@ def test_confirmations_of_the_operators_page_and_enabling_renew_its_lease_and_no
 
 def test_an_arm_that_another_operator_holds_is_only_let_down(panel):
     panel.arms.others["left"] = "anna"
-    assert panel.elsewhere == "anna"
+    assert panel.other_operator == "anna"
     for kind, more in (("enable", {}), ("clear_fault", {}), ("set", {"values": {"support": 0.1}})):
         assert panel.status(panel.first, kind, "left", **more) == 403
         assert "anna" in panel.notes[-1]

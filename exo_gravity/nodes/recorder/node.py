@@ -88,7 +88,7 @@ class Recorder(Node):
         self._live = LiveLine() if values["live"] else None
         self.create_timer(TIMING.drain_period, self._drain)
         self.create_timer(TIMING.discovery_period, self._discover)
-        self.create_timer(TIMING.live_period, self._look)
+        self.create_timer(TIMING.live_period, self._update_live)
         self.create_timer(TIMING.loss_period, self._report_losses)
         self._discover()
         self.get_logger().info(f"recording to {self._writer.path}")
@@ -129,7 +129,7 @@ class Recorder(Node):
             if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
 
-    def _look(self) -> None:
+    def _update_live(self) -> None:
         """Ask new nodes for their parameters, and print the live line."""
         self._guarded("parameters", self._nodes.update)
         if self._live:

@@ -117,11 +117,24 @@ def test_a_message_that_cannot_be_written_is_counted_and_the_others_are_written(
     assert (opened.count, opened.lost, opened.error) == (4, 2, None)
 
 
+# Writes until it is killed, so slowly that no buffer fills up and is flushed; prints the stamp of each message.
+RECORDER = """
+import sys, time
+from exo_gravity.lab.bag.writer import BagWriter, offered_qos
+from test.support.synthetic_bags import JOINT_STATE, NAMES, joint_state
+writer = BagWriter(sys.argv[1])
+writer.add_topic("/right/joint_states", JOINT_STATE, offered_qos(True, False, 1))
+while True:
+    now = time.time_ns()
+    writer.write([("/right/joint_states", now, joint_state(now, NAMES, *[[0.1] * 4] * 3))])
+    print(now, flush=True)
+    time.sleep(0.2)
+"""
+
+
 def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     path = tmp_path / "bag"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "test.support.bag_processes", str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
+    process = subprocess.Popen([sys.executable, "-c", RECORDER, str(path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     stamps = []
     while len(stamps) < 2 or stamps[-1] - stamps[0] < 1.7e9:
         stamps.append(int(process.stdout.readline()))
