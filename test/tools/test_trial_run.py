@@ -46,13 +46,7 @@ def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limit
         assert np.all(np.abs(torque) < RATED)
 
 
-def test_the_papers_two_trials_are_thirteen_poses_of_a_minute_and_a_push_from_17_to_20_s():
-    _, script = read_script("thirteen_poses")
-    assert len({step.value for step in script.steps if step.action == "move"}) == 13
-    assert [step.duration for step in script.steps if step.action == "hold"] == [60.0] * 13
-    _, script = read_script("two_poses")
-    actions = [script.steps[script.at(time)[0]].action for time in (16.9, 17.1, 19.9, 20.1)]
-    assert actions == ["hold", "push", "push", "hold"]
+def test_an_unknown_name_is_answered_with_the_packaged_trials():
     with pytest.raises(ParameterError) as caught:
         read_script("nosuch")
     assert all(name in str(caught.value) for name in PACKAGED)
@@ -204,14 +198,21 @@ def test_why_a_trial_ends_early(bridge, silence, exit_code, why):
     assert why in screen.end_of_trial(exit_code)
 
 
-def test_the_steps_of_the_trunk_are_instructions_too():
-    for step, words in (
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
         (Step("bow", 3.0, (0.52,)), ("bow", "30 deg forward", "3 s")),
         (Step("lean", 2.0, (-0.26,)), ("lean", "-15 deg to the right", "2 s")),
         (Step("walk", 60.0), ("walk", "60 s")),
-    ):
-        assert all(word in describe(step, True) for word in (*words, "leave the arm alone"))
-    assert describe(Step("sit", 2.0), False).startswith("the wearer: sit")
+        (Step("sit", 2.0), ("sit",)),
+        (Step("load", 1.0, (0.5,)), ("take", "0.5 kg")),
+        (Step("load", 1.0, (0.0,)), ("let go",)),
+    ],
+)
+def test_the_steps_of_the_trunk_and_of_a_load_are_instructions_too(step, words):
+    for guided in (True, False):
+        said = describe(step, guided)
+        assert all(word in said for word in words) and said.startswith("the wearer: ") != guided
 
 
 # Trials on a computer that is too busy

@@ -133,12 +133,10 @@ def test_an_impossible_arm_is_refused_by_the_name_of_the_parameter(arm, bridge, 
         configured_arm(write_params(tmp_path, arm, bridge))
 
 
-def test_all_checks_hold_on_the_packaged_arm_and_the_papers_figures_stand_beside_ours(quick):
+def test_all_checks_hold_on_the_packaged_arm_and_a_table_and_figures_are_written(quick):
     code, printed, folder, _ = quick
     assert code == 0
     assert "FAILED" not in printed and printed.count("\nheld") == 4
-    for figure in ("6.06e-16", "4.06e-16", "8.03e-17", "1.71e-03", "1.32e-03", "3.15e-04", "380 s"):
-        assert figure in printed
     for name in ("workspace.png", "tilt.png"):
         assert matplotlib.image.imread(folder / name)[..., :3].std() > 0.05
     rows = csv_rows(folder / "laws.csv")
