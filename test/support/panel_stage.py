@@ -106,10 +106,11 @@ class PlayedArms:
         values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
-        carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
-        carried |= {"changing load": self.changing, "weighing": self.weighing, "contact": self.contact}
-        carried["support adapts"] = self.adapts
-        carried["share of the wearer (%)"] = self.share
+        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating"}
+        carried |= {"changing load": self.changing, "weighing": self.weighing}
+        of_wearer = {"largest support": "0.068", "contact": self.contact, "support adapts": self.adapts}
+        of_wearer["share of the wearer (%)"] = self.share
+        carried |= of_wearer
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}

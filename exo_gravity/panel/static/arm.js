@@ -172,7 +172,7 @@ export class ArmCard {
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }
 
-  // How much of the weight of their arm the wearer carries, to be read from two metres: the bar, and its 95 % band.
+  // How much of his arm's weight the wearer carries, to be read from two metres: the bar, and its 95 % band.
   showShare(text) {
     const [value, width] = text?.match(/^(-?\d+) \+- (\d+)$/)?.slice(1).map(Number) ?? [];
     const known = value !== undefined;
