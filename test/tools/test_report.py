@@ -223,6 +223,7 @@ def test_what_limits_the_verdict_is_noted(held, page_of):
     assert "no trial script" in printed(unscripted) and "no trial script" in page_of(unscripted).text
     damaged = analyse(made.bag_of(whole, problems=("left: damaged",)))
     assert damaged.exit_code == 2 and damaged.verdict[0].startswith("It held, as far as")
+    assert "left: damaged" in printed(damaged)
 
 
 @pytest.mark.usefixtures("without_pictures")
