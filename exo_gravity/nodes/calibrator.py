@@ -34,7 +34,7 @@ PLAN_PERIOD = 0.05  # s
 
 
 class CalibratorNode(Node):
-    """The ROS shell around `core.calibration.tour.Tour`."""
+    """The ROS shell around `lab.calibration.tour.Tour`."""
 
     def __init__(self) -> None:
         super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)

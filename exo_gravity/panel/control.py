@@ -1,10 +1,10 @@
 """Who operates the arms, and what a page may ask for.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
-page that confirms nothing for `GONE` seconds is gone: the laptop is closed, or the network lost. One page at a time
-holds control, the others watch. Every page may let the arms down, at any time and without a rate limit. Each
-confirmation of the page that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one:
-no page, no panel, no lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
+page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. One page at a time holds control,
+the others watch. Every page may let the arms down, at any time and without a rate limit. Each confirmation of the page
+that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one: no page, no panel, no
+lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
 """
 
 import asyncio
@@ -37,9 +37,21 @@ KEYS: Mapping[str, frozenset[str]] = {
 }
 FOR_ALL = ("let_down", "take", "marker")
 CHANGEABLE = {**SETTABLE, **OF_SUBJECT}
-GONE = 2.0  # s without a confirmation; longer than a lease lasts, so that the next page finds the arm let down
-MAX_PAGES = 32
-BURST, REFILL = 20.0, 10.0  # requests that a page may send at once, and per second
+
+
+@dataclass(frozen=True)
+class PageLimits:
+    """What the panel allows its pages."""
+
+    #: s without a confirmation after which a page is gone; longer than a lease lasts, so that the next page
+    #: finds the arm let down
+    gone: float = 2.0
+    pages: int = 32  #: at once
+    burst: float = 20.0  #: requests that a page may send at once
+    refill: float = 10.0  #: requests per second, after those
+
+
+LIMITS = PageLimits()
 
 
 def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str, Any]:
@@ -85,7 +97,7 @@ class Page:
     address: str
     seen: float  #: monotonic s of its last confirmation
     credited: float  #: monotonic s of its last request
-    credit: float = BURST  #: requests that it may send
+    credit: float = LIMITS.burst  #: requests that it may send
     connection: Any = None  #: its open live connection
 
     def __str__(self) -> str:
@@ -96,8 +108,10 @@ class Page:
 class Control:
     """The pages, which of them holds control, and what is done for them.
 
-    arms: `Arms` of nodes/panel/node.py. files: `Recordings`. note: called with a sentence for the log and the
-    recording. clock: monotonic s.
+    arms: `Arms` of nodes/panel/node.py.
+    files: `Recordings`.
+    note: called with a sentence for the log and the recording.
+    clock: monotonic s.
     """
 
     def __init__(self, arms: Any, files: Any, note: Callable[[str], object], clock: Callable[[], float]) -> None:
@@ -118,9 +132,9 @@ class Control:
         page = self._pages.get(secret)
         now = self.clock()
         if page is None:
-            if len(self._pages) >= MAX_PAGES:  # those that are closed lose their numbers
+            if len(self._pages) >= LIMITS.pages:  # those that are closed lose their numbers
                 self._pages = {known.secret: known for known in self._pages.values() if known.connection}
-            if len(self._pages) >= MAX_PAGES:
+            if len(self._pages) >= LIMITS.pages:
                 return None
             self._numbers += 1
             page = Page(secrets.token_urlsafe(24), self._numbers, address, now, now)
@@ -138,10 +152,10 @@ class Control:
 
     def is_gone(self) -> bool:
         """Return whether a page holds control that is gone."""
-        return self.holder is not None and self.clock() - self.holder.seen > GONE
+        return self.holder is not None and self.clock() - self.holder.seen > LIMITS.gone
 
     @property
-    def elsewhere(self) -> str:
+    def other_operator(self) -> str:
         """The name of another operator who holds control of an arm, instead of this panel's page; '' for none."""
         others = [self.arms.other_holder(arm, str(self.holder)) for arm in self.arms.names]
         return next(filter(None, others), "")
@@ -210,7 +224,7 @@ class Control:
     def _spend(self, page: Page) -> bool:
         """Return whether the page may send one more request now."""
         now = self.clock()
-        page.credit = min(BURST, page.credit + REFILL * (now - page.credited))
+        page.credit = min(LIMITS.burst, page.credit + LIMITS.refill * (now - page.credited))
         page.credited = now
         if page.credit < 1.0:
             return False

@@ -30,7 +30,7 @@ from exo_gravity.sim.script import TrialScript
 STOP_TIMEOUT = 10.0  # s for a recorder to end
 WEARER, REPORT = "wearer.yaml", "report.html"
 FOLDER = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
-MOST = 200  # recordings that the page lists
+MOST_LISTED = 200  # recordings that the page lists
 
 
 class Recordings:
@@ -223,7 +223,7 @@ class Recordings:
                 found.append({"subject": "".join(subject[:1]), "trial": name, "when": when, "report": key})
         found.sort(key=lambda entry: entry["when"], reverse=True)
         kept = {path.parent.name for path in self._output.glob(f"*/{WEARER}")}
-        return {"subjects": sorted(kept | {entry["subject"] for entry in found} - {""}), "past": found[:MOST]}
+        return {"subjects": sorted(kept | {entry["subject"] for entry in found} - {""}), "past": found[:MOST_LISTED]}
 
     def report(self, name: str) -> Path | None:
         """Return the report in the folder `name` below `output`; None without one."""

@@ -20,6 +20,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
@@ -39,14 +40,26 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
-SEND_PERIOD = 0.05  # s between two looks for news
-HELLO_TIMEOUT = 5.0  # s for a page to send its first message
-STOP_TIMEOUT = 3.0  # s
-NONE_YET: Mapping[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Serving:
+    """How long the server waits, and how much it takes."""
+
+    send_period: float = 0.05  #: s between two looks for news
+    hello_timeout: float = 5.0  #: s for a page to send its first message
+    stop_timeout: float = 3.0  #: s for the thread to end
+    attempts: int = 5  #: wrong tokens of one address, and of all addresses ten times as many
+    attempt_window: float = 60.0  #: s in which they count
+    longest_request: int = 4096  #: bytes of a request
+
+
+SERVING = Serving()
+
+
+NOT_KNOWN: Mapping[str, Any] = {}
 FULL, REPLACED = 4000, 4001  # why a live connection was closed: too many pages; the page was opened again
-ATTEMPTS, ATTEMPT_WINDOW = 5, 60.0  # wrong tokens of one address, and of all addresses ten times as many, in s
 COOKIE = "exo_gravity_panel"
-MAX_BODY = 4096  # bytes of a request
 # Nothing from elsewhere, no inline script or style, and no frame around the page, in which a press could be stolen.
 CONFINED = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -67,8 +80,8 @@ class PanelServer:
     """Serves the panel at `host` and `port`, on a thread."""
 
     def __init__(self, host: str, port: int, token: str, control: Control) -> None:
-        self.state = NONE_YET  #: what the pages show, replaced by a new object in any thread
-        self.setup = NONE_YET  #: what changes rarely, replaced likewise
+        self.state = NOT_KNOWN  #: what the pages show, replaced by a new object in any thread
+        self.setup = NOT_KNOWN  #: what changes rarely, replaced likewise
         self._control = control
         routes = [
             Route("/", lambda request: FileResponse(FOLDER / "static" / "index.html")),
@@ -100,7 +113,7 @@ class PanelServer:
     def stop(self) -> None:
         """Close all connections and end the thread."""
         self._server.should_exit = True
-        self._thread.join(STOP_TIMEOUT)
+        self._thread.join(SERVING.stop_timeout)
         self._socket.close()
 
     @property
@@ -112,7 +125,7 @@ class PanelServer:
         """Send to a page and receive its confirmations until it closes."""
         await connection.accept()
         with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
-            hello = await asyncio.wait_for(connection.receive_json(), HELLO_TIMEOUT)
+            hello = await asyncio.wait_for(connection.receive_json(), SERVING.hello_timeout)
             page = self._control.open(_given(hello, "page", str), address_of(connection))
             if page is None:
                 await connection.close(FULL)
@@ -133,7 +146,7 @@ class PanelServer:
     async def _send(self, connection: WebSocket, page: Page) -> None:
         """Send the page's number, then setup and state whenever they are new, until it is cancelled."""
         await connection.send_json({"type": "page", "page": page.secret, "number": page.number})
-        setup, state, number = NONE_YET, NONE_YET, 0
+        setup, state, number = NOT_KNOWN, NOT_KNOWN, 0
         while True:
             if self.setup is not setup:
                 setup = self.setup
@@ -141,10 +154,10 @@ class PanelServer:
             if self.state is not state:
                 state, number = self.state, number + 1
                 holder, gone = self._control.holder, self._control.is_gone()
-                where = {"gone": gone, "elsewhere": self._control.elsewhere}
+                where = {"gone": gone, "elsewhere": self._control.other_operator}
                 of_holder = {"page": holder.number, "address": holder.address, **where} if holder else None
                 await connection.send_json({"type": "state", "number": number, "control": of_holder, **state})
-            await asyncio.sleep(SEND_PERIOD)
+            await asyncio.sleep(SERVING.send_period)
 
     async def _on_action(self, request: Request) -> Response:
         try:
@@ -166,7 +179,8 @@ class PanelServer:
 class Access:
     """Passes on to `app` the requests and live connections of those who may use the panel.
 
-    host: the address at which the panel listens. token: '' for none on loopback, and for a random one elsewhere.
+    host: the address at which the panel listens.
+    token: '' for none on loopback, and for a random one elsewhere.
     clock: monotonic s.
     """
 
@@ -177,12 +191,12 @@ class Access:
         self._session = secrets.token_urlsafe(24)  # the cookie's value: not the token, and another after each start
         self._app = app
         self._clock = clock
-        self._failures: deque[tuple[float, str]] = deque(maxlen=10 * ATTEMPTS)
+        self._failures: deque[tuple[float, str]] = deque(maxlen=10 * SERVING.attempts)
         self._form = (FOLDER / "static" / "login.html").read_text(encoding="utf-8")
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one request or live connection."""
-        left = MAX_BODY
+        left = SERVING.longest_request
 
         async def limited() -> Message:
             nonlocal left
@@ -212,8 +226,8 @@ class Access:
         After too many wrong ones, from `address` or from all, none is compared for a while.
         """
         now = self._clock()
-        recent = [origin for time, origin in self._failures if now - time <= ATTEMPT_WINDOW]
-        if recent.count(address) >= ATTEMPTS or len(recent) >= 10 * ATTEMPTS:
+        recent = [origin for time, origin in self._failures if now - time <= SERVING.attempt_window]
+        if recent.count(address) >= SERVING.attempts or len(recent) >= 10 * SERVING.attempts:
             return False
         right = not self.is_open and _equal(given, self.token)
         if not right:

@@ -33,7 +33,7 @@ OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.r
 
 Values = Mapping[str, Any]
 FIELDS = ("position", "velocity", "effort")
-LATE = 1.5  # s after a fault in which the panel may still learn of a change that came before it
+NEWS_DELAY = 1.5  # s after a fault in which the panel may still learn of a change that came before it
 
 
 def joint_rows(states: Any) -> list[dict[str, Any]]:
@@ -74,7 +74,8 @@ class LoadChanges:
     ) -> dict[str, Any]:
         """Return the states of `arms`, each with the `cause` of its fault or None. Call it with each new state.
 
-        nodes: the parameters of `can_bridge` and `compensator` by arm. now: monotonic s.
+        nodes: the parameters of `can_bridge` and `compensator` by arm.
+        now: monotonic s.
         """
         return {arm: {**state, "cause": self._cause(arm, state, nodes[arm][1], now)} for arm, state in arms.items()}
 
@@ -83,7 +84,7 @@ class LoadChanges:
         if not is_faulty:
             self._faults.pop(arm, None)
         began = self._faults.setdefault(arm, now) if is_faulty else now
-        if compensator and now - began <= LATE:
+        if compensator and now - began <= NEWS_DELAY:
             load = {name: compensator.get(name) for name in LOAD}
             if loads and loads[-1][0] == load:
                 loads.pop()

@@ -13,10 +13,8 @@ from exo_gravity.lab.view.scene import (
     GREEN,
     GREY,
     LINE,
-    RANGE_RADIUS,
     RED,
-    TORQUE_RADIUS,
-    TORQUE_SPAN,
+    SIZES,
     ArmView,
     arm_shapes,
     gravity_shapes,
@@ -62,10 +60,10 @@ def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle
     origins, _, _ = arm_pose(arm(), theta)
     shapes = lines(arm_shapes(view(theta)), "limits")
     for n, (arc, needle) in enumerate(zip(shapes[0::2], shapes[1::2], strict=True)):
-        assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(RANGE_RADIUS)
+        assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(SIZES.range_radius)
         link = origins[n + 1] - origins[n]
         start, tip = needle.points
-        assert (tip - start) / RANGE_RADIUS == pytest.approx(link / np.linalg.norm(link), abs=1e-12)
+        assert (tip - start) / SIZES.range_radius == pytest.approx(link / np.linalg.norm(link), abs=1e-12)
 
 
 def test_a_joint_near_its_limit_is_red():
@@ -77,9 +75,9 @@ def test_a_torque_spans_its_share_of_the_limit_in_its_direction_and_is_red_at_th
     shapes = lines(arm_shapes(view(effort=(0.0, 4.5, -1.0, 3.0))), "torques")
     origins, axes, _ = arm_pose(arm(), STILL)
     for n, share in enumerate((0.0, 0.5, -1.0 / 3.0, 1.0)):
-        start, end = ((shapes[n].points[i] - origins[n]) / TORQUE_RADIUS for i in (0, -1))
+        start, end = ((shapes[n].points[i] - origins[n]) / SIZES.torque_radius for i in (0, -1))
         turn = math.atan2(np.cross(start, end) @ axes[n], start @ end)
-        assert math.remainder(turn - share * TORQUE_SPAN, math.tau) == pytest.approx(0.0, abs=1e-9)
+        assert math.remainder(turn - share * SIZES.torque_span, math.tau) == pytest.approx(0.0, abs=1e-9)
     assert [shape.colour for shape in shapes] == [GREEN, GREEN, GREEN, RED]
 
 
@@ -91,11 +89,17 @@ def test_gravity_points_along_its_vector_and_without_a_tilt_there_is_no_arrow():
     assert (text.kind, text.text) == ("text", "no tilt")
 
 
-def test_the_state_is_shown_by_colour_and_words():
-    assert state_of(view()) == (GREEN, "active, holding")
-    assert state_of(view(velocity=(0.0, -0.3, 0.0, 0.0))) == (GREEN, "active, moving")
-    assert state_of(view(state="fault", message="fault: no reply")) == (RED, "fault: no reply")
-    assert state_of(view(state="ramping in")) == (AMBER, "ramping in")
-    assert state_of(view(state="letting down"))[0] == AMBER
-    assert state_of(view(state="disabled")) == (GREY, "disabled")
-    assert state_of(view(state="")) == (GREY, "no state")
+@pytest.mark.parametrize(
+    ("state", "more", "shown"),
+    [
+        ("active", {}, (GREEN, "active, holding")),
+        ("active", {"velocity": (0.0, -0.3, 0.0, 0.0)}, (GREEN, "active, moving")),
+        ("fault", {"message": "fault: no reply"}, (RED, "fault: no reply")),
+        ("ramping in", {}, (AMBER, "ramping in")),
+        ("letting down", {}, (AMBER, "letting down")),
+        ("disabled", {}, (GREY, "disabled")),
+        ("", {}, (GREY, "no state")),
+    ],
+)
+def test_the_state_is_shown_by_colour_and_words(state, more, shown):
+    assert state_of(view(state=state, **more)) == shown

@@ -13,7 +13,7 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Page
 
-from ..support.panel_browser import IN_BROWSER, wait_for_state
+from ..support.panel_browser import IN_BROWSER, of_arm, wait_for_state
 
 pytestmark = IN_BROWSER
 
@@ -55,7 +55,7 @@ def test_the_keyboard_alone_reaches_everything(visit, stage):
         reached.add(page.evaluate(name))
     assert {"language", "release", "operate enable", "down", "trial-start", "record", "save", "let-down"} <= reached
     assert {"body_mass", "sex", "upper_arm"} <= reached
-    page.focus('[data-arm="right"] .enable')
+    page.focus(of_arm(".enable"))
     page.keyboard.press("Enter")
     page.wait_for_selector("#ask:visible")
     page.keyboard.press("Tab")
@@ -102,7 +102,7 @@ def test_axe_has_no_serious_findings(browser, visit, stage, state):
         stage.arms.states["right"], stage.arms.sinking = "active", 0.2
         page.wait_for_selector("#chips .badge[data-moves]")
     elif state == "asking":
-        page.click('[data-arm="right"] .enable')
+        page.click(of_arm(".enable"))
     elif state == "german":
         page.select_option("#language", "de")
     assert serious(page) == []

@@ -9,7 +9,7 @@ pytest.importorskip("playwright", reason="no browser driver: install the extra t
 from exo_gravity.core.safety.gate import missing_for_a_start
 from exo_gravity.core.safety.limits import JointSample, Limits
 
-from ..support.panel_browser import IN_BROWSER, wait_for_state
+from ..support.panel_browser import IN_BROWSER, of_arm, wait_for_state
 from ..support.panel_stage import LEAVES
 
 pytestmark = IN_BROWSER
@@ -22,26 +22,26 @@ def test_a_check_that_waits_says_in_degrees_which_joint_to_turn_and_a_simulated_
     waits = f"waiting for {missing_for_a_start(limits, [hanging] * 3 + [astray], None, False)}"
     stage.arms.states["right"], stage.arms.messages["right"] = "checking", f"checking: {waits}"
     page = visit()
-    sentence = '[data-arm="right"] .sentence'
+    sentence = of_arm(".sentence")
     page.wait_for_selector(f"{sentence}:has-text('Elbow flexion: turn it back by 0.1°.')")
     page.select_option("#language", "de")
     page.wait_for_selector(f"{sentence}:has-text('Ellenbogen Beugung: um 0,1° zurückdrehen.')")
     page.select_option("#language", "en")
-    page.click('[data-arm="right"] .home')
+    page.click(of_arm(".home"))
     stage.arms.states["right"], stage.arms.messages["right"] = "disabled", f"disabled: not enabled within 10 s: {waits}"
     page.wait_for_selector(f"{sentence}:has-text('The motors stayed off. Elbow flexion')")
     stage.arms.messages.clear()
     stage.arms.states["right"] = "active"
     wait_for_state(page, "active")
     assert stage.arms.calls == [("bring_home", "right")]
-    assert page.is_disabled('[data-arm="right"] .home')
+    assert page.is_disabled(of_arm(".home"))
 
 
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_cause_of_a_fault_is_above_the_buttons_and_moves_none_of_them(visit, stage, width):
     page = visit()
     page.set_viewport_size({"width": width, "height": 800})
-    sentence, button = page.locator('[data-arm="right"] .sentence'), page.locator('[data-arm="right"] .clear')
+    sentence, button = page.locator(of_arm(".sentence")), page.locator(of_arm(".clear"))
     before = button.bounding_box()
     stage.arms.fail("right", "implausible_zero")  # the longest of all
     page.wait_for_selector("[data-arm=right] .sentence:has-text('did not hang where it should. The arm was let down')")
@@ -59,7 +59,7 @@ def test_a_fault_after_a_change_of_load_names_the_change_also_after_a_reload(vis
         stage.arms.settings["right"]["support"] = support
         page.wait_for_timeout(300)
     stage.arms.fail("right", "over_speed")
-    remedy = '[data-arm="right"] .remedy'
+    remedy = of_arm(".remedy")
     named = f"{remedy}:has-text('the support was changed from 5.0 % to 65.0 %')"
     page.wait_for_selector(named)
     assert "A joint moved too fast" in page.inner_text(remedy)
@@ -72,7 +72,7 @@ def test_a_fault_after_a_change_of_load_names_the_change_also_after_a_reload(vis
 
 def test_a_silent_motor_of_a_simulated_arm_is_the_computers_fault(visit, stage):
     page = visit()
-    remedy = '[data-arm="right"] .remedy'
+    remedy = of_arm(".remedy")
     stage.arms.fail("right", "motor_silent")
     page.wait_for_selector(f"{remedy}:has-text('CAN cable')")
     stage.arms.simulator = {"longest stall (ms)": "8", "longest silence (ms)": "212", "disconnected": "no"}

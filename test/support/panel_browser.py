@@ -50,13 +50,18 @@ def open_page(browser: Browser, url: str, width: int = 1100, height: int = 900) 
     return page
 
 
+def of_arm(name: str, arm: str = "right") -> str:
+    """Return the selector of what the page shows of this arm."""
+    return f'.arm[data-arm="{arm}"] {name}'
+
+
 def wait_for_state(page: Page, state: str, arm: str = "right") -> None:
     """Wait until the page shows the arm in this state."""
-    page.wait_for_selector(f'.arm[data-arm="{arm}"] .badge[data-state="{state}"]')
+    page.wait_for_selector(of_arm(f'.badge[data-state="{state}"]', arm))
 
 
 def enable(page: Page, arm: str = "right") -> None:
     """Enable the arm as its operator does."""
     wait_for_state(page, "disabled", arm)
-    page.click(f'.arm[data-arm="{arm}"] .enable')
+    page.click(of_arm(".enable", arm))
     page.click("#ask-yes")

@@ -23,6 +23,13 @@ from .ports import free_port
 LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
+#: What a subject's file holds.
+WEARER_FILE = {
+    "wearer.body_mass": 61.5,
+    "wearer.sex": "female",
+    "wearer.segment_length": [0.3, 0.25, 0.08],
+    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+}
 STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
 
 
@@ -30,7 +37,8 @@ STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active
 class PlayedArms:
     """`Arms` of the panel. calls: what was asked for, in order. problem: the answer to each call. errors: by arm.
 
-    leases: what pages asked for of control, in order. others: who else holds control, by arm.
+    leases: what pages asked for of control, in order.
+    others: who else holds control, by arm.
     """
 
     names: tuple[str, ...] = ("right", "left")
@@ -45,7 +53,7 @@ class PlayedArms:
     contact: str = "none"  #: and of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: str = "off"  #: from which support to which it adapts
-    share: str = "unknown"  #: of his arm's weight that the wearer carries
+    share: str = "unknown"  #: of the weight of their arm that the wearer carries
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report
@@ -98,10 +106,11 @@ class PlayedArms:
         values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
-        carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
-        carried |= {"changing load": self.changing, "weighing": self.weighing, "contact": self.contact}
-        carried["support adapts"] = self.adapts
-        carried["share of the wearer (%)"] = self.share
+        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating"}
+        carried |= {"changing load": self.changing, "weighing": self.weighing}
+        of_wearer = {"largest support": "0.068", "contact": self.contact, "support adapts": self.adapts}
+        of_wearer["share of the wearer (%)"] = self.share
+        carried |= of_wearer
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}

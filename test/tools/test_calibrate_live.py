@@ -41,17 +41,14 @@ def test_the_motors_are_watched_until_enter_is_pressed(keys: tuple[IO[str], IO[s
     assert "bend the elbow; then press Enter" in shown.getvalue()
 
 
-def test_a_program_without_a_person_ends_with_the_reason(keys: tuple[IO[str], IO[str]]) -> None:
-    keys[1].close()
-    with pytest.raises(DataError, match="standard input has ended"):
-        Person(Console(file=io.StringIO()), keys[0]).wait("bow")
-
-
-def test_lines_are_printed_as_they_are(keys: tuple[IO[str], IO[str]]) -> None:
-    shown = io.StringIO()
-    line = "pose [3] of 12: " + 20 * "long "
-    Person(Console(file=shown, width=40), keys[0]).say(line)
+def test_lines_are_printed_as_they_are_and_without_a_person_the_program_ends(keys: tuple[IO[str], IO[str]]) -> None:
+    shown, line = io.StringIO(), "pose [3] of 12: " + 20 * "long "
+    person = Person(Console(file=shown, width=40), keys[0])
+    person.say(line)
     assert shown.getvalue() == f"{line}\n"
+    keys[1].close()
+    with pytest.raises(DataError, match="standard input"):
+        person.wait("bow")
 
 
 def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path: Path) -> None:

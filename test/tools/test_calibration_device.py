@@ -11,7 +11,6 @@ import pytest
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.lab.calibration import recorded
 from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
-from exo_gravity.lab.calibration.recorded import TILT_TOPIC, TILT_TYPE
 from exo_gravity.lab.calibration.tours import friction_from, moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
@@ -20,7 +19,7 @@ from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools import calibrate
 
-from ..support.synthetic_bags import START, STORE, messages, write_bag
+from ..support.synthetic_bags import messages, tilt, write_bag
 from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun, fixed
 
 ARM = configured_arm(packaged_config("sim.yaml"))
@@ -68,18 +67,10 @@ def recorded_by(run, folder, torque_scale=1.0):
     torque_scale: that of the bridge, which divides the efforts by it.
     """
     table = np.array(run.log)
-    nothing = np.full((len(table), 4), np.nan)
+    unknown = np.full((len(table), 4), np.nan)
     efforts = table[:, 5:9] * torque_scale
-    states = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], nothing, nothing, efforts)
-    tilts = ((TILT_TOPIC, TILT_TYPE, START + round(now * 1e9), vector(run.tilt)) for now in table[::10, 0])
-    return write_bag(folder, sorted((*messages(states), *tilts), key=lambda entry: entry[2]))
-
-
-def vector(tilt):
-    types, (pitch, roll) = STORE.types, tilt
-    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="")
-    message = types[TILT_TYPE](header=header, vector=types["geometry_msgs/msg/Vector3"](x=roll, y=pitch, z=0.0))
-    return bytes(STORE.serialize_cdr(message, TILT_TYPE))
+    states = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], unknown, unknown, efforts)
+    return write_bag(folder, [*messages(states), *(tilt(now, *run.tilt) for now in table[::10, 0])])
 
 
 @pytest.mark.thorough
@@ -99,8 +90,8 @@ def test_the_recording_of_a_tour_gives_the_same_torques(tours, tmp_path):
 def test_held_poses_are_as_uncertain_as_friction(tmp_path):
     poses = np.random.default_rng(5).uniform((-1.0, 0.2, -0.3, 0.2), (1.0, 1.6, 1.5, 1.8), (6, 4))
     position, time = np.repeat(poses, 300, axis=0), 0.01 * np.arange(1800) + np.repeat(5.0 * np.arange(6), 300)
-    nothing = np.full_like(position, np.nan)
-    holds = Recording("right", ARM.joint_names, time, position, nothing, gravity_torque(TRUTH, position), nothing)
+    unknown = np.full_like(position, np.nan)
+    holds = Recording("right", ARM.joint_names, time, position, unknown, gravity_torque(TRUTH, position), unknown)
     upright = replace(ARM, compensator={**ARM.compensator, "use_imu": False})
     found = recorded.observations_of(write_bag(tmp_path / "bag", messages(holds)), upright)
     np.testing.assert_allclose([o.theta for o in found], poses, atol=1e-3)

@@ -27,7 +27,7 @@ TRUNK = np.array([(0.0, 0.0, 0.0, 0.0, *gravity_in_trunk(BOW, 0.0)), (8.0, 0.0, 
 
 
 def recorded(share: float) -> Recording:
-    """Return the recording of a still arm, whose trunk bows; the wearer gives `share` of what his own arm needs."""
+    """Return the recording of a still arm, whose trunk bows; the wearer gives `share` of what their own arm needs."""
     down, own = Tilt.of("right", BOW).direction, ArmModel(LENGTH, LOAD.cog, LOAD.mass)
     effort = gravity_torque(ROBOT, POSE, down) + (1.0 - share) * gravity_torque(own, POSE, down)
     rows = [np.tile(row, (len(TIME), 1)) for row in (POSE, (0.0,) * 4, effort, effort)]

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from subprocess import PIPE
-from typing import Any, Protocol
 
 import numpy as np
 import pytest
@@ -21,31 +20,29 @@ from exo_gravity.lab import processes
 from exo_gravity.tools import report, trial
 from exo_gravity.tools.trial import main
 
-from ..support import csv_rows
+from ..support import CONFIG, csv_rows
 from ..support.ports import own_ports
+from ..support.trunk_trial import moved, trunk_trial
 from ..support.waiting import PATIENCE
 
-CONFIG = Path(__file__).parents[2] / "config"
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
 PORTS = own_ports(30_000)
-Changes = dict[str, dict[str, Any]]  # parameters by node
 
 
 def by_length(path: Path) -> int:
     return len(path.name)  # attempts on a machine that was too busy have a number in addition
 
 
-class RunTrial(Protocol):
-    def __call__(self, *arguments: str, script: Any = SHORT, changes: Changes | None = None) -> tuple[int, Path]: ...
-
-
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[RunTrial]:
-    """Run `trial`; return its exit code and the folder of its last attempt, `tmp_path` if it wrote none."""
+def run(tmp_path):
+    """Run `trial` with `changes` {node: {parameter: value}}; return its exit code and the folder of its last attempt.
+
+    The folder is `tmp_path` if it wrote none.
+    """
     handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
-    def run(*arguments: str, script: Any = SHORT, changes: Changes | None = None) -> tuple[int, Path]:
+    def run(*arguments, script=SHORT, changes=None):
         (tmp_path / "script.yaml").write_text(yaml.safe_dump(script))
         output = tmp_path / f"out_{next(PORTS)}"
         params = changed(tmp_path, changes or {})
@@ -57,17 +54,13 @@ def run(tmp_path: Path) -> Iterator[RunTrial]:
         signal.signal(number, handler)
 
 
-def changed(folder: Path, changes: Changes) -> Path:
+def changed(folder, changes):
     """Write config/sim.yaml with `changes` and an unused bus; return its path."""
-    content = yaml.safe_load((CONFIG / "sim.yaml").read_text())
-    port = next(PORTS)
+    content, port = yaml.safe_load((CONFIG / "sim.yaml").read_text()), next(PORTS)
+    given = {"/right/can_bridge": {"sign_check_torque": 0.0}, "/right/simulator": {"trial_delay": 1.5}}  # saves seconds
     for node, entry in content.items():
         values = entry["ros__parameters"]
-        if node == "/right/can_bridge":
-            values.update(sign_check_torque=0.0)  # saves seconds
-        elif node == "/right/simulator":
-            values["trial_delay"] = 1.5
-        values.update(changes.get(node, {}))
+        values.update(given.get(node, {}) | changes.get(node, {}))
         if "can" in values:
             values["can"]["options"]["port"] = port
     path = folder / f"params_{port}.yaml"
@@ -75,27 +68,18 @@ def changed(folder: Path, changes: Changes) -> Path:
     return path
 
 
-def holds(folder: Path) -> list[dict[str, str]]:
-    return csv_rows(folder / "holds.csv")
+def column(folder, name):
+    return [float(row[name]) for row in csv_rows(folder / "holds.csv")]
 
 
 def test_an_offline_trial_ends_with_a_report_of_its_recording(run, capsys):
     code, folder = run("--offline")
     assert code == 0
-    written = {path.name for path in folder.iterdir()}
-    assert written == {
-        "params.yaml",
-        "holds.csv",
-        "motions.csv",
-        "report.html",
-        "right_overview.png",
-        "right_drift.png",
-        "bag",
-    }
+    report_files = {"holds.csv", "motions.csv", "report.html", "right_overview.png", "right_drift.png"}
+    assert {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
     text = capsys.readouterr().out
     assert "times real time" in text and "It held." in text
-    pose = [float(row["pose_deg"]) for row in holds(folder)]
-    np.testing.assert_allclose(pose, np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
+    np.testing.assert_allclose(column(folder, "pose_deg"), np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
     with Reader(folder / "bag") as recorded:  # rosbags' own
         assert {"/right/joint_states", "/right/effort_commands", "/diagnostics"} <= set(recorded.topics)
     assert report.main([str(folder / "bag"), "--output", str(folder / "again")]) == 0
@@ -104,25 +88,21 @@ def test_an_offline_trial_ends_with_a_report_of_its_recording(run, capsys):
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day(run):
+def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day_and_a_name_is_refused(run, capsys):
     code, folder = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
-    (trial,) = folder.glob("*-*-*/short_*")
+    (found,) = folder.glob("*-*-*/short_*")
     assert code == 0 and folder.name == "P01"
-    assert {(row["subject"], row["trial"], row["mode"]) for row in holds(trial)} == {("P01", trial.name, "one_g")}
-    page = (trial / "report.html").read_text(encoding="utf-8")
+    rows = {(row["subject"], row["trial"], row["mode"]) for row in csv_rows(found / "holds.csv")}
+    assert rows == {("P01", found.name, "one_g")}
+    page = (found / "report.html").read_text(encoding="utf-8")
     assert "Protocol: pilot" in page and "Note: - stiff" in page
-
-
-def test_a_name_is_refused_as_a_subjects_code(run, capsys):
     code, folder = run("--offline", "--subject", "Anna Meier")
-    assert code == 2 and "must be a code" in capsys.readouterr().err
-    assert not list(folder.glob("Anna*"))
+    assert code == 2 and "subject" in capsys.readouterr().err and not list(folder.rglob("Anna*"))
 
 
 def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
     code = "import sys; from exo_gravity.tools.trial import _print_json as p; p(step=0); input(); p(step=1); p(step=2)"
     process = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
-    assert process.stdin and process.stdout and process.stderr
     assert process.stdout.readline() == '{"step": 0}\n'
     process.stdout.close()
     process.stdin.write("\n")
@@ -131,17 +111,17 @@ def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
     process.stderr.close()
 
 
-def thirteen(hold: float, poses: int = 13) -> dict[str, Any]:
+def thirteen(poses=13):
     content = yaml.safe_load((CONFIG / "trials" / "thirteen_poses.yaml").read_text())
-    steps = [{"hold": hold} if "hold" in step else step for step in content["steps"][: 2 * poses]]
+    steps = [{"hold": 2.5} if "hold" in step else step for step in content["steps"][: 2 * poses]]
     return {"name": "thirteen", "steps": steps}
 
 
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
-    code, folder = run("--offline", script=thirteen(2.5))
-    rates = [abs(float(row["drift_deg_per_min"])) for row in holds(folder)]
+    code, folder = run("--offline", script=thirteen())
+    rates = np.abs(column(folder, "drift_deg_per_min"))
     assert code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
 
 
@@ -151,7 +131,7 @@ def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_pose
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
     slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
     changes = {"/right/compensator": heavy, "/right/simulator": slippery}
-    code, _ = run("--offline", script=thirteen(2.5, poses=5), changes=changes)
+    code, _ = run("--offline", script=thirteen(poses=4), changes=changes)
     said = capsys.readouterr().out
     assert code == 1 and "It did not hold." in said
     assert said.count("the arm was still moving at the end of a hold") > 1
@@ -193,5 +173,26 @@ def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
     assert code == 0, (folder / "log.txt").read_text()
     assert {"bag", "log.txt", "params.yaml", "report.html"} <= {path.name for path in folder.iterdir()}
     _, offline = run("--offline")
-    online, simulated = ([float(row["pose_deg"]) for row in holds(f)] for f in (folder, offline))
-    np.testing.assert_allclose(online, simulated, atol=0.3)
+    np.testing.assert_allclose(column(folder, "pose_deg"), column(offline, "pose_deg"), atol=0.3)
+
+
+BOW = {"bow": math.radians(30.0), "over": 3.0}
+THOROUGH = pytest.mark.thorough
+
+
+@pytest.mark.parametrize(
+    ("steps", "inertial", "least", "most"),
+    [
+        ((BOW, {"hold": 1.0}), True, 0.0, 2.0),
+        pytest.param(({"walk": 6.0}, {"hold": 1.0}), True, 0.0, 3.0, marks=THOROUGH),
+        pytest.param((BOW, {"hold": 1.0}), False, 0.0, 2.0, marks=THOROUGH),
+        pytest.param(({"walk": 4.0},), False, 5.0, math.inf, marks=THOROUGH),
+    ],
+    ids=["bow", "walk", "bow, tilt alone", "walk, tilt alone"],
+)
+def test_an_arm_with_little_friction_stays_where_it_is_unless_a_walking_trunks_acceleration_is_left_out(
+    steps, inertial, least, most
+):
+    trial = trunk_trial(*steps, inertial=inertial)
+    assert least < moved(trial.run(), ("bow", "walk")) < most  # degrees
+    assert trial.trouble == ""

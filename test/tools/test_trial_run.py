@@ -1,4 +1,4 @@
-"""trial's scripts, criteria, nodes and screen: what is a hold, what a person reads, why a trial ends early."""
+"""trial's scripts, criteria and screen: what is a hold, what a person reads, why a trial ends early or is repeated."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ import itertools
 import json
 import math
 import threading
-from collections.abc import Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from rich.console import Console
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.trial import run as running
 from exo_gravity.lab.trial.run import TrialEnd, follow, is_guided, too_busy
 from exo_gravity.lab.trial.screen import LEAD, TrialScreen, describe
@@ -28,13 +25,14 @@ from exo_gravity.lab.trial.scripted import analysed, read_script
 from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.tools import trial
 
+from ..support import CONFIG
 from ..support import synthetic_bags as made
 
-CONFIG = Path(__file__).parents[2] / "config"
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
+PACKAGED = ("bow_and_walk", "demo", "thirteen_poses", "two_poses")
 
 
-@pytest.mark.parametrize("name", ["bow_and_walk", "demo", "two_poses", "thirteen_poses"])
+@pytest.mark.parametrize("name", PACKAGED)
 def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limits(name):
     _, script = read_script(name)
     values = yaml.safe_load((CONFIG / "exo.yaml").read_text())
@@ -48,292 +46,230 @@ def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limit
         assert np.all(np.abs(torque) < RATED)
 
 
-def test_the_second_trial_has_thirteen_different_poses_of_a_minute_each():
-    _, script = read_script("thirteen_poses")
-    poses = {step.value for step in script.steps if step.action == "move"}
-    assert len(poses) == 13
-    assert [step.duration for step in script.steps if step.action == "hold"] == [60.0] * 13
-
-
-def test_the_push_of_the_first_trial_lasts_from_17_to_20_s():
-    _, script = read_script("two_poses")
-    actions = [script.steps[script.at(time)[0]].action for time in (16.9, 17.1, 19.9, 20.1)]
-    assert actions == ["hold", "push", "push", "hold"]
-
-
 def test_an_unknown_name_is_answered_with_the_packaged_trials():
     with pytest.raises(ParameterError) as caught:
         read_script("nosuch")
-    assert str(caught.value) == (
-        "trial = 'nosuch': must be bow_and_walk, demo, thirteen_poses, two_poses or a YAML file with a script"
-    )
+    assert all(name in str(caught.value) for name in PACKAGED)
 
 
-def bag_with(holds: int) -> Bag:
+def bag_with(holds):
     """Return a recording without a script, of one arm with that many holds of 4 s."""
     recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
-    unscripted = dataclasses.replace(recording, steps=(), carried=((0.0, recording.time[-1]),))
-    return Bag(Path("bag"), 0, (unscripted,), (), {}, (), ())
+    return made.bag_of(dataclasses.replace(recording, steps=(), carried=((0.0, recording.time[-1]),)))
 
 
-def holding(*durations: float) -> TrialScript:
-    return TrialScript.parse({"name": "holds", "steps": [{"hold": duration} for duration in durations]})
+@pytest.mark.parametrize(
+    ("found", "durations", "guided", "given", "trouble"),
+    [
+        (2, (4.0, 4.0), True, "", ""),
+        (1, (4.0, 4.0), True, "", "right: 1 of 2 holds"),  # a real arm that never came to rest
+        (1, (4.0, 4.0), True, "an arm is not active any more", "an arm is not active any more"),
+        (2, (60.0, 14.0), True, "", "right: 0 of 2 holds"),  # a moment in which a person holds the arm still
+        (2, (60.0, 14.0), False, "", ""),
+    ],
+)
+def test_a_real_arm_must_have_held_for_half_of_each_hold_of_the_script(found, durations, guided, given, trouble):
+    script = TrialScript.parse({"name": "holds", "steps": [{"hold": duration} for duration in durations]})
+    report, why = analysed(bag_with(found), script, guided, given)
+    assert why.startswith(trouble) and bool(why) == bool(trouble)
+    assert len(report.arms[0][1].holds) == (0 if "0 of 2" in trouble else found)
 
 
-def test_only_holds_of_a_minute_are_judged_by_their_rate():
+def test_only_holds_of_a_minute_are_judged_by_their_rate_and_a_simulator_makes_a_guide_needless():
     rates = [
         analysed(bag_with(1), read_script(name)[1], False, "")[0].criteria.max_rate
         for name in ("demo", "thirteen_poses")
     ]
     assert rates == [math.inf, pytest.approx(math.radians(0.2) / 60)]
-
-
-def test_a_hold_in_which_a_real_arm_never_came_to_rest_is_missing():
-    script = holding(4.0, 4.0)
-    assert analysed(bag_with(2), script, True, "")[1] == ""
-    assert analysed(bag_with(1), script, True, "")[1] == "right: 1 of 2 holds were found"
-    assert analysed(bag_with(1), script, True, "an arm is not active any more")[1] == "an arm is not active any more"
-
-
-def test_a_moment_in_which_a_person_holds_the_arm_still_is_not_a_hold():
-    script = holding(60.0, 14.0)  # of which at least 7 s remain
-    report, trouble = analysed(bag_with(2), script, True, "")
-    assert not report.arms[0][1].holds and trouble == "right: 0 of 2 holds were found"
-    report, trouble = analysed(bag_with(2), script, False, "")
-    assert len(report.arms[0][1].holds) == 2 and trouble == ""
-
-
-def test_a_trial_is_guided_unless_a_simulator_performs_it():
     assert is_guided(CONFIG / "exo.yaml") and not is_guided(CONFIG / "sim_both.yaml")
 
+
+# The screen
 
 SCRIPT = TrialScript.parse(
     {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]},
 )
-ACTIVE = {"level": 0, "message": "active", "state": "active", "fault": "none"}
 
 
-class Screen:
+def status(state, level=0, fault="none", message=None):
+    return {"level": level, "message": message or state, "state": state, "fault": fault}
+
+
+ACTIVE = status("active")
+
+
+class Screen(TrialScreen):
     """The screen of a trial, whose clock and recorder's lines the test sets."""
 
-    def __init__(
-        self, guided: bool = True, bridges: Sequence[str] = ("right/can_bridge",), lead: float | None = LEAD
-    ) -> None:
-        self.now, self.out = 0.0, io.StringIO()
-        self.console = Console(file=self.out, width=120)
-        self.steps: list[tuple[int, float]] = []
-        self.screen = TrialScreen(
-            SCRIPT, guided, self.console, bridges, lead, lambda *step: self.steps.append(step), lambda: self.now
-        )
+    def __init__(self, guided=True, bridges=("right/can_bridge",), lead=LEAD):
+        self.now, self.out, self.steps = 0.0, io.StringIO(), []
+        console = Console(file=self.out, width=120)
+        super().__init__(SCRIPT, guided, console, bridges, lead, lambda *s: self.steps.append(s), lambda: self.now)
 
-    def at(self, now: float, position: Sequence[float] = (0.0,) * 4, bridge: Any = ACTIVE, **arm: Any) -> str:
+    def at(self, now, position=(0.0,) * 4, bridge=ACTIVE, **arm):
         """Process a line of the recorder at `now`, in which the bridge has the status `bridge`; return the screen."""
         self.now = now
-        status = {"right/can_bridge": bridge}
-        faults = [f"{name}: {values['message']}" for name, values in status.items() if values["level"]]
+        faults = [bridge["message"]] if bridge["level"] else []
         arm = {"position": list(position), "effort": [0.0] * 4, **arm}
-        self.screen.take(json.dumps({"right": arm, "status": status, "faults": faults}))
+        self.take(json.dumps({"right": arm, "status": {"right/can_bridge": bridge}, "faults": faults}))
         with self.console.capture() as capture:
-            self.console.print(self.screen.screen())
+            self.console.print(self.screen())
         return capture.get()
 
     @property
-    def printed(self) -> list[str]:
-        """The lines that stay on the screen."""
-        return self.out.getvalue().splitlines()
+    def printed(self):
+        """The lines that stay on the screen, without the number of the step."""
+        return [line[5:] for line in self.out.getvalue().splitlines()]
+
+    def end_of_trial(self, exit_code=None):
+        return follow(self, threading.Event(), lambda: exit_code, Future())
 
 
-def checking(what: str) -> dict[str, Any]:
-    return {"level": 1, "message": f"checking: waiting for {what}", "state": "checking", "fault": "none"}
+WAITING, TAKE_HOLD = "waiting for the arm", "take hold of the arm"
 
 
-def test_a_person_waits_until_the_arm_is_active():
+def test_a_person_waits_until_every_arm_is_active_whether_or_not_a_limit_acts():
     screen = Screen()
-    text = screen.at(10.0, bridge=checking("effort commands"))
-    assert "waiting for the arm to be carried" in text and "checking" in text
-    ramping = {"level": 0, "message": "ramping in", "state": "ramping in", "fault": "none"}
-    assert "waiting for the arm to be carried" in screen.at(11.0, bridge=ramping)
-    assert "take hold of the arm: in 5 s, bring the arm to 6 34 69 29 deg, then let go" in screen.at(12.0)
+    text = screen.at(10.0, bridge=status("checking", 1, message="checking: waiting for effort commands"))
+    assert WAITING in text and "effort commands" in text
+    assert WAITING in screen.at(11.0, bridge=status("ramping in"))
+    assert f"{TAKE_HOLD}: in 5 s, bring the arm to 6 34 69 29 deg" in screen.at(12.0)
     assert screen.printed == []
-
-
-def test_a_limit_that_acts_does_not_keep_a_person_waiting():
-    limited = {**ACTIVE, "level": 1, "message": "active, limited by max_effort (right_elbow_flexion)"}
-    assert "take hold of the arm" in Screen().at(10.0, bridge=limited)
-
-
-def test_a_person_with_two_arms_waits_for_both():
-    screen = Screen(bridges=("left/can_bridge", "right/can_bridge"))
-    assert "waiting for the arm to be carried" in screen.at(10.0)
+    assert TAKE_HOLD in Screen().at(10.0, bridge=status("active", 1, message="active, limited by max_effort"))
+    assert WAITING in Screen(bridges=("left/can_bridge", "right/can_bridge")).at(10.0)
 
 
 def test_the_clock_leads_a_person_through_the_steps():
     screen = Screen()
-    screen.at(0.0)
-    screen.at(LEAD + 0.1)
+    for now in (0.0, 0.1):
+        screen.at(now if not now else LEAD + now)
     assert "then: hands off for 4 s" in screen.at(LEAD + 1.0)
-    screen.at(LEAD + 2.1)
-    screen.at(LEAD + 3.0)
+    for now in (2.1, 3.0):
+        screen.at(LEAD + now)
     assert "drift 1.00 deg" in screen.at(LEAD + 4.0, position=(0.0, 0.0, math.radians(1.0), 0.0))
-    assert not screen.screen.done
+    assert not screen.done
     screen.at(LEAD + 6.1)
-    assert screen.screen.done
-    assert [line[5:] for line in screen.printed] == [
-        "bring the arm to 6 34 69 29 deg, then let go",
-        "hands off for 4 s",
-        "drifted 0.00 deg",
-    ]
+    assert screen.done
+    assert screen.printed == ["bring the arm to 6 34 69 29 deg, then let go", "hands off for 4 s", "drifted 0.00 deg"]
 
 
-def test_at_a_simulated_arm_the_virtual_wearer_leads():
+WEARERS_MOVE = "the wearer brings the arm to 6 34 69 29 deg"
+
+
+def test_at_a_simulated_arm_the_virtual_wearer_leads_and_on_running_nodes_the_clock_whatever_was_before():
     screen = Screen(guided=False, lead=None)
     screen.at(100.0)
     assert screen.printed == []
     screen.at(101.0, step={"step": 0})
-    assert screen.printed == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
+    assert screen.printed == [WEARERS_MOVE]
     screen.at(102.0, step={"step": 2})
-    assert screen.screen.done
-
-
-def test_on_nodes_that_run_already_the_clock_leads_at_once_whatever_an_earlier_trial_left():
+    assert screen.done
     screen = Screen(guided=False, bridges=(), lead=0.0)
-    screen.at(100.0, step={"step": 2})
-    screen.at(100.1, step={"step": 2})
-    screen.at(101.0, step={"step": 0})
+    for now, step in ((100.0, 2), (100.1, 2), (101.0, 0)):
+        screen.at(now, step={"step": step})
     assert screen.steps == [(-1, 0.0), (0, 2.0), (0, pytest.approx(1.1))]
-    assert screen.printed == ["1/2  the wearer brings the arm to 6 34 69 29 deg"]
+    assert screen.printed == [WEARERS_MOVE]
 
 
 def test_half_a_line_of_a_killed_recorder_is_ignored():
     screen = Screen()
     screen.at(1.0)
-    screen.screen.take('{"right": {"posi')
-    assert screen.screen.silence == 0.0
+    screen.take('{"right": {"posi')
     screen.now = 4.0
-    assert screen.screen.silence == 3.0
+    assert screen.silence == 3.0
 
 
-@pytest.fixture
-def nodes() -> Future[None]:
-    """Nodes that run."""
-    return Future()
+MOTOR = "motor_silent: elbow"
+ENDS = {
+    "the recorder ended": (ACTIVE, 0.0, -9, "exit code -9"),
+    "no data": (ACTIVE, 10.1, None, "no data for 10 s"),
+    "letting down": (status("letting down", 2, "motor_silent", MOTOR), 0.0, None, MOTOR),
+    "fault": (status("fault", 2, "motor_silent", MOTOR), 0.0, None, MOTOR),
+    "let down": (status("letting down"), 0.0, None, "not active any more"),
+}
 
 
-def test_a_recorder_that_ends_ends_the_trial(nodes):
+@pytest.mark.parametrize(("bridge", "silence", "exit_code", "why"), ENDS.values(), ids=ENDS)
+def test_why_a_trial_ends_early(bridge, silence, exit_code, why):
     screen = Screen()
     screen.at(0.0)
-    why = follow(screen.screen, threading.Event(), lambda: -9, nodes)
-    assert why == "the recorder ended with exit code -9 before the trial was done"
+    screen.at(1.0, bridge=bridge)
+    screen.now += silence
+    assert why in screen.end_of_trial(exit_code)
 
 
-def test_a_recorder_that_prints_nothing_ends_the_trial(nodes):
-    screen = Screen()
-    screen.at(0.0)
-    screen.now = 10.1
-    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
-    assert why == "the recorder has sent no data for 10 s"
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        (Step("bow", 3.0, (0.52,)), ("bow", "30 deg forward", "3 s")),
+        (Step("lean", 2.0, (-0.26,)), ("lean", "-15 deg to the right", "2 s")),
+        (Step("walk", 60.0), ("walk", "60 s")),
+        (Step("sit", 2.0), ("sit",)),
+        (Step("load", 1.0, (0.5,)), ("take", "0.5 kg")),
+        (Step("load", 1.0, (0.0,)), ("let go",)),
+    ],
+)
+def test_the_steps_of_the_trunk_and_of_a_load_are_instructions_too(step, words):
+    for guided in (True, False):
+        said = describe(step, guided)
+        assert all(word in said for word in words) and said.startswith("the wearer: ") != guided
 
 
-@pytest.mark.parametrize("state", ["letting down", "fault"])
-def test_a_latched_fault_ends_the_trial_with_its_reason(nodes, state):
-    screen, message = Screen(), f"{state}: motor_silent: elbow"
-    screen.at(0.0, bridge={"level": 2, "message": message, "state": state, "fault": "motor_silent"})
-    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
-    assert why == f"right/can_bridge: {message}"
+# Trials on a computer that is too busy
 
 
-def test_an_arm_that_is_let_down_ends_a_trial_that_the_clock_leads(nodes):
-    screen = Screen()
-    screen.at(0.0)
-    screen.at(1.0, bridge={"level": 0, "message": "letting down", "state": "letting down", "fault": "none"})
-    why = follow(screen.screen, threading.Event(), lambda: None, nodes)
-    assert why == "an arm is not active any more"
+def simulator(stall=12.0, silence=14.0, disconnected="no"):
+    values = {"longest stall (ms)": f"{stall:.0f}", "longest silence (ms)": f"{silence:.0f}"}
+    return {"level": 0, "message": "running", "disconnected": disconnected, **values}
 
 
-def test_the_steps_of_the_trunk_are_instructions_too() -> None:
-    assert describe(Step("bow", 3.0, (0.52,)), True) == "bow to 30 deg forward in 3 s, and leave the arm alone"
-    assert describe(Step("lean", 2.0, (-0.26,)), True) == "lean to -15 deg to the right in 2 s, and leave the arm alone"
-    assert describe(Step("walk", 60.0), True) == "walk for 60 s, and leave the arm alone"
-    assert describe(Step("sit", 2.0), False) == "the wearer: sit down hard, and leave the arm alone"
-
-
-SILENT = {"level": 2, "message": "letting down: motor_silent", "state": "letting down", "fault": "motor_silent"}
-STALE = {**SILENT, "message": "letting down: command_stale", "fault": "command_stale"}
-HOT = {**SILENT, "message": "letting down: over_temperature", "fault": "over_temperature"}
-
-
-def simulator(stall: float = 12.0, silence: float = 14.0, disconnected: str = "no") -> dict[str, Any]:
-    return {
-        "level": 0,
-        "message": "running",
-        "longest stall (ms)": f"{stall:.0f}",
-        "longest silence (ms)": f"{silence:.0f}",
-        "disconnected": disconnected,
-    }
-
-
+SILENT, STALE, HOT = (
+    status("letting down", 2, fault, f"letting down: {fault}")
+    for fault in ("motor_silent", "command_stale", "over_temperature")
+)
 CASES = {
     "a stalled device": (SILENT, simulator(140, 150), "right/simulator was not run for 140 ms"),
     "a stalled bridge": (SILENT, simulator(12, 130), "right/can_bridge was not run for 130 ms"),
-    "late replies without a long gap": (SILENT, simulator(), "the replies of the simulated motors came too late"),
-    "late efforts": (STALE, simulator(), "the efforts came too late"),
+    "late replies without a long gap": (SILENT, simulator(), "replies"),
+    "late efforts": (STALE, simulator(), "efforts"),
     "a simulated fault": (SILENT, simulator(60, 70, "yes"), ""),
     "a hot motor": (HOT, simulator(140, 150), ""),
+    "a real arm's silent motor": (SILENT, None, ""),
+    "a real arm's late efforts": (STALE, None, ""),
 }
 
 
 @pytest.mark.parametrize(("bridge", "device", "reason"), CASES.values(), ids=CASES)
-def test_only_a_gap_and_late_replies_or_efforts_mean_a_busy_computer(bridge, device, reason):
-    assert too_busy({"right/can_bridge": bridge, "right/simulator": device}) == reason
+def test_only_a_gap_and_late_replies_or_efforts_of_a_simulated_arm_mean_a_busy_computer(bridge, device, reason):
+    found = too_busy({"right/can_bridge": bridge, **({"right/simulator": device} if device else {})})
+    assert reason in found and bool(found) == bool(reason)
 
 
-def test_a_real_arm_is_never_excused_by_a_busy_computer():
-    assert too_busy({"right/can_bridge": STALE}) == too_busy({"right/can_bridge": SILENT}) == ""
+STALLED = "right/simulator was not run for 140 ms"
+BUSY = TrialEnd("right/can_bridge: letting down: motor_silent", 1, STALLED)
+FAULT = TrialEnd("right/can_bridge: letting down: over_temperature", 1, "")
 
 
-class Attempts:
-    """Stands for the nodes: each attempt ends in the next of the given ways, and records nothing."""
+@pytest.mark.parametrize(
+    ("ends", "code", "attempts", "last_line"),
+    [
+        ((BUSY, BUSY, BUSY), 3, 3, STALLED),
+        ((BUSY, FAULT), 1, 2, "over_temperature"),
+        ((FAULT, BUSY), 1, 1, "over_temperature"),
+    ],
+)
+def test_a_trial_on_a_busy_computer_is_repeated_and_one_with_a_fault_is_not(
+    tmp_path, monkeypatch, capsys, ends, code, attempts, last_line
+):
+    left = list(ends)
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *ends: TrialEnd) -> None:
-        self.ends = list(ends)
-        monkeypatch.setattr(running, "run_nodes", lambda *arguments: self.ends.pop(0))
-        monkeypatch.setattr("exo_gravity.lab.bag.reader.read_bag", self._no_recording)
-        monkeypatch.setattr(trial, "stop_on_signals", threading.Event)
-
-    @staticmethod
-    def _no_recording(path: Path) -> None:
+    def no_recording(path: Path) -> None:
         raise DataError(f"{path}: nothing was recorded")
 
-
-BUSY = TrialEnd("right/can_bridge: letting down: motor_silent", 1, "right/simulator was not run for 140 ms")
-FAULT = TrialEnd("right/can_bridge: letting down: over_temperature", 1, "")
-LAST_LINE = (
-    "trial: this computer was too busy: right/simulator was not run for 140 ms. "
-    "Close other programs and try again. The arm has no fault."
-)
-
-
-def run(tmp_path: Path) -> int:
-    return trial.main(["demo", "--output", str(tmp_path)])
-
-
-def test_a_busy_computer_ends_a_trial_with_exit_code_3_and_advice_in_the_last_line(tmp_path, monkeypatch, capsys):
-    attempts = Attempts(monkeypatch, BUSY, BUSY, BUSY)
-    assert run(tmp_path) == 3
-    assert attempts.ends == []
-    assert capsys.readouterr().out.splitlines()[-1] == LAST_LINE
-
-
-def test_a_trial_that_failed_on_a_busy_computer_is_repeated(tmp_path, monkeypatch, capsys):
-    attempts = Attempts(monkeypatch, BUSY, FAULT)
-    assert run(tmp_path) == 1
-    assert attempts.ends == []
+    monkeypatch.setattr(running, "run_nodes", lambda *_: left.pop(0))
+    monkeypatch.setattr("exo_gravity.lab.bag.reader.read_bag", no_recording)
+    monkeypatch.setattr(trial, "stop_on_signals", threading.Event)
+    assert trial.main(["demo", "--output", str(tmp_path)]) == code
+    assert len(ends) - len(left) == attempts
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "this computer was too busy: right/simulator was not run for 140 ms; attempt 2 of 3"
-    assert lines[-1] == "trial: right/can_bridge: letting down: over_temperature"
-
-
-def test_a_fault_of_the_arm_is_not_repeated(tmp_path, monkeypatch):
-    attempts = Attempts(monkeypatch, FAULT, BUSY)
-    assert run(tmp_path) == 1
-    assert attempts.ends == [BUSY]
+    assert last_line in lines[-1] and (f"attempt {attempts} of 3" in "".join(lines)) == (attempts > 1)

@@ -64,7 +64,19 @@ def description(side="left", joints=NAMES, **robot):
     return ArmDescription(side, arm, (0.6, 0.5, 0.6, 0.2), Limits(joints))
 
 
-@pytest.mark.parametrize("reference", [by_pinocchio, by_mujoco])
+REFERENCES = pytest.mark.parametrize("reference", [by_pinocchio, by_mujoco])
+CALIBRATED = {
+    "off_axis": {"off_axis": (0.02, -0.03, 0.01, 0.004)},
+    "by_moments": {
+        "length": (0.05, 0.13, 0.3, 0.3),
+        "first_moment": (0.2, 0.4, 0.3, 0.05),
+        "off_axis": (0.02, 0.01, 0.0, -0.01),
+    },
+    "gain": {"gain": (0.9, 1.1, 1.2, 0.8), "gravity": 9.8},
+}
+
+
+@REFERENCES
 @pytest.mark.parametrize("file", ["exo.yaml", "sim_both.yaml"])
 def test_the_description_of_both_arms_gives_the_exact_laws_torques(reference, file):
     path = packaged_config(file)
@@ -74,17 +86,9 @@ def test_the_description_of_both_arms_gives_the_exact_laws_torques(reference, fi
         assert torque == pytest.approx(exact(arm.robot, arm.side, theta, down), abs=ROUNDING)
 
 
-@pytest.mark.parametrize("reference", [by_pinocchio, by_mujoco])
+@REFERENCES
 @pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize(
-    "robot",
-    [
-        {"off_axis": (0.02, -0.03, 0.01, 0.004)},
-        {"length": (0.05, 0.13, 0.3, 0.3), "first_moment": (0.2, 0.4, 0.3, 0.05), "off_axis": (0.02, 0.01, 0.0, -0.01)},
-        {"gain": (0.9, 1.1, 1.2, 0.8), "gravity": 9.8},
-    ],
-    ids=("off_axis", "by_moments", "gain"),
-)
+@pytest.mark.parametrize("robot", CALIBRATED.values(), ids=CALIBRATED)
 def test_a_calibrated_arms_description_gives_the_exact_laws_torques(reference, side, robot):
     arm, (theta, down) = description(side, **robot), poses_and_gravity(2)
     torque = reference(urdf([arm]), NAMES, theta, arm.robot.gravity * down)

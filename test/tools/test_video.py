@@ -30,10 +30,6 @@ def drawable(monkeypatch):
     monkeypatch.setattr(output, "find_library", lambda name: name)
 
 
-def test_without_the_option_there_is_no_clip():
-    assert requested(None, 1.0) is None
-
-
 @pytest.mark.parametrize(
     ("video", "speed", "expected"),
     [
@@ -51,7 +47,7 @@ def test_a_wrong_clip_is_refused_before_the_trial(drawable, tmp_path, video, spe
 
 def test_a_missing_package_is_named_with_its_extra(drawable, tmp_path, monkeypatch):
     monkeypatch.setattr(output, "NEEDED", ("no_such_encoder",))
-    with pytest.raises(ParameterError, match=r"no_such_encoder is not installed: .*exo_gravity\[video\]"):
+    with pytest.raises(ParameterError, match=r"no_such_encoder .*exo_gravity\[video\]"):
         requested(str(tmp_path / "clip.gif"), 1.0)
 
 
@@ -74,6 +70,7 @@ def test_without_opengl_the_error_names_the_packages(tmp_path, monkeypatch, chos
 
 
 def test_from_frame_to_frame_the_recording_goes_on_at_the_speed_of_the_clip(drawable, tmp_path):
+    assert requested(None, 1.0) is None
     assert requested(str(tmp_path / "clip.gif"), 4.0).step == pytest.approx(0.4)
     assert requested(str(tmp_path / "clip.mp4"), 4.0).step == pytest.approx(0.16)
 

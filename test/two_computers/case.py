@@ -19,7 +19,8 @@ START_TIMEOUT = 25.0  # s until the arm is carried
 class Result:
     """start: s from the start of the nodes until the arm was carried, None if it never was.
 
-    outcome: 'carried', or why the arm was not carried to the end of the hold. measured: None without a hold.
+    outcome: 'carried', or why the arm was not carried to the end of the hold.
+    measured: None without a hold.
     late_cycles: of the bridge, that began more than a period late; late_frame: ms by which a frame was late beyond the
     wire's delay. Both show how busy this computer was.
     """

@@ -6,6 +6,7 @@ import contextlib
 import json
 import socket
 import sys
+import threading
 import time
 
 PORT = 5005
@@ -14,8 +15,8 @@ PATIENCE = 1.0  # s without a datagram after which no more are expected
 
 
 def echo(address: str) -> None:
-    """Send every datagram back until the standard input closes or PATIENCE is over after the first one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+    """Send every datagram back until PATIENCE is over after the first one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver, contextlib.suppress(TimeoutError):
         receiver.bind((address, PORT))
         print("ready", flush=True)
         while True:
@@ -26,31 +27,26 @@ def echo(address: str) -> None:
 
 def count(address: str, number: int) -> None:
     """Print the round-trip times in s of the datagrams that return, by their numbers, as a list of pairs."""
-    sent, back = {}, []
+    sent, back = dict[int, float](), list[tuple[int, float]]()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("", 0))
+        sender.settimeout(PATIENCE)
+
+        def receive() -> None:
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    index = int(sender.recv(100))
+                    back.append((index, time.monotonic() - sent[index]))
+
+        receiving = threading.Thread(target=receive)
+        receiving.start()
         for index in range(number):
             sent[index] = time.monotonic()
             sender.sendto(str(index).encode(), (address, PORT))
             time.sleep(PERIOD)
-            sender.setblocking(False)
-            try:
-                while True:
-                    back.append(_returned(sender, sent))
-            except BlockingIOError:
-                pass
-        sender.settimeout(PATIENCE)
-        try:
-            while True:
-                back.append(_returned(sender, sent))
-        except TimeoutError:
-            print(json.dumps(back))
-
-
-def _returned(sender: socket.socket, sent: dict[int, float]) -> tuple[int, float]:
-    index = int(sender.recv(100))
-    return index, time.monotonic() - sent[index]
+        receiving.join()
+    print(json.dumps(back))
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(TimeoutError):
-        echo(sys.argv[2]) if sys.argv[1] == "echo" else count(sys.argv[2], int(sys.argv[3]))
+    echo(sys.argv[2]) if sys.argv[1] == "echo" else count(sys.argv[2], int(sys.argv[3]))

@@ -19,9 +19,12 @@ COMMANDS, STATES = "/right/effort_commands", "/right/joint_states"
 class Measured:
     """Of the hold, until its end or until the arm was let down.
 
-    duration: s. age: ms from a joint state's stamp to the arrival of its efforts at the bridge's computer: median, 99th
-    percentile, largest. missed: share of the joint states that were never answered. gap: ms, the longest time without
-    efforts. drift: deg, the largest of any joint by the simulator's truth.
+    duration: s.
+    age: ms from a joint state's stamp to the arrival of its efforts at the bridge's computer: median, 99th percentile,
+    largest.
+    missed: share of the joint states that were never answered.
+    gap: ms, the longest time without efforts.
+    drift: deg, the largest of any joint by the simulator's truth.
     """
 
     duration: float

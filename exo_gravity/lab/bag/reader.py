@@ -9,6 +9,7 @@ was carried comes from the key `state` of its can_bridge on /diagnostics, never 
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import groupby, islice
 from operator import itemgetter
 from pathlib import Path
@@ -30,9 +31,20 @@ from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Sp
 from exo_gravity.lab.trial.session import Session
 
 BATCH_SIZE = 5_000  # messages that are decoded at once
-MAX_COMMAND_AGE = 200_000_000  # ns; an older command is no longer in force
-MAX_CLOCK_OFFSET = 1_000_000_000  # ns between stamp and arrival
-STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """Which messages belong together."""
+
+    command_age: int = 200_000_000  #: ns; an older command is no longer in force
+    clock_offset: int = 1_000_000_000  #: ns between stamp and arrival
+    state_gap: float = 1.0  #: s; can_bridge reports its state twice a second, except while it ends
+
+
+PAIRING = Pairing()
+
+
 TOPIC = itemgetter(0)
 
 
@@ -55,7 +67,7 @@ def read_bag(path: str | Path) -> Bag:
         problem = (
             f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(storage.topics))}"
         )
-        if not storage.topics or any(leaf(topic) == STATES for topic in storage.topics):
+        if not storage.topics or any(leaf(t) == STATES and kind == JOINT_STATE for t, kind in storage.topics.items()):
             problem = "the recording is empty: it has no messages"
         raise DataError(f"{path}: {'; '.join((problem, *contents.notes))}")
     start = min((contents.joints[name].first_arrival for name in states), default=0)
@@ -167,7 +179,7 @@ class _Contents:
         if finite.any() and not finite.all():
             self.notes.append(f"{name}: joint states left out, a position is NaN or infinite: {np.sum(~finite)}")
             arrival, stamp, values = arrival[finite], stamp[finite], values[finite]
-        stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < MAX_CLOCK_OFFSET)
+        stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < PAIRING.clock_offset)
         clock = stamp if stamped else arrival  # either is in order
         command, steps = self._commands(topic, names, clock, stamped), self._script(name, start)
         time = (clock - start) / 1e9
@@ -196,7 +208,7 @@ class _Contents:
         order = np.argsort(sent, kind="stable")
         sent, effort = sent[order], effort[order][:, [given.index(name) for name in names]]
         last = np.searchsorted(sent, clock, "left") - 1
-        known = (last >= 0) & (clock - sent[last] < MAX_COMMAND_AGE)
+        known = (last >= 0) & (clock - sent[last] < PAIRING.command_age)
         result[known] = effort[last[known]]
         return result
 
@@ -218,9 +230,9 @@ class _Contents:
         groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
         spans = [(group[0][0], group[-1][0]) for group in groups]
         time, last = states[-1]
-        if last in CARRIED and 0.0 < end - time < STATE_GAP:
+        if last in CARRIED and 0.0 < end - time < PAIRING.state_gap:
             spans[-1] = spans[-1][0], end
-        if self.is_cut or end - time < STATE_GAP:  # else the joint states go on: they show the way down
+        if self.is_cut or end - time < PAIRING.state_gap:  # else the joint states go on: they show the way down
             if last in CARRIED:
                 missing = "while the arm is carried: it does not show how the arm was let down"
             else:

@@ -26,7 +26,10 @@ def write_recordings(
 ) -> None:
     """Write simulated arms to a new recording `path`, as `recorder` writes real ones; time 0 is now.
 
-    events: what went wrong. parameters: YAML text by node. Raises DataError if it cannot be written.
+    events: what went wrong.
+    parameters: YAML text by node.
+
+    Raises DataError if it cannot be written.
     """
     start = time.time_ns()
     messages: list[Unsent] = [

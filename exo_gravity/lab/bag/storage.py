@@ -85,7 +85,10 @@ class Storage:
     ) -> Generator[Message, None, bool]:
         """Yield the messages among the records from `at` on, also those in chunks; return whether all data were read.
 
-        schemas: read so far. chosen: the wanted topics by channel. Raises an error at a cut or damage.
+        schemas: read so far.
+        chosen: the wanted topics by channel.
+
+        Raises an error at a cut or damage.
         """
         end = len(data)
         while at + RECORD.size <= end:

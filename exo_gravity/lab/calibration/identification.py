@@ -2,7 +2,7 @@
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
-    effort = torque(moments + load) / scale + offset          torque: `core.model.gravity.regressor` times the moments
+    effort = torque(moments + load) / scale + offset          torque: `core.arm.gravity.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
@@ -43,15 +43,36 @@ from exo_gravity.lab.calibration.pose_fit import (
 )
 from exo_gravity.lab.calibration.poses import missing_pose
 
-HIDDEN = 0.1  # share of an unknown, in combinations that are not known, from which it is not known itself
-SCALES = (0.3, 3.0)  # true torque per commanded torque; users report 0.75
-MISFIT = 0.1  # of the peak effort
-LEAST_MISFIT = 0.1  # Nm
-LEAST_ZERO_ERROR = 0.5  # deg worth a sentence
+
+@dataclass(frozen=True)
+class Acceptance:
+    """What a result must keep within."""
+
+    hidden: float = 0.1  #: share of an unknown, in combinations that are not known, from which it is not known itself
+    scales: tuple[float, float] = (0.3, 3.0)  #: true torque per commanded torque; users report 0.75
+    misfit: float = 0.1  #: of the peak effort
+    least_misfit: float = 0.1  #: Nm
+    least_zero_error: float = 0.5  #: deg worth a sentence
+
+
+ACCEPTED = Acceptance()
+
+
 STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
-SIGNIFICANT = 3.0  # standard errors, from which on a Stribeck part is kept
-LEAST_RATIO = 2.0  # of the fastest to the slowest speed
-FRICTION_RESOLUTION = 0.003  # Nm: standard error of a friction that was measured once
+
+
+@dataclass(frozen=True)
+class FrictionFit:
+    """How friction is fitted over the speed."""
+
+    significant: float = 3.0  #: of its standard errors, that a Stribeck part must have to be kept
+    least_ratio: float = 2.0  #: of the fastest to the slowest speed
+    resolution: float = 0.003  #: Nm: standard error of a friction that was measured once
+
+
+FRICTION = FrictionFit()
+
+
 # Unknowns of joint 1, which carries nothing while its axis is vertical.
 FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
 NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
@@ -88,10 +109,11 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
     keep, rejected = without_outliers(rows)
     used, solution = bounded(rows.only(keep))
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
-    for joint in np.flatnonzero(typical > np.maximum(MISFIT * peak, LEAST_MISFIT)):
+    for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
-    direction, hidden, is_relative = observations[-1].direction, solution.hidden > HIDDEN, not np.any(used.load)
+    direction, is_relative = observations[-1].direction, not np.any(used.load)
+    hidden = solution.hidden > ACCEPTED.hidden
     _check_known(hidden, len(observations), direction, gravity, is_relative)
     unknowns = np.where(hidden, START, solution.unknowns)
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
@@ -126,7 +148,7 @@ def check_physical(
     moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: Vector, gravity: float
 ) -> None:
     """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
-    low, high = SCALES
+    low, high = ACCEPTED.scales
     for joint in np.flatnonzero((scale < low) | (scale > high)):
         expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
         raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
@@ -155,7 +177,7 @@ def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, r
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
         yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
     elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
-    if elbow and abs(elbow) > max(3.0 * elbow_error, LEAST_ZERO_ERROR):
+    if elbow and abs(elbow) > max(3.0 * elbow_error, ACCEPTED.least_zero_error):
         yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
 
 
@@ -180,12 +202,14 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
     speeds = len(np.unique(speed))
     if speeds < 3:
         raise DataError(f"friction was measured at {speeds} speeds, must be at least 3")
-    if speed.max() < LEAST_RATIO * speed.min():
+    if speed.max() < FRICTION.least_ratio * speed.min():
         measured = f"from {speed.min():.2f} to {speed.max():.2f} rad/s"
-        raise DataError(f"friction was measured {measured}, the fastest must be {LEAST_RATIO:g} times the slowest")
+        raise DataError(
+            f"friction was measured {measured}, the fastest must be {FRICTION.least_ratio:g} times the slowest"
+        )
     fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
     best = min(fits, key=lambda fit: float(np.sum((fit.fitted - torque) ** 2)))
-    return best if speeds > 3 and best.stribeck > SIGNIFICANT * best.error[2] else _fit(speed, torque)
+    return best if speeds > 3 and best.stribeck > FRICTION.significant * best.error[2] else _fit(speed, torque)
 
 
 def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
@@ -195,6 +219,6 @@ def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> 
     values, _, rank, _ = np.linalg.lstsq(matrix, torque, rcond=None)
     fitted = matrix @ values
     scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
-    errors = np.sqrt(max(scatter, FRICTION_RESOLUTION**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    errors = np.sqrt(max(scatter, FRICTION.resolution**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
     coulomb, viscous, stribeck = values.tolist()
     return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist()))

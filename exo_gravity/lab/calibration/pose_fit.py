@@ -12,6 +12,7 @@ joint gets a factor of its own, estimated from its residuals and pooled with the
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -34,21 +35,36 @@ NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT
 # kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
 TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
 START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(18)))  # of the search
-HUBER = 2.0  # standard errors beyond which a residual's weight falls
-POOLING = 6.0  # degrees of freedom with which all joints together inform the error of each
-STEPS = 40
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The errors that the fit expects, and what it makes of larger ones."""
+
+    least_spread: float = 0.003  #: Nm; about half a code of an AK motor's 12-bit torque
+    #: of torque: error of all sweeps of a joint in one tour, which their scatter does not show
+    common_error: float = 0.002
+    beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
+    #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
+    tilt_error: float = 0.05
+    huber: float = 2.0  #: standard errors beyond which a residual's weight falls
+    pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each
+    steps: int = 40  #: of Gauss-Newton, at most
+    #: sum of squares that a pose causes, from which it is left out: of good poses, one in 500,000
+    outlier: float = 32.0
+    #: Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
+    least_outlier: float = 0.03
+    share_of_peak: float = 0.01  #: of the effort, likewise
+
+
+FIT = Fit()
+
+
 TINY = 1e-20  # of the complex step: no difference is taken, so nothing is lost to rounding
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 MEDIAN_CAUSED = 3.36  # of the sum of four such squares
-LEAST_OUTLIER = 0.03  # Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
-SHARE_OF_PEAK = 0.01
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
-COMMON = 0.002  # of torque: error of all sweeps of a joint in one tour, which their scatter does not show
-LEAST_SPREAD = 0.003  # Nm; about half a code of an AK motor's 12-bit torque
-BESIDE_ERROR = 0.05  # rad, of a weight's place; 3 degrees
-TILT_ERROR = 0.05  # rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
 EXACT = 1e-6  # error of a value that is held
-OUTLIER = 32.0  # such a sum from which a pose is left out: of good poses, one in 500,000
 
 
 class Rows(NamedTuple):
@@ -106,8 +122,8 @@ def rows_of(observations: Sequence[Observation], length: Vector, gravity: float)
     load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
     product = np.eye(COUNT)[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
     product *= not np.any(load)
-    anchor = np.vstack((np.eye(COUNT)[ANGLE] / BESIDE_ERROR, np.eye(COUNT)[TILT] / TILT_ERROR, product / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, LEAST_SPREAD), anchor)
+    anchor = np.vstack((np.eye(COUNT)[ANGLE] / FIT.beside_error, np.eye(COUNT)[TILT] / FIT.tilt_error, product / EXACT))
+    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, FIT.least_spread), anchor)
 
 
 def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
@@ -124,7 +140,7 @@ def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.
     """Return the least-squares solution from `start` (22,); weight: (n, 4) of the squared residuals."""
     root = np.sqrt(weight) / rows.sigma
     unknowns = start
-    for _ in range(STEPS):
+    for _ in range(FIT.steps):
         poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
         whitened = np.vstack((poses, rows.anchor))
         left, size, right = np.linalg.svd(whitened * NATURAL, full_matrices=False)
@@ -154,14 +170,14 @@ def robust(rows: Rows) -> tuple[Rows, Solution]:
         squares /= np.maximum(0.2, solution.left)
         factor = np.maximum(1.0, _pooled(np.median(squares, axis=0) / MEDIAN_SQUARE, solution.freedom))
         size = np.sqrt(squares / factor)
-        solution = solve(rows, solution.unknowns, np.minimum(1.0, HUBER / np.maximum(size, 1e-9)))
+        solution = solve(rows, solution.unknowns, np.minimum(1.0, FIT.huber / np.maximum(size, 1e-9)))
     return rows._replace(sigma=rows.sigma * np.sqrt(factor)), solution
 
 
 def final(rows: Rows) -> tuple[Rows, Solution]:
     """Return the plain least-squares solution, and the rows with the error that its residuals show.
 
-    The covariance includes a relative error of `COMMON` that all poses of a joint with the same weight share.
+    The covariance includes a relative error of `FIT.common_error` that all poses of a joint with the same weight share.
     """
     scaled, solution = rows, solve(rows)
     for _ in range(3):
@@ -183,11 +199,11 @@ def bounded(rows: Rows) -> tuple[Rows, Solution]:
 
 
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
-    """Return the covariance (22, 22) that the error `COMMON` of each joint and weight causes."""
+    """Return the covariance (22, 22) that the error `FIT.common_error` of each joint and weight causes."""
     torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
     loads, group = np.unique(rows.load, axis=0, return_inverse=True)
     shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
-    columns = COMMON * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
+    columns = FIT.common_error * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
     change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
     return np.asarray(change.T @ change)
 
@@ -196,7 +212,7 @@ def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Return each joint's factor (4,) of the variance, moved towards that of all joints where its data are few."""
     total = freedom.sum()
     common = float(factor @ freedom) / total if total > 1.0 else 1.0
-    pooled = (factor * freedom + POOLING * common) / (freedom + POOLING)
+    pooled = (factor * freedom + FIT.pooling * common) / (freedom + FIT.pooling)
     return np.asarray(np.maximum(pooled, 1e-4))
 
 
@@ -223,13 +239,13 @@ def without_outliers(rows: Rows) -> tuple[np.ndarray, tuple[tuple[int, str], ...
     """
     keep = np.ones(len(rows.effort), dtype=bool)
     rejected: list[tuple[int, str]] = []
-    least = np.maximum(LEAST_OUTLIER, SHARE_OF_PEAK * np.abs(rows.effort).max(axis=0))
+    least = np.maximum(FIT.least_outlier, FIT.share_of_peak * np.abs(rows.effort).max(axis=0))
     while True:
         used, solution = robust(rows.only(keep))
         held_out, caused = without_each_pose(solution, used.sigma)
         matters = np.nanmax(np.abs(held_out) / least, axis=1, initial=0.0) > 1.0
         worst = int(np.argmax(caused * matters))
-        if not matters[worst] or caused[worst] < OUTLIER * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
+        if not matters[worst] or caused[worst] < FIT.outlier * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
             return keep, tuple(rejected)
         joint = int(np.argmax(np.abs(held_out[worst] / used.sigma[worst])))
         index = int(np.flatnonzero(keep)[worst])

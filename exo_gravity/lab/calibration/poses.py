@@ -8,6 +8,7 @@ file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,24 +21,52 @@ from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
 from exo_gravity.lab.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
 
-UNSURE = 0.4  # of a moment: masses and torque scales that are each off by 30 %
-UNSURE_MOMENT = 0.02  # kg m, in addition: off-axis moments of which the file knows nothing
-UNEXPLAINED = 0.05  # Nm: standard deviation of what no moment explains
-CANDIDATES = 800
-MOST_UPWARDS = 0.3  # sine of the largest angle above the horizontal, of links 3 and 4
-SHARE = 0.85  # of max_effort that a pose may need
-DEVIATIONS = 2.0  # of the expected torque, that a pose must leave room for; less where none does
-LEAST_DEVIATION = 1e-9  # Nm
-USUAL_FRICTION = 0.5  # Nm, until it is measured
-WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
-FIRST_EDGE = 0.1  # rad in addition, at the first pose
-EDGE = 0.02  # rad between a sweep's end and the soft wall
-TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
-SWEEP_SPEEDS = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  # rad/s, at which friction is measured
-SWEEP_TIME = 1.2  # s of such a sweep's half at steady speed
-SWEEP_AMPLITUDE = (0.05, 0.3)  # rad
-NOISE = 0.03  # Nm in any pose
-NOISE_SHARE = 0.02  # of the torque
+
+@dataclass(frozen=True)
+class Prior:
+    """How unsure the torque is that holds the arm, before a pose is measured."""
+
+    share: float = 0.4  #: of a moment: masses and torque scales that are each off by 30 %
+    moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
+    unexplained: float = 0.05  #: Nm: standard deviation of what no moment explains
+
+
+PRIOR = Prior()
+
+
+@dataclass(frozen=True)
+class PoseChoice:
+    """Which poses may be visited, and which of them shows most."""
+
+    candidates: int = 800  #: random poses, of which those above the horizontal are left out
+    most_upwards: float = 0.3  #: sine of the largest angle above the horizontal, of links 3 and 4
+    effort_share: float = 0.85  #: of max_effort that a pose may need
+    deviations: float = 2.0  #: of the expected torque, that a pose must leave room for; less where none does
+    least_deviation: float = 1e-9  #: Nm
+    usual_friction: float = 0.5  #: Nm, until it is measured
+    waypoints: int = 8  #: of the way to a pose, at which the motors must hold the arm too
+    first_edge: float = 0.1  #: rad in addition, at the first pose
+    edge: float = 0.02  #: rad between a sweep's end and the soft wall
+    time_share: float = 1.5  #: of the time left for each pose, that the next one may take
+    noise: float = 0.03  #: Nm in any pose
+    noise_share: float = 0.02  #: of the torque
+
+
+CHOICE = PoseChoice()
+
+
+@dataclass(frozen=True)
+class FrictionSweeps:
+    """The sweeps of the hanging arm that show its friction."""
+
+    speeds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  #: rad/s, at which friction is measured
+    time: float = 1.2  #: s of such a sweep's half at steady speed
+    amplitude: tuple[float, float] = (0.05, 0.3)  #: rad, smallest and largest
+
+
+SWEEPS = FrictionSweeps()
+
+
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 
@@ -45,12 +74,14 @@ GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30,
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
+    length: (4,) m.
+    moments: (8,) kg m, as in `core.arm.gravity`, with the load.
+    tilt: of the trunk or the stand.
     """
 
     def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
         moments = np.asarray(moments, dtype=float)
-        deviation = UNSURE * np.abs(moments) + UNSURE_MOMENT
+        deviation = PRIOR.share * np.abs(moments) + PRIOR.moment
         self.length = np.asarray(length, dtype=float)
         self.tilt = tilt
         self.gravity = gravity
@@ -83,7 +114,7 @@ class TorqueGuess:
         rows = regressor(theta, self.tilt.direction, self.gravity)[0]
         for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
             covariance = self._covariance[joint]
-            gain = covariance @ row / (row @ covariance @ row + error**2 + UNEXPLAINED**2)
+            gain = covariance @ row / (row @ covariance @ row + error**2 + PRIOR.unexplained**2)
             self._mean[joint] += gain * (torque - row @ self._mean[joint])
             self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
         self._arms = self._as_arms()
@@ -98,7 +129,8 @@ class TorqueGuess:
 class Itinerary:
     """Visits given stations, then others until `count` poses are measured, each the one that shows the most.
 
-    given: by default the hanging arm. duration: s, of the whole tour, which the choice keeps within.
+    given: by default the hanging arm.
+    duration: s, of the whole tour, which the choice keeps within.
     """
 
     def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
@@ -112,9 +144,12 @@ class Itinerary:
     ) -> Station | None:
         """Return the next of the given stations, then the best of the candidates that can be held and reached.
 
-        taken: (n, 4) rad, the poses measured so far. position: (4,) rad, where the arm is. elapsed: s since the start
-        of the tour. friction: (4,) Nm, 0 if unknown. Returns None after the last; raises DataError if no pose can be
-        held.
+        taken: (n, 4) rad, the poses measured so far.
+        position: (4,) rad, where the arm is.
+        elapsed: s since the start of the tour.
+        friction: (4,) Nm, 0 if unknown.
+
+        Returns None after the last; raises DataError if no pose can be held.
         """
         station = next(self._given, None)
         if station or len(taken) >= self._most:
@@ -123,7 +158,7 @@ class Itinerary:
         room = self._room(self._candidates[in_time], position, guess, friction)
         if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
-        possible = in_time[room >= min(DEVIATIONS, math.floor(room.max()))]
+        possible = in_time[room >= min(CHOICE.deviations, math.floor(room.max()))]
         seen, poses = list(taken) or [self._home.theta], self._candidates[possible]
         index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
         pose = self._candidates[index]
@@ -138,7 +173,7 @@ class Itinerary:
         )
         budget = (self._duration - elapsed - home) / left
         sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
-        fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
+        fits = way + sweeps <= budget * (CHOICE.time_share if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
@@ -147,26 +182,32 @@ class Itinerary:
         It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
         known. friction: (4,) Nm, against which the arm is moved.
         """
-        shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
+        shares = np.linspace(0.0, 1.0, CHOICE.waypoints + 1)[1:, None, None]
         sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
         start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
         mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
-        most = SHARE * np.array(self._limits.max_effort) - [own or USUAL_FRICTION for own in friction]
-        room = ((most - np.abs(mean)) / np.maximum(deviation, LEAST_DEVIATION)).min(axis=1).reshape(-1, len(poses))
+        most = CHOICE.effort_share * np.array(self._limits.max_effort) - [
+            own or CHOICE.usual_friction for own in friction
+        ]
+        room = (
+            ((most - np.abs(mean)) / np.maximum(deviation, CHOICE.least_deviation)).min(axis=1).reshape(-1, len(poses))
+        )
         is_home = np.arange(len(room))[:, None] >= len(room) - len(home)
         return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
 
 
 def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
-    """Return the hanging arm, off the soft walls by FIRST_EDGE: friction is not known there at first."""
+    """Return the hanging arm, farther off the soft walls than other poses: friction is not known there at first."""
     low, high = measurable(limits, amplitude)
-    return Station(tuple(np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE).tolist()), speed, amplitude)
+    return Station(
+        tuple(np.clip(limits.home, low + CHOICE.first_edge, high - CHOICE.first_edge).tolist()), speed, amplitude
+    )
 
 
 def friction_stations(limits: Limits) -> list[Station]:
     """Return sweeps through the hanging arm at each speed; the first lets the controller learn the friction."""
-    speeds = (0.1, *SWEEP_SPEEDS)
-    amplitudes = np.clip(np.array(speeds) * SWEEP_TIME, *SWEEP_AMPLITUDE).tolist()
+    speeds = (0.1, *SWEEPS.speeds)
+    amplitudes = np.clip(np.array(speeds) * SWEEPS.time, *SWEEPS.amplitude).tolist()
     return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
 
 
@@ -175,14 +216,14 @@ def candidates(limits: Limits) -> np.ndarray:
 
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
-    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CANDIDATES, JOINT_COUNT))
+    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CHOICE.candidates, JOINT_COUNT))
     down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
-    return np.asarray(poses[down.min(axis=1) >= -MOST_UPWARDS])
+    return np.asarray(poses[down.min(axis=1) >= -CHOICE.most_upwards])
 
 
 def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest pose (4,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
-    margin = WALL_WIDTH + amplitude + EDGE
+    margin = WALL_WIDTH + amplitude + CHOICE.edge
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 
@@ -191,8 +232,10 @@ def next_pose(
 ) -> int:
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
-    taken: (4,) rad each, none at the start. candidates: (n, 4) rad. direction: (3,), gravity's unit vector in the base
-    frame. moments: (8,) kg m, a guess.
+    taken: (4,) rad each, none at the start.
+    candidates: (n, 4) rad.
+    direction: (3,), gravity's unit vector in the base frame.
+    moments: (8,) kg m, a guess.
     """
     seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
     information = np.diag(NATURAL**-2.0) + seen.T @ seen
@@ -211,10 +254,10 @@ def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
     """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 22)."""
-    nothing = np.zeros((len(theta), JOINT_COUNT))
+    unused = np.zeros((len(theta), JOINT_COUNT))  # what was measured
     down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
-    rows = Rows(along_axes(theta, gravity), down, no_load, nothing, nothing)
+    rows = Rows(along_axes(theta, gravity), down, no_load, unused, unused)
     unknowns = START.copy()
     unknowns[MOMENT] = moments
-    noise = np.hypot(NOISE, NOISE_SHARE * rows.predicted(unknowns))
+    noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))
     return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(COUNT) < TILT.start))

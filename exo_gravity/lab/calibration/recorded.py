@@ -6,7 +6,7 @@ arm would stay with any torque inside it.
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from rosbags.serde import SerdeError
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import BINS, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.bag.joints import TYPES
 from exo_gravity.lab.bag.reader import read_bag
@@ -25,19 +26,30 @@ from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
 
 TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
-SPEED = (0.008, 0.35)  # rad/s: slower is held, faster has inertia
-SPEED_WINDOW = 0.2  # s over which the speed is taken
-EDGE = 0.25  # of the common way of two sweeps, left out at each end, where they turn
-LEAST_WAY = 0.03  # rad that each joint must turn in both directions
-LONGEST_TURN = 3.0  # s between a sweep and the one back
-HELD_TIME = 1.0  # s
-UNKNOWN_FRICTION = 0.4  # Nm, of a joint of which no sweep was recorded
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What counts as a sweep there and back, and as a held pose."""
+
+    speed: tuple[float, float] = (0.008, 0.35)  #: rad/s: slower is held, faster has inertia
+    window: float = 0.2  #: s over which the speed is taken
+    edge: float = 0.25  #: of the common way of two sweeps, left out at each end, where they turn
+    least_way: float = 0.03  #: rad that each joint must turn in both directions
+    longest_turn: float = 3.0  #: s between a sweep and the one back
+    held_time: float = 1.0  #: s for which a pose must be held
+    unknown_friction: float = 0.4  #: Nm, of a joint of which no sweep was recorded
+
+
+DETECTION = Detection()
 
 
 def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
 
-    with_held: False for sweeps alone, which show friction. Raises DataError if there are none.
+    with_held: False for sweeps alone, which show friction.
+
+    Raises DataError if there are none.
     """
     bag = read_bag(path)
     recording = recording_of(bag, arm)
@@ -48,7 +60,7 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     if with_held:
         observations += list(_held(recording, down, observations))
     if not observations:
-        held = f", or held one for {HELD_TIME:g} s" if with_held else ""
+        held = f", or held one for {DETECTION.held_time:g} s" if with_held else ""
         raise DataError(f"{path}: {arm.name} never passed a pose slowly there and back, all joints turning{held}")
     return observations
 
@@ -105,16 +117,16 @@ def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
     for there, back in pairwise(runs):
         ends = position[[there.start, there.stop - 1, back.start, back.stop - 1]]
         way, way_back = ends[1] - ends[0], ends[3] - ends[2]
-        is_late = time[back.start] - time[there.stop - 1] > LONGEST_TURN
+        is_late = time[back.start] - time[there.stop - 1] > DETECTION.longest_turn
         if there.start < used or is_late or np.any(way * way_back >= 0.0):
             continue
         low = np.maximum(ends[:2].min(axis=0), ends[2:].min(axis=0))
         high = np.minimum(ends[:2].max(axis=0), ends[2:].max(axis=0))
         middles = []
         for run in (there, back):
-            is_inside = np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - EDGE)
+            is_inside = np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - DETECTION.edge)
             middles.append(np.flatnonzero(np.all(is_inside, axis=1)) + run.start)
-        if np.any(high - low < LEAST_WAY) or min(map(len, middles)) < 2 * BINS:
+        if np.any(high - low < DETECTION.least_way) or min(map(len, middles)) < 2 * BINS:
             continue
         used = back.stop
         speeds = [np.ptp(position[part[[0, -1]]], axis=0) / np.ptp(time[part]) for part in middles]
@@ -126,10 +138,10 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     """Yield the runs between `start` and `end` s in which every joint turns slowly without turning round."""
     first, beyond = np.searchsorted(recording.time, start), np.searchsorted(recording.time, end, "right")
     time, position = recording.time[first:beyond], recording.position[first:beyond]
-    later = np.minimum(np.searchsorted(time, time + SPEED_WINDOW), len(time) - 1)
+    later = np.minimum(np.searchsorted(time, time + DETECTION.window), len(time) - 1)
     speed = (position[later] - position) / np.maximum(time[later] - time, 1e-3)[:, None]
-    is_slow = np.all((np.abs(speed) >= SPEED[0]) & (np.abs(speed) <= SPEED[1]), axis=1)
-    way = np.where(is_slow, np.sign(speed) @ (27, 9, 3, 1), 0.5)
+    is_slow = np.all((np.abs(speed) >= DETECTION.speed[0]) & (np.abs(speed) <= DETECTION.speed[1]), axis=1)
+    way = np.where(is_slow, np.sign(speed) @ 3.0 ** np.arange(JOINT_COUNT), 0.5)
     edges = np.flatnonzero(np.diff(way, prepend=np.nan, append=np.nan) != 0.0)
     for low, high in pairwise(edges.tolist()):
         if is_slow[low] and high - low > 4 * BINS:
@@ -138,9 +150,11 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
 
 def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:
     """Yield an observation for every pose that was held, as uncertain as the friction of `sweeps`."""
-    friction = np.abs(np.median([s.friction for s in sweeps], axis=0)) if sweeps else np.full(4, UNKNOWN_FRICTION)
+    friction = np.full(JOINT_COUNT, DETECTION.unknown_friction)
+    if sweeps:
+        friction = np.abs(np.median([sweep.friction for sweep in sweeps], axis=0))
     for start, end in still_spans(recording, in_blocks(recording)):
-        if end - start >= HELD_TIME:
+        if end - start >= DETECTION.held_time:
             part = (recording.time >= start) & (recording.time <= end)
             effort = recording.effort[part]
             spread = np.hypot(friction / math.sqrt(3.0), effort.std(axis=0))

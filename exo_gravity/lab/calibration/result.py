@@ -80,8 +80,10 @@ def write_changes(
 ) -> None:
     """Write a copy of `params` with `changes` to `output`.
 
-    command: 'calibrate gravity', for the comments. Raises ParameterError if `output` exists, if a node is not in
-    `params`, or if a value cannot be set alone, because an anchor shares it with another entry.
+    command: 'calibrate gravity', for the comments.
+
+    Raises ParameterError if `output` exists, if a node is not in `params`, or if a value cannot be set alone, because
+    an anchor shares it with another entry.
     """
     check_output(output)
     wanted = load(params)

@@ -8,6 +8,7 @@ of the body-mass table: torque shows only mass times distance.
 
 import argparse
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,15 +33,26 @@ from exo_gravity.lab.inputs.arms import ConfiguredArm
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
-WEARER_POSES = 4  # the hanging arm and three others
-BREATHING = 0.1  # Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
-TYPICAL_BODY_MASS = 70.0  # kg
-# rad: a comfortable part of the joints' ranges.
-COMFORTABLE = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
+
+
+@dataclass(frozen=True)
+class WearerTour:
+    """The tour of a worn arm, and which masses a wearer can have."""
+
+    poses: int = 4  #: the hanging arm and three others
+    #: rad: a comfortable part of the joints' ranges.
+    comfortable: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
+    breathing: float = 0.1  #: Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
+    body_mass: float = 70.0  #: kg, where the file has none
+    largest_error: float = 0.25  #: of a mass, as a standard error
+    most: float = 15.0  #: kg of a person's arm
+    table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled moments that are plausible
+
+
+WEARER = WearerTour()
+
+
 WORN = ("upper arm", "forearm and hand")  # on links 3 and 4
-LARGEST_ERROR = 0.25  # of a mass, as a standard error
-MOST = 15.0  # kg of a person's arm
-TABLE_RATIO = (0.6, 1.6)  # measured to tabled moments that are plausible
 
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -54,7 +66,8 @@ def _observations(
 ) -> list[Observation]:  # fmt: skip
     """Return what a tour measures, or what `options.bag` shows.
 
-    changes, moments: as for `tour_parameters`. request: what a person does first; they cannot reach a simulated device.
+    changes, moments: as for `tour_parameters`.
+    request: what a person does first; they cannot reach a simulated device.
     """
     if options.bag:
         return observations_of(options.bag, arm, with_held="tour.friction" not in changes)
@@ -163,8 +176,8 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
     # Few poses, in a comfortable range, with the weight that the table expects.
-    low, high = np.maximum(arm.low, COMFORTABLE[0]), np.minimum(arm.high, COMFORTABLE[1])
-    changes = {"tour.poses": WEARER_POSES, "position_min": low.tolist(), "position_max": high.tolist()}
+    low, high = np.maximum(arm.low, WEARER.comfortable[0]), np.minimum(arm.high, WEARER.comfortable[1])
+    changes = {"tour.poses": WEARER.poses, "position_min": low.tolist(), "position_max": high.tolist()}
     expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
     request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
     return wearer_from(arm, _observations(options, arm, say, changes, request, expected))
@@ -177,7 +190,7 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     theta, direction, effort, spread = columns(observations)
     cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
     per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
-    weight = 1.0 / np.hypot(spread, BREATHING).ravel()
+    weight = 1.0 / np.hypot(spread, WEARER.breathing).ravel()
     matrix = (rows[..., :JOINT_COUNT] @ per_mass).reshape(-1, 2) * weight[:, None]
     extra = (effort - rows @ moments_of(arm.robot)).ravel() * weight
     covariance = np.linalg.pinv(matrix.T @ matrix)
@@ -187,10 +200,10 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
     moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
     for part, own, e in zip(WORN, mass, error, strict=True):
-        if not 0.0 < own < MOST:
+        if not 0.0 < own < WEARER.most:
             relaxed = "is the arm relaxed, the robot calibrated?"
-            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {MOST:g}: {relaxed}")
-        if e > LARGEST_ERROR * own:
+            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {WEARER.most:g}: {relaxed}")
+        if e > WEARER.largest_error * own:
             raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
     node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
     changes = (
@@ -198,11 +211,11 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
         Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
         Change(node, "model_error.wearer", round(float((moment_error / moments).max()), 3), "share of M3 and M4"),
     )
-    body_mass, (low, high) = arm.compensator["wearer.body_mass"], TABLE_RATIO
+    body_mass, (low, high) = arm.compensator["wearer.body_mass"], WEARER.table_ratio
     tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
     ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
     refusals: tuple[str, ...] = ()
-    compared = f"a person of {TYPICAL_BODY_MASS * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    compared = f"a person of {WEARER.body_mass * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
     if body_mass:
         compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
         if not np.all((ratio >= low) & (ratio <= high)):
@@ -216,5 +229,5 @@ def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], 
     values = arm.compensator
     if not tabled and all(values["wearer.mass"][2:]):
         return values["wearer.mass"], values["wearer.cog"]
-    body_mass = values["wearer.body_mass"] or TYPICAL_BODY_MASS
+    body_mass = values["wearer.body_mass"] or WEARER.body_mass
     return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})

@@ -6,6 +6,7 @@ dummy. A GIF has one palette for all frames, which keeps it small.
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -36,9 +37,22 @@ NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
 MAX_SHAPES = 4000
 AZIMUTH = {"left": 215.0, "right": 145.0}  # deg, of the camera: in front, on the arm's side
-BOTH_SIDES, ELEVATION, DISTANCE = 165.0, -8.0, 1.75  # deg, deg, m
-CENTRE = 0.24  # m below the shoulders, what the camera looks at
-FIELD_OF_VIEW = 38.0  # deg
+
+
+@dataclass(frozen=True)
+class Camera:
+    """From where the wearer is seen."""
+
+    both_sides: float = 165.0  #: deg, azimuth if both arms are worn
+    elevation: float = -8.0  #: deg
+    distance: float = 1.75  #: m
+    centre: float = 0.24  #: m below the shoulders, what the camera looks at
+    field_of_view: float = 38.0  #: deg
+
+
+CAMERA = Camera()
+
+
 GEOMS = {LINE: mujoco.mjtGeom.mjGEOM_CAPSULE, SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE}
 BODY, LIMB = (0.80, 0.76, 0.70, 1.0), (0.80, 0.70, 0.62, 0.3)  # the wearer, and the arms that are worn
 # Parts of the wearer between two points in m, relative to the middle of the shoulders, and their diameters. Those that
@@ -99,9 +113,9 @@ class Stage:
         names = [name for four in joint_names(arms) for name in four]
         self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
         self._camera = mujoco.MjvCamera()
-        self._camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CENTRE)
-        self._camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else BOTH_SIDES
-        self._camera.elevation, self._camera.distance = ELEVATION, DISTANCE
+        self._camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CAMERA.centre)
+        self._camera.azimuth = AZIMUTH[arms[0].side] if len(arms) == 1 else CAMERA.both_sides
+        self._camera.elevation, self._camera.distance = CAMERA.elevation, CAMERA.distance
         try:
             self._renderer = mujoco.Renderer(self._model, height, width, max_geom=MAX_SHAPES)
         except Exception as error:  # EGL, GLX and OSMesa raise what they like
@@ -147,7 +161,7 @@ class Stage:
         """Return where a point (3,) is in the picture, from the left and from above."""
         left, right = self._renderer.scene.camera
         forward, up, away = np.array(left.forward), np.array(left.up), point - np.add(left.pos, right.pos) / 2
-        scale = self._renderer.height / 2 / np.tan(np.radians(FIELD_OF_VIEW) / 2) / (away @ forward)
+        scale = self._renderer.height / 2 / np.tan(np.radians(CAMERA.field_of_view) / 2) / (away @ forward)
         across = away @ np.cross(forward, up) * scale
         return self._renderer.width / 2 + across, self._renderer.height / 2 - away @ up * scale
 
@@ -203,7 +217,7 @@ def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
     seen = '<mujoco><compiler discardvisual="false" fusestatic="false"/></mujoco></robot>'
     spec = mujoco.MjSpec.from_string(urdf(arms).replace("</robot>", seen))
     spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
-    spec.visual.global_.fovy = FIELD_OF_VIEW
+    spec.visual.global_.fovy = CAMERA.field_of_view
     spec.visual.quality.offsamples, spec.visual.quality.numslices, spec.visual.quality.numstacks = 2, 16, 8
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = (0.45,) * 3, (0.35,) * 3
     spec.add_texture(

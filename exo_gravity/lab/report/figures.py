@@ -105,7 +105,7 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
 
 
 def wearer(recording: Recording, part: WearerPart) -> Figure:
-    """Return the wearer's torque at each joint and his share over time, with their 95 % bands."""
+    """Return the wearer's torque at each joint and their share over time, with their 95 % bands."""
     figure, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
     axes = figure.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
     rows = [*curve.torque.T, 100.0 * part.sliding.value]

@@ -19,15 +19,24 @@ from itertools import pairwise
 import numpy as np
 
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.lab.trial.recording import MARGIN, Blocks, Recording, Span, in_blocks, still_spans
+from exo_gravity.lab.trial.recording import STILLNESS, Blocks, Recording, Span, in_blocks, still_spans
 from exo_gravity.sim.script import TRUNK_ACTIONS
 
 MIN_HOLD = 2.0  # s
-WINDOW = 10.0  # s, over which `Hold.stray` is judged
-POSE_TIME = 0.5  # s before and after a motion, over which its first and last pose are averaged
-PUSH_OFFSET = 0.35  # rad (20 degrees); a motion that ends farther away is a move to another pose
-HUBER = 1.345  # standard deviations; gives 95 % efficiency on normal noise
-MAX_PARTS = 30  # parts of a hold, to whose means the slope is fitted
+
+
+@dataclass(frozen=True)
+class AnalysisTuning:
+    """How holds and motions are told apart and measured."""
+
+    window: float = 10.0  #: s, over which `Hold.stray` is judged
+    pose_time: float = 0.5  #: s before and after a motion, over which its first and last pose are averaged
+    push_offset: float = 0.35  #: rad (20 degrees); a motion that ends farther away is a move to another pose
+    huber: float = 1.345  #: standard deviations; gives 95 % efficiency on normal noise
+    parts: int = 30  #: parts of a hold, to whose means the slope is fitted
+
+
+TUNING = AnalysisTuning()
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,11 +132,11 @@ def _hold(recording: Recording, blocks: Blocks, resolution: np.ndarray, span: Sp
     within = blocks.between(*span)
     samples = slice(*blocks.sample[[within.start, within.stop]])
     mean = blocks.mean[within]
-    parts = np.array_split(np.arange(len(mean)), min(len(mean), MAX_PARTS))
+    parts = np.array_split(np.arange(len(mean)), min(len(mean), TUNING.parts))
     part_time = np.array([blocks.time[within][part].mean() for part in parts])
     part_mean = np.array([mean[part].mean(axis=0) for part in parts])
     rate, scatter = robust_slope(part_time, part_mean, resolution)
-    width = min(len(mean), max(1, round(WINDOW / blocks.length)))
+    width = min(len(mean), max(1, round(TUNING.window / blocks.length)))
     windows = np.lib.stride_tricks.sliding_window_view(mean, width, axis=0)
     effort, command = recording.effort[samples], recording.command[samples]
     return Hold(
@@ -158,25 +167,25 @@ def robust_slope(x: np.ndarray, y: np.ndarray, resolution: np.ndarray) -> tuple[
         slope = (weight * dx * dy).sum(axis=0) / spread
         residual = np.abs(dy - slope * dx)
         scale = np.maximum(1.4826 * np.median(residual, axis=0), resolution / 2) + 1e-12
-        weight = np.minimum(1.0, HUBER * scale / np.maximum(residual, 1e-12))
+        weight = np.minimum(1.0, TUNING.huber * scale / np.maximum(residual, 1e-12))
     return slope, np.sqrt((weight * residual**2).sum(axis=0) / (len(x) - 2) / spread)
 
 
 def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Motion:
     """Return the motion from the end of span `left` to the start of `right`, which is empty if no hold followed."""
-    before = blocks.mean[blocks.between(max(left[0], left[1] - POSE_TIME), left[1])].mean(axis=0)
-    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + POSE_TIME))].mean(axis=0)
+    before = blocks.mean[blocks.between(max(left[0], left[1] - TUNING.pose_time), left[1])].mean(axis=0)
+    after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + TUNING.pose_time))].mean(axis=0)
     within = blocks.between(left[1], right[0])
     samples = slice(*blocks.sample[[within.start, within.stop]])
     away = np.vstack((np.zeros(JOINT_COUNT), recording.position[samples] - before))
-    settled, residual = right[1] > right[0], after - before
+    is_still, residual = right[1] > right[0], after - before
     return Motion(
         kind=_kind(recording, left[1], right[0], bool(blocks.empty[within].any()), residual),
         start=left[1],
         end=right[0],
         peak=away[np.abs(away).argmax(axis=0), np.arange(JOINT_COUNT)],
-        residual=residual if settled else np.full(JOINT_COUNT, math.nan),
-        until_still=max(0.0, right[0] - left[1] - MARGIN) if settled else math.nan,
+        residual=residual if is_still else np.full(JOINT_COUNT, math.nan),
+        until_still=max(0.0, right[0] - left[1] - STILLNESS.margin) if is_still else math.nan,
         speed=np.abs(recording.velocity[samples]).max(axis=0, initial=0.0),
     )
 
@@ -188,7 +197,7 @@ def _kind(recording: Recording, start: float, end: float, empty: bool, residual:
     if empty:
         return "gap"
     if not recording.steps:
-        return "push" if np.all(np.abs(residual) < PUSH_OFFSET) else "move"
+        return "push" if np.all(np.abs(residual) < TUNING.push_offset) else "move"
     return next((action for action in ("move", "push", *TRUNK_ACTIONS) if action in actions), "slip")
 
 

@@ -1,7 +1,7 @@
 """The recorded arrays of one arm, and the time spans in which it was carried, left alone and still.
 
 Stillness is judged from position only. Motors report velocity in steps of 22 to 24 mrad/s without a code for 0, so a
-motor at rest reports half a step. Position has steps of 0.38 mrad, and `STILL_SPEED` over two blocks is ten of them.
+motor at rest reports half a step. Position has steps of 0.38 mrad, and the speed limit over two blocks is ten of them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,9 +14,18 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import State
 
-BLOCK = 0.1  # s, the time resolution of the analysis
-STILL_SPEED = 0.02  # rad/s, or 69 degrees per minute: an arm that moves faster is not held
-MARGIN = 0.2  # s cut off at both ends of a still span, where a smooth motion can be slower than STILL_SPEED
+
+@dataclass(frozen=True)
+class Stillness:
+    """When an arm counts as still."""
+
+    block: float = 0.1  #: s, the time resolution of the analysis
+    speed: float = 0.02  #: rad/s, or 69 degrees per minute: an arm that moves faster is not held
+    margin: float = 0.2  #: s cut off at both ends of a still span, where a smooth motion can be slower than `speed`
+
+
+STILLNESS = Stillness()
+
 
 ARRAYS = ("position", "velocity", "effort", "command")  # of a recording, (n, 4) each
 Span = tuple[float, float]  # start and end in s
@@ -99,7 +108,7 @@ class Blocks(NamedTuple):
 def in_blocks(recording: Recording) -> Blocks:
     """Return the recording in blocks of 0.1 s, or of three samples if its rate is below 30 Hz."""
     time, position = recording.time, recording.position
-    length = max(BLOCK, 3.0 * float(np.median(np.diff(time))))
+    length = max(STILLNESS.block, 3.0 * float(np.median(np.diff(time))))
     count = int((time[-1] - time[0]) / length) + 1
     starts = time[0] + length * np.arange(count + 1)
     sample = np.searchsorted(time, starts)
@@ -110,7 +119,7 @@ def in_blocks(recording: Recording) -> Blocks:
     mean = np.add.reduceat(position, first, axis=0, dtype=float) / np.maximum(filled, 1)[:, None]
     low, high = (extreme.reduceat(position, first, axis=0) for extreme in (np.minimum, np.maximum))
     low[1:], high[1:] = np.minimum(low[1:], low[:-1]), np.maximum(high[1:], high[:-1])
-    still = np.all(high - low < STILL_SPEED * 2 * length, axis=1) & (filled > 0)
+    still = np.all(high - low < STILLNESS.speed * 2 * length, axis=1) & (filled > 0)
     return Blocks(starts, sample, mean, still, filled == 0)
 
 
@@ -120,6 +129,6 @@ def still_spans(recording: Recording, blocks: Blocks) -> Iterator[Span]:
     windows = [(step.start, step.end) for step in recording.steps if step.action == "hold"]
     for first, beyond in zip(edges[::2], edges[1::2], strict=True):
         # A block is still if it is still together with the block before it.
-        start, end = blocks.time[max(first - 1, 0)] + MARGIN, blocks.time[beyond] - MARGIN
+        start, end = blocks.time[max(first - 1, 0)] + STILLNESS.margin, blocks.time[beyond] - STILLNESS.margin
         for low, high in windows if recording.steps else ((start, end),):
             yield from recording.while_carried(float(max(start, low)), float(min(end, high)))

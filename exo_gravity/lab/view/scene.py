@@ -1,11 +1,12 @@
 """What a viewer shows around the arms: gravity, the torque and the limits of each joint, and the state of each arm.
 
 Every shape is given in the trunk's axes, so that a viewer needs no transforms for it. A joint's range is an arc around
-its axis, and its torque a second, smaller arc, which spans `TORQUE_SPAN` at the joint's torque limit.
+its axis, and its torque a second, smaller arc, which spans `SIZES.torque_span` at the joint's torque limit.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,20 +21,39 @@ Colour = tuple[float, float, float, float]
 ARROW, LINE, TEXT, SPHERE = "arrow", "line", "text", "sphere"
 GREEN, AMBER, RED = (0.20, 0.70, 0.30, 1.0), (0.95, 0.65, 0.10, 1.0), (0.85, 0.15, 0.15, 1.0)
 GREY, BLUE = (0.60, 0.60, 0.60, 1.0), (0.20, 0.45, 0.85, 1.0)
-RANGE_RADIUS, TORQUE_RADIUS = 0.11, 0.075  # m
-TORQUE_SPAN = math.radians(270.0)
-ARC_STEP = math.radians(6.0)
-GRAVITY_FROM, GRAVITY_LENGTH = (0.30, 0.0, 0.10), 0.25  # m, in front of the chest
-STATE_HEIGHT = 0.20  # m above the shoulder
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large each shape is."""
+
+    range_radius: float = 0.11  #: m
+    torque_radius: float = 0.075  #: m
+    torque_span: float = math.radians(270.0)  #: rad, of the arc of a joint at its torque limit
+    arc_step: float = math.radians(6.0)  #: rad between two points of an arc
+    gravity_from: tuple[float, float, float] = (0.30, 0.0, 0.10)  #: m, in front of the chest
+    gravity_length: float = 0.25  #: m
+    state_height: float = 0.20  #: m above the shoulder
+    limit_width: float = 0.004  #: m
+    torque_width: float = 0.016  #: m
+    arrow_width: float = 0.012  #: m
+    text_height: float = 0.035  #: m
+    sphere_size: float = 0.05  #: m, diameter
+
+
+SIZES = Sizes()
+
+
 RESTING = 0.05  # rad/s, below which a carried arm is held; twice the step of the motors' speed
-LIMIT_WIDTH, TORQUE_WIDTH, ARROW_WIDTH, TEXT_HEIGHT, SPHERE_SIZE = 0.004, 0.016, 0.012, 0.035, 0.05  # m
 
 
 class Shape(NamedTuple):
     """One thing to draw.
 
-    group: 'gravity', 'torques', 'limits' or 'states'. kind: ARROW from the first point to the second, LINE through the
-    points, TEXT or SPHERE at the first point. points: (n, 3) m. size: m, width of a line, height of a text, diameter.
+    group: 'gravity', 'torques', 'limits' or 'states'.
+    kind: ARROW from the first point to the second, LINE through the points, TEXT or SPHERE at the first point.
+    points: (n, 3) m.
+    size: m, width of a line, height of a text, diameter.
     """
 
     group: str
@@ -58,9 +78,9 @@ class ArmView(NamedTuple):
 def gravity_shapes(gravity: Vector | None) -> list[Shape]:
     """Return the arrow of gravity for its unit vector (3,) in the trunk's axes; None: the tilt is not known."""
     if gravity is None:
-        return [Shape("gravity", TEXT, np.array([GRAVITY_FROM]), TEXT_HEIGHT, RED, "no tilt")]
-    points = np.array((GRAVITY_FROM, np.add(GRAVITY_FROM, np.multiply(GRAVITY_LENGTH, gravity))))
-    return [Shape("gravity", ARROW, points, ARROW_WIDTH, BLUE)]
+        return [Shape("gravity", TEXT, np.array([SIZES.gravity_from]), SIZES.text_height, RED, "no tilt")]
+    points = np.array((SIZES.gravity_from, np.add(SIZES.gravity_from, np.multiply(SIZES.gravity_length, gravity))))
+    return [Shape("gravity", ARROW, points, SIZES.arrow_width, BLUE)]
 
 
 def arm_shapes(view: ArmView) -> list[Shape]:
@@ -69,20 +89,24 @@ def arm_shapes(view: ArmView) -> list[Shape]:
     for n, (origin, axis, along) in enumerate(zip(*arm_pose(view.arm, view.theta), strict=False)):
         low, high = limits.position_min[n] - view.theta[n], limits.position_max[n] - view.theta[n]
         colour = GREY if low + WALL_WIDTH <= 0.0 <= high - WALL_WIDTH else RED
-        tip = origin + RANGE_RADIUS * along
-        shapes.append(Shape("limits", LINE, _arc(origin, axis, along, low, high, RANGE_RADIUS), LIMIT_WIDTH, colour))
-        shapes.append(Shape("limits", LINE, np.array((origin, tip)), LIMIT_WIDTH, colour))
+        tip = origin + SIZES.range_radius * along
+        shapes.append(
+            Shape("limits", LINE, _arc(origin, axis, along, low, high, SIZES.range_radius), SIZES.limit_width, colour)
+        )
+        shapes.append(Shape("limits", LINE, np.array((origin, tip)), SIZES.limit_width, colour))
         effort, limit = view.effort[n], limits.max_effort[n]
         share = max(-1.0, min(1.0, effort / limit)) if limit > 0.0 else 0.0
-        arc = _arc(origin, axis, along, 0.0, share * TORQUE_SPAN, TORQUE_RADIUS)
+        arc = _arc(origin, axis, along, 0.0, share * SIZES.torque_span, SIZES.torque_radius)
         strength = RED if abs(share) >= 1.0 else AMBER if abs(share) > 0.5 else GREEN
-        shapes.append(Shape("torques", LINE, arc, TORQUE_WIDTH, strength))
-        shapes.append(Shape("torques", TEXT, tip[None], TEXT_HEIGHT, strength, f"{round(effort, 2) + 0.0:.2f} Nm"))
+        shapes.append(Shape("torques", LINE, arc, SIZES.torque_width, strength))
+        shapes.append(
+            Shape("torques", TEXT, tip[None], SIZES.text_height, strength, f"{round(effort, 2) + 0.0:.2f} Nm")
+        )
     colour, state = state_of(view)
-    above = np.add([view.arm.base], (0.0, 0.0, STATE_HEIGHT))
-    shapes.append(Shape("states", SPHERE, above, SPHERE_SIZE, colour))
-    over = np.add(above, (0.0, 0.0, SPHERE_SIZE))
-    return [*shapes, Shape("states", TEXT, over, TEXT_HEIGHT, colour, f"{view.arm.side}: {state}")]
+    above = np.add([view.arm.base], (0.0, 0.0, SIZES.state_height))
+    shapes.append(Shape("states", SPHERE, above, SIZES.sphere_size, colour))
+    over = np.add(above, (0.0, 0.0, SIZES.sphere_size))
+    return [*shapes, Shape("states", TEXT, over, SIZES.text_height, colour, f"{view.arm.side}: {state}")]
 
 
 def state_of(view: ArmView) -> tuple[Colour, str]:
@@ -99,5 +123,5 @@ def _arc(
     origin: np.ndarray, axis: np.ndarray, along: np.ndarray, start: float, end: float, radius: float
 ) -> np.ndarray:
     """Return points (n, 3) on the arc around `axis` from angle `start` to `end` in rad from the direction `along`."""
-    angles = np.linspace(start, end, 2 + int(abs(end - start) / ARC_STEP))[:, None]
+    angles = np.linspace(start, end, 2 + int(abs(end - start) / SIZES.arc_step))[:, None]
     return np.asarray(origin + radius * (np.cos(angles) * along + np.sin(angles) * np.cross(axis, along)))

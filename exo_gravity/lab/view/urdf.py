@@ -115,7 +115,9 @@ def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
     """Return the URDF of one arm a side, with the root link `trunk`.
 
     meshes: address of a folder (package:// or file://) with LINK.stl for every link, each in the frame of its joint and
-    in m; '' draws tubes and motors. Raises ParameterError if two arms are on one side, or a link has no mass.
+    in m; '' draws tubes and motors.
+
+    Raises ParameterError if two arms are on one side, or a link has no mass.
     """
     sides = [arm.side for arm in arms]
     if not arms or len(set(sides)) != len(sides):

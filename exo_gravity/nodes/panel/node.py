@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,12 +37,22 @@ from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, LoadChanges, Values, joint_rows, setup_of
 
-STATE_PERIOD = 0.1  # s between two states that the pages get
-DISCOVERY_PERIOD = 0.5  # s between two searches for nodes
-SILENT = 1.5  # s without diagnostics or joint states after which the last ones are not shown any more
-CALL_TIMEOUT = 3.0  # s, longer than can_bridge itself waits
-ABSENT_TIMEOUT = 0.5  # s, where the service seems to be absent
-LOOK_PERIOD = 0.005  # s between two looks for an answer
+
+@dataclass(frozen=True)
+class Timing:
+    """When the panel looks, and how long it waits."""
+
+    state_period: float = 0.1  #: s between two states that the pages get
+    discovery_period: float = 0.5  #: s between two searches for nodes
+    silent: float = 1.5  #: s without diagnostics or joint states after which the last ones are not shown any more
+    call_timeout: float = 3.0  #: s, longer than can_bridge itself waits
+    absent_timeout: float = 0.5  #: s, where the service seems to be absent
+    look_period: float = 0.005  #: s between two looks for an answer
+
+
+TIMING = Timing()
+
+
 BRIDGE, COMPENSATOR = "can_bridge", "compensator"
 SIMULATOR = "simulator"
 SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", SIMULATOR: "simulator"}  # what the page calls the status of each
@@ -100,8 +110,10 @@ class Arms:
         """Return what the page shows of each arm; None in the place of what is old."""
         shown = {}
         for name, client in sorted(self.clients.items(), reverse=True):
-            statuses = {kind: self._statuses.within(SILENT, f"{name}/{leaf}") or None for leaf, kind in SHOWN.items()}
-            shown[name] = {"joints": client.joints.within(SILENT), **statuses}
+            statuses = {
+                kind: self._statuses.within(TIMING.silent, f"{name}/{leaf}") or None for leaf, kind in SHOWN.items()
+            }
+            shown[name] = {"joints": client.joints.within(TIMING.silent), **statuses}
         return shown
 
     def nodes(self) -> dict[str, tuple[Values, Values]]:
@@ -158,7 +170,7 @@ class Arms:
 
     def _report(self, arm: str) -> dict[str, Any]:
         """Return what the arm's bridge reports; {} if it is silent."""
-        return self._statuses.within(SILENT, f"{arm}/{BRIDGE}")
+        return self._statuses.within(TIMING.silent, f"{arm}/{BRIDGE}")
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._others.found:
@@ -168,12 +180,12 @@ class Arms:
 async def call(client: Client, request: Any) -> str:
     """Send `request` at once; return '' if it was carried out, else why not."""
     sent = client.call_async(request)
-    deadline = time.monotonic() + (CALL_TIMEOUT if client.service_is_ready() else ABSENT_TIMEOUT)
+    deadline = time.monotonic() + (TIMING.call_timeout if client.service_is_ready() else TIMING.absent_timeout)
     while not sent.done():
         if time.monotonic() > deadline:
             client.remove_pending_request(sent)
             return f"{client.srv_name} does not answer"
-        await asyncio.sleep(LOOK_PERIOD)
+        await asyncio.sleep(TIMING.look_period)
     response: Any = sent.result()
     if isinstance(response, SetParametersAtomically.Response):
         is_done, reason = response.result.successful, response.result.reason
@@ -210,8 +222,8 @@ class Panel(Node):
             missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
             raise ExoGravityError(missing) from None
         self._server = PanelServer(values["host"], values["port"], values["token"], control)
-        self.create_timer(STATE_PERIOD, self._send_state)
-        self.create_timer(DISCOVERY_PERIOD, self._arms.discover)
+        self.create_timer(TIMING.state_period, self._send_state)
+        self.create_timer(TIMING.discovery_period, self._arms.discover)
         self._log_address(values["host"], values["port"])
 
     def close(self) -> None:
@@ -243,7 +255,7 @@ class Panel(Node):
             self._shown = nodes
             self._server.setup = {**self._own_setup, **setup_of(nodes)}
         arms = self._changes.with_causes(self._arms.state(), nodes, time.monotonic())
-        self._server.state = {"arms": arms, "tilt": self._tilt.within(SILENT), **self._recordings.state()}
+        self._server.state = {"arms": arms, "tilt": self._tilt.within(TIMING.silent), **self._recordings.state()}
 
 
 def tilt_shown(message: Vector3Stamped) -> dict[str, float] | None:

@@ -13,6 +13,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -45,13 +46,23 @@ TYPES = {  # of each topic that is recorded, or of its last part in an arm's nam
 }  # fmt: skip
 REPEATER = "robot_model"  # its joint states are those of the arms once more
 UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it has not discovered yet
-DRAIN_PERIOD = 0.05  # s between two writes of what has arrived
-DISCOVERY_PERIOD = 0.5  # s between two searches for new topics
-LIVE_PERIOD = 0.1  # s between two lines of live state, and two searches for new nodes
-DEPTH = 1000  # queued messages per topic: two seconds at 500 Hz
-LOSS_REPORT_PERIOD = 5.0  # s between two warnings of lost messages
-# After the launcher's death a bridge lets its arm down: this is recorded while joint states arrive.
-SILENCE = 0.5  # s without joint states, after which the arms are down
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the recorder looks and writes, and what it keeps until then."""
+
+    drain_period: float = 0.05  #: s between two writes of what has arrived
+    discovery_period: float = 0.5  #: s between two searches for new topics
+    live_period: float = 0.1  #: s between two lines of live state, and two searches for new nodes
+    loss_period: float = 5.0  #: s between two warnings of lost messages
+    depth: int = 1000  #: queued messages per topic: two seconds at 500 Hz
+    #: s without joint states, after which the arms are down: after the launcher's death a bridge lets its arm down, and
+    #: this is recorded
+    silence: float = 0.5
+
+
+TIMING = Timing()
 
 
 class Recorder(Node):
@@ -75,10 +86,10 @@ class Recorder(Node):
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
         self._nodes = OtherNodes(self, on_read=partial(self._guarded, "parameters", self._write_parameters), once=True)
         self._live = LiveLine() if values["live"] else None
-        self.create_timer(DRAIN_PERIOD, self._drain)
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
-        self.create_timer(LIVE_PERIOD, self._look)
-        self.create_timer(LOSS_REPORT_PERIOD, self._report_losses)
+        self.create_timer(TIMING.drain_period, self._drain)
+        self.create_timer(TIMING.discovery_period, self._discover)
+        self.create_timer(TIMING.live_period, self._update_live)
+        self.create_timer(TIMING.loss_period, self._report_losses)
         self._discover()
         self.get_logger().info(f"recording to {self._writer.path}")
 
@@ -87,7 +98,7 @@ class Recorder(Node):
         """Whether an arm may still be on its way down. The node's owner asks only once its launcher has died."""
         now = time.monotonic()
         self._orphaned = min(self._orphaned, now)
-        return now - self._last_states < SILENCE and now - self._orphaned < DESCENT_TIMEOUT
+        return now - self._last_states < TIMING.silence and now - self._orphaned < DESCENT_TIMEOUT
 
     def close(self) -> None:
         """Write what has arrived, and close the recording."""
@@ -118,7 +129,7 @@ class Recorder(Node):
             if msgtype and topic not in self._topics:
                 self._guarded(topic, self._subscribe, topic, msgtype)
 
-    def _look(self) -> None:
+    def _update_live(self) -> None:
         """Ask new nodes for their parameters, and print the live line."""
         self._guarded("parameters", self._nodes.update)
         if self._live:
@@ -157,7 +168,7 @@ class Recorder(Node):
         # A recorder must not make the control loops' publishers wait for acknowledgements.
         acknowledged = reliable and msgtype is not JointState
         qos = QoSProfile(
-            depth=DEPTH,
+            depth=TIMING.depth,
             reliability=ReliabilityPolicy.RELIABLE if acknowledged else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )

@@ -11,6 +11,7 @@ It only reads: nothing depends on it, and the arms run on if it ends.
 
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from builtin_interfaces.msg import Duration, Time
@@ -30,10 +31,21 @@ from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PITCH_YAW, Latest
 
 COMPENSATOR, BRIDGE = "compensator", "can_bridge"  # the nodes of an arm
-DISCOVERY_PERIOD = 0.5  # s between two searches for arms
-MARKER_PERIOD = 0.1  # s
-STALE = 0.5  # s after which a reading or a state is no longer shown
-STALE_STATE = 2.0  # s; states come twice a second
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the arms are looked for and shown, and until when."""
+
+    discovery_period: float = 0.5  #: s between two searches for arms
+    marker_period: float = 0.1  #: s between two sets of markers
+    stale: float = 0.5  #: s after which a reading or a state is no longer shown
+    stale_state: float = 2.0  #: s; states come twice a second
+
+
+TIMING = Timing()
+
+
 KINDS = {ARROW: Marker.ARROW, LINE: Marker.LINE_STRIP, SPHERE: Marker.SPHERE, TEXT: Marker.TEXT_VIEW_FACING}
 LIFETIME = Duration(nanosec=500_000_000)  # a marker that is no longer sent disappears
 
@@ -56,9 +68,9 @@ class RobotModel(Node):
         self._description = self.create_publisher(String, "robot_description", LATCHED)
         self._joint_states = self.create_publisher(JointState, "joint_states", 1)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.create_timer(TIMING.discovery_period, self._discover)
         self.create_timer(1.0 / values["rate"], self._publish_states)
-        self.create_timer(MARKER_PERIOD, self._publish_markers)
+        self.create_timer(TIMING.marker_period, self._publish_markers)
 
     def _discover(self) -> None:
         self._others.update()
@@ -82,7 +94,7 @@ class RobotModel(Node):
 
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))
-        found = ((arm, arm.view(self._statuses.within(STALE_STATE, arm.bridge))) for arm in self._described)
+        found = ((arm, arm.view(self._statuses.within(TIMING.stale_state, arm.bridge))) for arm in self._described)
         self._views = views = [(arm, view) for arm, view in found if view]
         own_topic = self._joint_states.topic_name
         if not views or self._problem or own_topic in {arm.states_topic for arm in self._arms.values()}:
@@ -97,7 +109,7 @@ class RobotModel(Node):
         self._joint_states.publish(states)
 
     def _publish_markers(self) -> None:
-        gravity = self._tilt.within(STALE)
+        gravity = self._tilt.within(TIMING.stale)
         if not self._markers.get_subscription_count():
             return
         groups = [("", gravity_shapes(gravity))]
@@ -133,7 +145,7 @@ class ViewedArm:
 
     def view(self, status: Mapping[str, Any]) -> ArmView | None:
         """Return what is known of the arm now; None without a description or a fresh reading. status: its bridge's."""
-        states = self._states.within(STALE)
+        states = self._states.within(TIMING.stale)
         if self.description is None:
             return None
         if states is None:

@@ -10,95 +10,60 @@ from exo_gravity.lab.bag.reader import read_bag
 from ...support import synthetic_bags as made
 
 
-def status(level, text, **values):
-    """Topic, type and bytes of a bridge's diagnostics."""
-    types = made.STORE.types
-    pairs = [types["diagnostic_msgs/msg/KeyValue"](key=key, value=value) for key, value in values.items()]
-    entry = types["diagnostic_msgs/msg/DiagnosticStatus"](level, "right/can_bridge", text, "", pairs)
-    kind = "diagnostic_msgs/msg/DiagnosticArray"
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    message = types[kind](types["std_msgs/msg/Header"](stamp=stamp, frame_id=""), [entry])
-    return "/diagnostics", kind, bytes(made.STORE.serialize_cdr(message, kind))
+def read(content, folder, *more, until=np.inf):
+    kept = [item for item in (*content, *more) if item[2] < made.START + until * 1e9]
+    return read_bag(made.write_bag(folder / "bag", kept))
+
+
+def states(*names, first=0.1, period=0.5):
+    """The bridge's state, every half second from 0.1 s on; None for no report."""
+    return [made.status(first + number * period, name, state=name) for number, name in enumerate(names) if name]
 
 
 def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
-    states = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
-    for tenth, state in enumerate(states):
-        topic, kind, data = status(0, state, state=state)
-        content = [*content, (topic, kind, made.START + tenth * 10**8, data)]
-    content.sort(key=lambda item: item[2])
+    names = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
+    (arm,) = read(content, tmp_path, *states(*names, first=0.0, period=0.1)).recordings
     arrival = 0.0002  # s, of the first joint state, at which time begins
-    expected = [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)]
-    np.testing.assert_allclose(made.only(made.write_bag(tmp_path / "bag", content)).carried, expected, atol=1e-9)
+    np.testing.assert_allclose(arm.carried, [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)], atol=1e-9)
 
 
-def with_states(content, *states):
-    """The content with the bridge's state added every half second from 0.1 s on; None for no report."""
-    for number, state in enumerate(states):
-        if state:
-            topic, kind, data = status(0, state, state=state)
-            content = [*content, (topic, kind, made.START + 10**8 + number * 5 * 10**8, data)]
-    return sorted(content, key=lambda item: item[2])
+@pytest.mark.parametrize(
+    ("names", "notes"),
+    [
+        (["active"] * 20, 1),
+        (["active"] * 6 + ["letting down"] * 3, 1),
+        *((["active"] * 4 + [last] * 5, 0) for last in ("disabled", "fault", None)),
+    ],
+)
+def test_a_recording_that_ends_before_the_arm_is_down_says_so(content, tmp_path, names, notes):
+    found = read(content, tmp_path, *states(*names), until=4.35)
+    assert len(found.notes) == notes and all(note.startswith("right: the recording ends") for note in found.notes)
+    if len(names) == 20:
+        (arm,) = found.recordings
+        assert arm.carried == ((pytest.approx(0.0998), arm.time[-1]),)
 
 
-def until(content, seconds):
-    return [item for item in content if item[2] < made.START + round(seconds * 1e9)]
-
-
-def test_an_arm_that_is_carried_when_the_recording_ends_was_not_let_down_in_it(content, tmp_path):
-    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *["active"] * 20), 4.35)))
-    (arm,) = read.recordings
-    assert arm.carried == ((pytest.approx(0.0998), arm.time[-1]),)
-    assert read.notes == (
-        "right: the recording ends while the arm is carried: it does not show how the arm was let down",
+def parameter_event(seconds, name, number):
+    types, kind = made.STORE.types, "rcl_interfaces/msg/ParameterEvent"
+    value = types["rcl_interfaces/msg/ParameterValue"](
+        3, False, 0, number, "", np.zeros(0, np.uint8), np.zeros(0, bool), np.zeros(0, np.int64), np.zeros(0), []
     )
-
-
-def test_a_recording_that_ends_in_the_descent_does_not_claim_that_the_arm_came_down(content, tmp_path):
-    states = ["active"] * 6 + ["letting down"] * 3
-    read = read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35)))
-    assert read.notes == ("right: the recording ends before the arm was down",)
-
-
-@pytest.mark.parametrize("last", ["disabled", "fault", None])
-def test_an_arm_that_is_off_at_the_end_or_still_observed_gets_no_note(content, tmp_path, last):
-    states = ["active"] * 4 + [last] * 5
-    assert not read_bag(made.write_bag(tmp_path / "bag", until(with_states(content, *states), 4.35))).notes
+    changed = types["rcl_interfaces/msg/Parameter"](name, value)
+    data = made.serialised(kind, made.header().stamp, "/right/compensator", [], [changed], [])
+    return "/parameter_events", kind, made.START + round(seconds * 1e9), data
 
 
 def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
-    types = made.STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-
-    def change(name, value):
-        nothing = {
-            "bool_value": False,
-            "integer_value": 0,
-            "string_value": "",
-            "byte_array_value": np.zeros(0, np.uint8),
-        }
-        nothing.update(bool_array_value=np.zeros(0, bool), integer_array_value=np.zeros(0, np.int64))
-        nothing.update(double_array_value=np.zeros(0), string_array_value=[])
-        value = types["rcl_interfaces/msg/ParameterValue"](type=3, double_value=value, **nothing)
-        parameter = types["rcl_interfaces/msg/Parameter"](name=name, value=value)
-        kind = "rcl_interfaces/msg/ParameterEvent"
-        message = types[kind](stamp, "/right/compensator", [], [parameter], [])
-        return "/parameter_events", kind, bytes(made.STORE.serialize_cdr(message, kind))
-
     snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
-    messages = [
-        (1.0, ("/recorder/parameters", "std_msgs/msg/String", made.string(snapshot))),
-        (2.0, status(0, "fine")),
-        (3.0, status(2, "motor 2 is silent")),
-        (3.5, status(2, "motor 2 is silent")),
-        (4.0, status(0, "fine")),
-        (5.0, change("support", 0.5)),
-    ]
-    extra = [(topic, kind, made.START + 200_000 + round(s * 1e9), data) for s, (topic, kind, data) in messages]
-    read = read_bag(made.write_bag(tmp_path / "bag", sorted([*content, *extra], key=lambda item: item[2])))
-    assert [(round(event.time, 6), event.text) for event in read.events] == [
+    silent = [made.status(seconds, "motor 2 is silent", level=2) for seconds in (3.0, 3.5)]
+    found = read(
+        content, tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
+        made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5),
+    )  # fmt: skip
+    assert [(round(event.time, 3), event.text) for event in found.events] == [
         (3.0, "right/can_bridge: motor 2 is silent"),
         (4.0, "right/can_bridge: OK, fine"),
         (5.0, "/right/compensator: support = 0.5"),
     ]
-    assert read.parameters == {"/right/compensator": snapshot}
+    assert found.events[-1].setting == ("/right/compensator", "support", 0.5)
+    assert found.parameters == {"/right/compensator": snapshot}

@@ -1,9 +1,13 @@
-"""Recordings of every form -> the arrays that were written, against rosbags as the independent writer and decoder."""
+"""Recordings of every form, complete, cut short, damaged or incomplete: what can be read is read, the rest is named.
+
+rosbags is the independent writer and decoder.
+"""
 
 from __future__ import annotations
 
 import itertools
 import json
+import re
 import shutil
 
 import numpy as np
@@ -14,7 +18,9 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays
+from exo_gravity.lab.bag.reader import read_bag
 
 from ...support import synthetic_bags as made
 
@@ -25,11 +31,18 @@ FORMS = {
     "compressed file": {"compression": CompressionMode.FILE},
     "compressed messages": {"compression": CompressionMode.MESSAGE},
 }
+STATES, COMMANDS, STEPS = (f"/right/{name}" for name in ("joint_states", "effort_commands", "wearer_step"))
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A function that writes a bag and returns what is read of it."""
+    return lambda *content, **form: read_bag(made.write_bag(tmp_path / "written", content, **form))
 
 
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
-def test_every_form_of_rosbag2_gives_the_arrays_that_were_written(recording, content, tmp_path, form):
-    made.assert_same(made.only(made.write_bag(tmp_path / "bag", content, **form)), recording)
+def test_every_form_of_rosbag2_gives_the_arrays_that_were_written(recording, content, written, form):
+    made.assert_same(written(*content, **form).recordings[0], recording)
 
 
 @pytest.mark.parametrize("chunked", [True, False])
@@ -38,73 +51,65 @@ def test_an_mcap_file_of_another_writer_is_read(recording, content, tmp_path, ch
         writer = McapWriter(file, chunk_size=20_000, compression=CompressionType.LZ4, use_chunking=chunked)
         writer.start("ros2")
         schema = writer.register_schema(made.JOINT_STATE, "ros2msg", b"std_msgs/Header header")
-        channels = {}
-        for topic, kind, stamp, data in content:
-            if kind == made.JOINT_STATE:
-                channel = channels.get(topic) or channels.setdefault(
-                    topic, writer.register_channel(topic, "cdr", schema)
-                )
-                writer.add_message(channel, stamp, data, stamp)
+        channels = {topic: writer.register_channel(topic, "cdr", schema) for topic in (STATES, COMMANDS)}
+        for topic, _, stamp, data in content:
+            if topic in channels:
+                writer.add_message(channels[topic], stamp, data, stamp)
         writer.finish()
     made.assert_same(made.only(tmp_path / "other.mcap"), recording)
 
 
-def test_time_comes_from_the_stamps_and_is_0_at_the_first_arrival(recording, bag):
-    np.testing.assert_allclose(made.only(bag).time, recording.time - 200e-6, atol=1e-8)
+def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recording, content, tmp_path):
+    folder = tmp_path / "split"
+    folder.mkdir()
+    edges = np.linspace(0, len(content), 13).astype(int)
+    for number, (first, last) in enumerate(itertools.pairwise(edges)):
+        part = made.write_bag(tmp_path / f"part_{number}", content[first:last])
+        shutil.move(part / f"part_{number}.mcap", folder / f"split_{number}.mcap")
+    made.assert_same(made.only(folder), recording)
 
 
-def test_without_stamps_time_is_the_time_of_arrival(recording, tmp_path):
+def test_time_is_that_of_the_stamps_from_the_first_arrival_on_and_without_stamps_that_of_arrival(
+    recording, bag, written
+):
+    read = made.only(bag)
+    np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
+    assert read.carried is None  # no state was reported
     states = [
         ("/joint_states", made.JOINT_STATE, made.START + round(time * 1e9), made.joint_state(0, made.NAMES, pose))
         for time, pose in zip(recording.time.tolist(), recording.position, strict=True)
     ]
-    read = made.only(made.write_bag(tmp_path / "bag", states))
+    (read,) = written(*states).recordings
     np.testing.assert_allclose(read.time, recording.time, atol=1e-8)
     assert read.name == "arm"
 
 
-def test_a_command_is_paired_with_the_state_after_the_one_that_it_answers(recording, bag):
-    read = made.only(bag)
-    np.testing.assert_allclose(read.command[1:], recording.command[:-1], rtol=1e-6)
-    assert np.all(np.isnan(read.command[0]))
-
-
-def test_the_last_command_expires_when_commands_stop(recording, content, tmp_path):
+def test_a_command_is_paired_with_the_state_after_the_one_that_it_answers_and_expires(recording, content, written):
     last = made.START + 2 * 10**9
-    some = [item for item in content if item[0] != "/right/effort_commands" or item[2] < last]
-    read = made.only(made.write_bag(tmp_path / "bag", some))
-    assert np.all(np.isfinite(read.command[(read.time > 0.1) & (read.time < 2.0)]))
-    assert np.all(np.isnan(read.command[read.time > 2.3]))
+    read = written(*(item for item in content if item[0] != COMMANDS or item[2] < last)).recordings[0]
+    answered = np.isfinite(read.command[:, 0])
+    np.testing.assert_allclose(read.command[1:][answered[1:]][:300], recording.command[:300], rtol=1e-6)
+    assert not answered[0] and answered[1 : np.searchsorted(read.time, 2.0)].all()
+    assert not answered[read.time > 2.3].any()
 
 
-def test_joints_are_found_by_name_whatever_their_order(recording, tmp_path):
-    names = made.NAMES[::-1]
-    turned = made.trial(made.POSES[:1], hold=2.0, rate=200.0)
-    content = list(made.messages(turned))
-    for k, (topic, kind, stamp, _) in enumerate(content):
-        if topic == "/right/effort_commands":
-            answered = stamp - 500_000
-            row = round((answered - made.START) * 200 / 1e9)
-            data = made.joint_state(answered, names, effort=turned.command[row][::-1])
-            content[k] = topic, kind, stamp, data
-    read = made.only(made.write_bag(tmp_path / "bag", content))
-    np.testing.assert_allclose(read.command[1:], turned.command[:-1], rtol=1e-6)
-
-
-def test_messages_of_changing_length_and_order_in_one_topic_are_all_decoded(tmp_path):
+def test_joints_are_found_by_name_whatever_their_order_and_their_number_of_bytes(recording, content, written):
+    turned = [
+        (topic, kind, stamp, made.joint_state(stamp - 500_000, made.NAMES[::-1], effort=command[::-1]))
+        for (topic, kind, stamp, _), command in zip(
+            (item for item in content if item[0] == COMMANDS), recording.command, strict=True
+        )
+    ]
     rng = np.random.default_rng(5)
-    content, expected = [], []
-    for k in range(300):
+    states = []
+    for k, values in enumerate(np.stack((recording.position, recording.velocity, recording.effort), axis=1)):
         order = rng.permutation(4)
-        values = rng.standard_normal((3, 4))
         stamp = made.START + k * 5_000_000
-        data = made.joint_state(stamp, [made.NAMES[i] for i in order], *values[:, order], frame="x" * int(k % 5))
-        content.append(("/right/joint_states", made.JOINT_STATE, stamp, data))
-        expected.append(values)
-    read = made.only(made.write_bag(tmp_path / "bag", content))
-    columns = [made.NAMES.index(name) for name in read.joint_names]
-    got = np.stack([read.position, read.velocity, read.effort], axis=1)
-    np.testing.assert_allclose(got, np.array(expected)[:, :, columns], rtol=1e-6)
+        data = made.joint_state(stamp, [made.NAMES[i] for i in order], *values[:, order], frame="x" * (k % 5))
+        states.append((STATES, made.JOINT_STATE, stamp + 200_000, data))
+    read = written(*turned, *states).recordings[0].in_order(made.NAMES)
+    made.assert_same(read, recording)
+    np.testing.assert_allclose(read.command[1:], recording.command[:-1], rtol=1e-6)
 
 
 @settings(deadline=None)
@@ -115,10 +120,8 @@ def test_messages_of_changing_length_and_order_in_one_topic_are_all_decoded(tmp_
     st.booleans(),
 )
 def test_the_layout_of_any_joint_state_is_what_rosbags_decodes(names, frame, present, little_endian):
-    types = made.STORE.types
-    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=7, nanosec=8), frame_id=frame)
     numbers = {f: np.arange(len(names)) + 10.0 * k if f in present else np.zeros(0) for k, f in enumerate(FIELDS)}
-    message = types[made.JOINT_STATE](header, names, **numbers)
+    message = made.STORE.types[made.JOINT_STATE](made.header(7_000_000_008, frame), names, **numbers)
     data = bytes(made.STORE.serialize_cdr(message, made.JOINT_STATE, little_endian=little_endian))
     joints = JointArrays("joint_states")
     joints.add([9], [data])
@@ -130,26 +133,110 @@ def test_the_layout_of_any_joint_state_is_what_rosbags_decodes(names, frame, pre
         np.testing.assert_array_equal(found, expected)
 
 
-def test_the_recorded_wearer_steps_are_the_script(recording, bag):
-    steps = made.only(bag).steps
-    assert [step.action for step in steps] == ["move", "hold", "move", "hold"]
+def test_the_recorded_wearer_steps_are_the_script(recording, content, written):
+    done = made.text_entry(STEPS, 9.0, json.dumps({"step": 4, "of": 4, "action": "done", "duration": 0.0}))
+    *steps, last = written(*content, done).recordings[0].steps
+    assert [step.action for step in steps] == ["move", "hold", "move", "hold"] and last.action == "done"
     np.testing.assert_allclose([step.start for step in steps], [step.start for step in recording.steps], atol=0.006)
 
 
-def test_the_parts_of_a_recording_are_read_in_the_order_of_their_numbers(recording, content, tmp_path):
-    folder = tmp_path / "split"
-    folder.mkdir()
-    edges = np.linspace(0, len(content), 13).astype(int)
-    for number, (first, last) in enumerate(itertools.pairwise(edges)):
-        part = made.write_bag(tmp_path / f"part_{number}", content[first:last])
-        shutil.move(part / f"part_{number}.mcap", folder / f"split_{number}.mcap")
-    read = made.only(folder)
-    made.assert_same(read, recording)
-    np.testing.assert_allclose(read.time, recording.time - 200e-6, atol=1e-8)
+@pytest.mark.parametrize(
+    ("form", "share", "least"),
+    [
+        *(("mcap", share, 0.8) for share in (0.2, 0.5, 0.9)),
+        *(("mcap with compressed chunks", share, 0.1) for share in (0.5, 0.9)),
+        ("sqlite3", 0.6, 0.2),
+    ],
+)
+def test_a_recording_cut_short_gives_what_was_written_before(recording, content, tmp_path, form, share, least):
+    chunks = form == "mcap with compressed chunks"  # of 1 MiB
+    bag = made.write_bag(tmp_path / "bag", content * 4 if chunks else content, **FORMS[form])
+    if not chunks:
+        (bag / "metadata.yaml").unlink()
+    made.cut(next(file for file in bag.iterdir() if file.suffix != ".yaml"), share)
+    read = read_bag(bag)
+    (arm,) = read.recordings
+    assert least * share < len(arm.time) / len(recording.time) <= (4.0 if chunks else 1.0)
+    if form == "mcap":
+        made.assert_same(arm, recording, len(arm.time))
+    assert "cut short" in read.notes[0]
 
 
-def test_additional_fields_of_a_virtual_wearers_step_are_ignored(content, tmp_path):
-    done = json.dumps({"step": 4, "of": 4, "action": "done", "duration": 0.0})
-    stamp = content[-1][2] + 1
-    last = ("/right/wearer_step", "std_msgs/msg/String", stamp, made.string(done))
-    assert made.only(made.write_bag(tmp_path / "bag", [*content, last])).steps[-1].action == "done"
+def test_a_recording_that_lacks_only_its_index_is_complete(recording, bag):
+    file = bag / "bag.mcap"
+    file.write_bytes(file.read_bytes()[:-40])
+    read = read_bag(bag)
+    made.assert_same(read.recordings[0], recording)
+    assert not read.notes
+
+
+@pytest.mark.parametrize("name", ["missing", "folder", "text.mcap", "text.db3", "text.txt"])
+def test_a_file_that_is_not_a_recording_is_refused_by_name(tmp_path, name):
+    (tmp_path / "folder").mkdir()
+    for file in ("text.mcap", "text.db3", "text.txt"):
+        (tmp_path / file).write_text("no recording at all, though long enough to look at\n" * 20)
+    with pytest.raises(DataError, match=name):
+        read_bag(tmp_path / name)
+
+
+def broken(content):
+    return [(topic, kind, stamp, data[:40]) for topic, kind, stamp, data in content if kind == made.JOINT_STATE]
+
+
+def other_joints(content):
+    return [
+        *content,
+        (STATES, made.JOINT_STATE, content[-1][2] + 10**9, made.joint_state(0, "abcd", *np.zeros((3, 4)))),
+    ]
+
+
+UNREADABLE = {
+    "empty": (lambda _: [], "is empty"),
+    "other topics": (lambda _: [made.text_entry("/chatter", 0.0, "hello")], "joint_states .* /chatter"),
+    "another type": (lambda _: [made.text_entry(STATES, 0.0, "hello")], f"no topic .* it has {STATES}"),
+    "names that change": (other_joints, f"{STATES}: .*a, b, c, d"),
+    "damaged messages": (broken, f"{STATES}: .*damaged"),
+}
+
+
+@pytest.mark.parametrize(("change", "words"), UNREADABLE.values(), ids=UNREADABLE)
+def test_a_recording_without_readable_joint_states_is_refused_with_what_it_has(content, written, change, words):
+    with pytest.raises(DataError, match=words):
+        written(*change(content), topics=[(STATES, made.JOINT_STATE)] if not change(content) else ())
+
+
+def not_finite(position):
+    data = made.joint_state(made.START + 5 * 10**9, made.NAMES, (0.0, position, 0.0, 0.0), np.zeros(4), np.zeros(4))
+    return STATES, made.JOINT_STATE, made.START + 9 * 10**9, data
+
+
+LEFT = [("/left/joint_states", made.JOINT_STATE, made.START + k, made.joint_state(0, ["a"], [0.0])) for k in range(9)]
+PROBLEMS = {
+    "another arm": (LEFT, "left: .*must be 4"),
+    **{text: ([made.text_entry(STEPS, 9.0, text)], STEPS) for text in ("no JSON", "[1]", "{}")},
+    "null": ([made.text_entry(STEPS, 9.0, '{"action": "hold", "duration": null}')], STEPS),
+}
+NOTES = {name: ([not_finite(value)], "right: .* 1$") for name, value in (("nan", np.nan), ("inf", np.inf))}
+
+
+@pytest.mark.parametrize(("more", "words"), {**PROBLEMS, **NOTES}.values(), ids={**PROBLEMS, **NOTES})
+def test_what_cannot_be_read_is_named_and_the_rest_is_read(content, recording, written, more, words):
+    read = written(*content, *more)
+    made.assert_same(read.recordings[0], recording)
+    (named,) = read.notes if "right" in words and STEPS not in words else read.problems
+    assert re.search(words, named)
+
+
+def test_without_fitting_commands_or_any_valid_step_the_joint_states_are_read(recording, content, tmp_path):
+    for number, (changed, words) in enumerate(
+        (
+            (made.messages(recording, command_names="abcd"), (COMMANDS, "a, b, c, d", "right_joint_1")),
+            ([item for item in content if item[0] != COMMANDS], ("effort_commands",)),
+            ([*(item for item in content if item[0] != STEPS), made.text_entry(STEPS, 0.0, "gibberish")], (STEPS,)),
+        )
+    ):
+        read = read_bag(made.write_bag(tmp_path / str(number), changed))
+        made.assert_same(read.recordings[0], recording)
+        (named,) = (*read.problems, *read.notes)
+        assert all(word in named for word in words)
+        assert np.isnan(read.recordings[0].command).all() == (number < 2)

@@ -87,24 +87,30 @@ def test_moments_that_no_arm_has_are_refused_with_what_to_check(changes, words):
         check_physical(moments, error, np.ones(4), np.array(LEANING), 9.8)
 
 
-@pytest.mark.parametrize("factor", [-1.0, 0.0, 0.2, 5.0])
-def test_a_reversed_joint_a_silent_motor_and_an_impossible_torque_scale_are_refused(factor):
-    observations = [o._replace(effort=np.multiply(o.effort, (1, 1, factor, 1))) for o in Device(10).tour()]
-    with pytest.raises(DataError, match=r"torque scale 3|do not fit one arm|not known better|must be positive"):
-        identify(observations, LENGTH)
+def scaled(factor):
+    """Return observations of a joint with this factor in its efforts: reversed, silent, or of another firmware."""
+    return lambda: [one._replace(effort=np.multiply(one.effort, (1, 1, factor, 1))) for one in Device(10).tour()]
 
 
-def test_a_weight_that_is_too_light_to_show_the_scale_is_refused():
+def with_a_light_weight():
     device = Device(11)
-    observations = device.tour(weighed=0) + [device.observe(t, weight=(0.002, 0.1)) for t in best(LEANING, 4)]
-    with pytest.raises(DataError, match="hang a heavier one"):
-        identify(observations, LENGTH)
+    return device.tour(weighed=0) + [device.observe(t, weight=(0.002, 0.1)) for t in best(LEANING, 4)]
 
 
-def test_an_impossible_observation_is_refused_by_number_and_name():
-    observations = Device(12).tour()
-    observations[1] = observations[1]._replace(effort=(0.0, np.nan, 0.0, 0.0))
-    with pytest.raises(DataError, match="pose 2: effort"):
-        identify(observations, LENGTH)
-    with pytest.raises(DataError, match="no pose"):
-        identify([], LENGTH)
+def with_nan():
+    first, second, *others = Device(12).tour()
+    return [first, second._replace(effort=(0.0, np.nan, 0.0, 0.0)), *others]
+
+
+@pytest.mark.parametrize(
+    ("observations", "words"),
+    [
+        *((scaled(f), r"scale 3|do not fit|not known better|must be positive") for f in (-1.0, 0.0, 0.2, 5.0)),
+        (with_a_light_weight, "a heavier one"),
+        (with_nan, "pose 2: effort"),
+        (list, "no pose"),
+    ],
+)
+def test_impossible_observations_are_refused_with_what_to_check(observations, words):
+    with pytest.raises(DataError, match=words):
+        identify(observations(), LENGTH)
