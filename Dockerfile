@@ -28,7 +28,8 @@ RUN apt-get update \
 # Ubuntu's, against which ROS's messages are compiled.
 COPY .ci/constraints/ros.txt constraints.txt
 RUN python3 -m pip install --no-cache-dir --break-system-packages --constraint constraints.txt \
-    mcap mujoco rich rosbags smbus2 starlette uvicorn vqf websockets
+    adafruit-circuitpython-icm20x adafruit-circuitpython-lsm6ds adafruit-circuitpython-mpu6050 adafruit-extended-bus \
+    mcap mujoco rich rosbags starlette uvicorn vqf websockets
 
 COPY . src/exo_gravity
 RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravity

@@ -49,14 +49,12 @@ class BusError(ExoGravityError):
 class DeviceError(ExoGravityError):
     """A sensor does not answer, is not the one expected, or has failed.
 
-    Attributes: `device`, its name and address; `register`, the one concerned, or None.
+    Attributes: `device`, its name and address.
     """
 
-    def __init__(self, device: str, problem: str, register: int | None = None) -> None:
-        where = device if register is None else f"{device}, register 0x{register:02X}"
-        super().__init__(f"{where}: {problem}")
+    def __init__(self, device: str, problem: str) -> None:
+        super().__init__(f"{device}: {problem}")
         self.device = device
-        self.register = register
 
 
 class DataError(ExoGravityError):

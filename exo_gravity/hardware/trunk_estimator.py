@@ -11,6 +11,7 @@ more than 3 degrees there is no output: the output never jumps.
 import math
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk import imu_checks
 from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range
-from exo_gravity.core.trunk.uncertainty import MAX_SIGMA, TiltUncertainty
+from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
 
 try:
     from vqf import VQF
@@ -40,14 +41,24 @@ except ImportError:  # needed only for an IMU that reports no orientation
 
 __all__ = ["ImuSample", "TrunkEstimator", "TrunkOrientation"]
 
-MAX_GAP = 0.1  # s between two samples, after which the estimate begins anew
-MAX_REPORTED_RATE = 15.0  # rad/s; a reported orientation that turns faster has jumped: no trunk turns so fast
-MAX_JUMP = 0.01  # rad by which rounding may turn a reported orientation
-CHECK_PERIOD, FAST_PERIOD = 0.0195, 0.0095  # s between two judgements: usually, and
-FAST = 3.0  # rad/s: while the IMU turns faster
-OVERSHOOT = 0.25  # share of the range by which the true rate exceeds it
-BIAS_INTERVAL = 10  # samples; the bias changes slowly
 PACK = struct.Struct("6d").pack_into
+
+
+@dataclass(frozen=True)
+class EstimatorTuning:
+    """When the estimate begins anew, and when the samples are judged."""
+
+    longest_gap: float = 0.1  #: s between two samples, after which the estimate begins anew
+    fastest_report: float = 15.0  #: rad/s; a reported orientation that turns faster has jumped: no trunk does
+    report_rounding: float = 0.01  #: rad by which rounding may turn a reported orientation
+    judgement_period: float = 0.0195  #: s between two judgements of the samples: every second one at 100 Hz,
+    fast_period: float = 0.0095  #: or each one
+    fast: float = 3.0  #: rad/s, while the IMU turns faster than this
+    overshoot: float = 0.25  #: share of the gyroscope's range by which the true rate may exceed it
+    bias_interval: int = 10  #: samples between two looks at the bias, which changes slowly
+
+
+TUNING = EstimatorTuning()
 
 
 class TrunkOrientation(NamedTuple):
@@ -84,14 +95,17 @@ class TrunkEstimator:
     ) -> None:
         """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
 
-        rate: nominal sample rate in Hz. gyroscope_range rad/s, accelerometer_range m/s^2: of the sensor, at which it
-        saturates. Raises ParameterError.
+        rate: nominal sample rate, Hz.
+        gyroscope_range: at which the sensor saturates, rad/s.
+        accelerometer_range: at which it saturates, m/s^2.
+
+        Raises ParameterError.
         """
         #: (3, 3), trunk from IMU
         self.rotation = rotation_matrix(rotation_trunk_from_imu, "rotation_trunk_from_imu")
         x, y, z, w = unit_quaternion("rotation_trunk_from_imu", rotation_trunk_from_imu)
         self._imu_from_trunk = (-x, -y, -z, w)
-        self._period = 1.0 / one_float("rate", rate, 2.0 / MAX_GAP, 10_000.0, "Hz")
+        self._period = 1.0 / one_float("rate", rate, 2.0 / TUNING.longest_gap, 10_000.0, "Hz")
         self._fastest = one_float("gyroscope_range", gyroscope_range, *imu_checks.GYROSCOPE_RANGES, "rad/s")
         ranges = imu_checks.ACCELEROMETER_RANGES
         self._strongest = one_float("accelerometer_range", accelerometer_range, *ranges, "m/s^2")
@@ -126,12 +140,13 @@ class TrunkEstimator:
         """Why there is no orientation yet; empty once there is."""
         if self._agreement.is_suspect:
             return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
-        return "" if self._uncertainty.sigma <= MAX_SIGMA else self._why
+        return "" if self._uncertainty.sigma <= MODEL.limit else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
 
-        arrival: s, when the sample arrived, by a clock that need not agree with that of the stamps; None: not known.
+        arrival: when the sample arrived, s, by a clock that need not agree with that of the stamps; None: not known.
+
         Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
         or if what it measures contradicts itself or the samples before it.
         """
@@ -143,7 +158,7 @@ class TrunkEstimator:
             self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
         sigma = self._uncertainty.sigma
-        is_sure = sigma <= MAX_SIGMA and not self._agreement.is_suspect
+        is_sure = sigma <= MODEL.limit and not self._agreement.is_suspect
         return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma) if is_sure else None
 
     def _reported(self, sample: ImuSample) -> Quaternion:
@@ -152,7 +167,8 @@ class TrunkEstimator:
         turning, force = (ZERO if given is None else given for given in sample[1:3])
         rate, force = three_floats("angular_velocity", turning), three_floats("linear_acceleration", force)
         dt, up = self._step(sample, rate + force, None), up_in_body(quaternion)
-        if last and angle_between(up, up_in_body(last)) > MAX_REPORTED_RATE * max(dt, self._period) + MAX_JUMP:
+        reach = TUNING.fastest_report * max(dt, self._period) + TUNING.report_rounding
+        if last and angle_between(up, up_in_body(last)) > reach:
             self._restart("orientation jumped")
         self._quaternion = quaternion
         self._uncertainty.report(dt)
@@ -165,18 +181,19 @@ class TrunkEstimator:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
         rate, is_saturated = in_range("angular_velocity", sample.angular_velocity, self._fastest)
         force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
-        imu_checks.check_living(force, self._force)
+        imu_checks.check_unit(force, self._force)
         dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
         last = self._rates[-1] if self._rates else rate
-        unknown = OVERSHOOT * self._fastest if is_saturated else 0.0
-        if self._uncertainty.miss(dt, math.dist(rate, last), unknown, self._equal.duration):
+        unknown = TUNING.overshoot * self._fastest if is_saturated else 0.0
+        if self._uncertainty.add_unmeasured(dt, math.dist(rate, last), unknown, self._equal.duration):
             self._restart("too much rotation was not measured")
         self._force = None if is_cut else force
         quaternion = self._quaternion = self._fusion.advance(dt, rate, last, self._force)
         self._rates.append(rate)
         if not is_cut:
             self._total, self._count = plus(self._total, force), self._count + 1
-        if self._time - self._judged >= (CHECK_PERIOD if math.hypot(*rate) < FAST else FAST_PERIOD):
+        is_fast = math.hypot(*rate) >= TUNING.fast
+        if self._time - self._judged >= (TUNING.fast_period if is_fast else TUNING.judgement_period):
             self._judge(quaternion, force, self._fusion.bias_sigma)
         return quaternion
 
@@ -197,11 +214,11 @@ class TrunkEstimator:
         """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
         time, is_fused = float(sample.time), sample.orientation is None
         dt = time - self._time
-        if not math.isfinite(time) or -MAX_GAP <= dt <= 0.0:  # far in the past: another clock, like a gap
+        if not math.isfinite(time) or -TUNING.longest_gap <= dt <= 0.0:  # far in the past: another clock, like a gap
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
         self._equal.check(time, values, quaternion)
         self._time = time
-        if 0.0 < dt <= MAX_GAP and is_fused is self._is_fused:
+        if 0.0 < dt <= TUNING.longest_gap and is_fused is self._is_fused:
             return dt
         self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
         self._is_fused, self._clock = is_fused, imu_checks.ClockCheck()
@@ -235,11 +252,12 @@ class VqfFusion:
     def advance(self, dt: float, rate: Floats3, last_rate: Floats3, acceleration: Floats3 | None) -> Quaternion:
         """Return the orientation `dt` s after the last sample, world from IMU.
 
-        rate, last_rate: of this sample and the last one, each of the period that it ends; over several periods those
-        between the two are interpolated. acceleration: None if it is not known.
+        rate: of this sample, for the period that it ends, rad/s.
+        last_rate: of the last one; over several periods those between the two are interpolated.
+        acceleration: m/s^2; None: not known.
         """
         vqf, period = self._vqf, self._period
-        if not self._count % BIAS_INTERVAL:
+        if not self._count % TUNING.bias_interval:
             self.bias, self.bias_sigma = vqf.getBiasEstimate()
             self._bias = self.bias.tolist()
         self._count += 1

@@ -35,6 +35,7 @@ DEPTH = 50
 WATCH_PERIOD = 0.1  # s
 POLLS_A_SAMPLE = 2.0  # of a device
 MIN_POLL_PERIOD = 0.002  # s
+LOG_PERIOD = 1.0  # s between two warnings of lost samples
 SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
 
@@ -160,11 +161,9 @@ class ImuDevice(Repeated):
         self._node, self._callback, self._clock = node, callback, clock
         self._publisher = node.create_publisher(Imu, topic, DEPTH)
         stamps = node.get_clock()
-        self.reopening = Reopening(
-            lambda self_test: open_source(values, lambda: stamps.now().nanoseconds * 1e-9, self_test, wait=clock.sleep)
-        )
+        self.reopening = Reopening(lambda: open_source(values, lambda: stamps.now().nanoseconds * 1e-9))
         self._number = 0  # of the last message
-        self._lost = 0  # samples, as last logged
+        self._lost = 0  # samples, at the last poll
         self.poll()
 
     @property
@@ -193,10 +192,10 @@ class ImuDevice(Repeated):
             self._number += 1
             self._callback(message, {"publication_sequence_number": self._number})
         source = self.reopening.source
-        lost = source.lost if source else 0
-        if source and lost > self._lost:
-            self._node.get_logger().warning(f"{source.name}: {lost - self._lost} samples lost: {source.loss}")
-        self._lost = lost
+        if source and source.lost > self._lost:
+            sentence = f"{source.name}: {source.lost} samples lost since it was opened, the last because: {source.loss}"
+            self._node.get_logger().warning(sentence, throttle_duration_sec=LOG_PERIOD)
+        self._lost = source.lost if source else 0
 
 
 def sample_of(message: Imu) -> ImuSample:

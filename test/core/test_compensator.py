@@ -13,7 +13,7 @@ from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, Gui
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.inputs import HOLD, MAX_LEAD
+from exo_gravity.core.trunk.inputs import TILT
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
@@ -58,7 +58,7 @@ def test_a_tilt_is_as_old_as_its_stamp():
 
 def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
     run = CompensatorRun(use_imu=True)
-    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-MAX_LEAD)
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-TILT.lead)
     assert run.cycle(0.078).held == ""
     assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
     assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
@@ -78,7 +78,7 @@ def test_a_late_tilt_is_extrapolated_within_the_bound_that_it_states_and_then_wi
         if answer.held:
             held += 1
             assert error <= float(answer.held.split()[-2])
-    assert held * PERIOD == pytest.approx(HOLD - 0.08, abs=2 * PERIOD)
+    assert held * PERIOD == pytest.approx(TILT.hold - 0.08, abs=2 * PERIOD)
     assert answer.reason == "trunk tilt older than 80 ms"
     before = [effort for effort in run.efforts if effort is not None][-1]
     run.compensator.tilt.set_gravity(run.now, (math.sin(0.1), 0.0, -math.cos(0.1)), (0.0, 0.3, 0.0))

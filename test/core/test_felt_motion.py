@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.inputs import EFFECT, FELT_RANGE, FeltMotion
+from exo_gravity.core.trunk.inputs import FELT, FeltMotion
 
 G = 9.80665
 STILL = (0.0, 0.0, 0.0)
@@ -36,13 +36,13 @@ def test_an_arm_on_a_trunk_at_rest_feels_gravity():
 @pytest.mark.parametrize(("frequency", "share"), [(1.9, 0.03), (3.8, 0.15)])
 def test_a_shake_is_felt_as_it_will_be_when_the_motors_answer(age, frequency, share):
     felt = following(lambda t: shaken(t, frequency), lambda t: STILL).at(1.0 + age)
-    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + age + EFFECT, frequency)[2], abs=share * 2.0)
+    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + age + FELT.effect, frequency)[2], abs=share * 2.0)
 
 
 def test_the_angular_acceleration_is_that_of_the_sway_when_the_motors_answer():
     w, sway = 2 * math.pi * 0.95, 0.2
     felt = following(shaken, lambda t: (sway * math.sin(w * t), 0.0, 0.0)).at(1.004)
-    assert felt.angular_acceleration[0] == pytest.approx(sway * w * math.cos(w * (1.004 + EFFECT)), rel=0.05)
+    assert felt.angular_acceleration[0] == pytest.approx(sway * w * math.cos(w * (1.004 + FELT.effect)), rel=0.05)
 
 
 def test_too_few_or_too_old_samples_give_no_motion():
@@ -54,7 +54,7 @@ def test_too_few_or_too_old_samples_give_no_motion():
 @pytest.mark.parametrize("rate", [40.0, 50.0, 250.0, 1000.0])
 def test_a_shake_is_felt_at_any_usual_rate(rate):
     felt = following(shaken, lambda t: STILL, period=1.0 / rate).at(1.0)
-    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + EFFECT)[2], abs=0.1)
+    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + FELT.effect)[2], abs=0.1)
 
 
 def test_a_gap_is_not_bridged():
@@ -72,7 +72,7 @@ def test_a_sample_that_is_late_is_ignored():
 @pytest.mark.parametrize("force", [0.1, 8.0 * G])
 def test_free_fall_and_blows_are_felt_only_within_a_range(force):
     felt = following(lambda t: (0.0, 0.0, force), lambda t: STILL).at(1.0)
-    low, high = FELT_RANGE
+    low, high = FELT.range
     assert low - 1e-9 <= np.linalg.norm(felt.gravity) <= high + 1e-9
 
 
@@ -84,7 +84,7 @@ def test_numbers_that_are_not_finite_are_refused():
 def test_the_shoulder_of_a_trunk_that_turns_accelerates_other_than_the_imu():
     w, sway, lever = 2 * math.pi * 0.95, 0.3, (0.0, -0.2, 0.1)
     felt = following(lambda t: (0.0, 0.0, G), lambda t: (sway * math.sin(w * t), 0.0, 0.0)).at(1.0, lever)
-    phase = w * (1.0 + EFFECT)
+    phase = w * (1.0 + FELT.effect)
     turning, spin_up = np.array((sway * math.sin(phase), 0, 0)), np.array((sway * w * math.cos(phase), 0, 0))
     expected = (0, 0, -G) - np.cross(spin_up, lever) - np.cross(turning, np.cross(turning, lever))
     np.testing.assert_allclose(felt.gravity, expected, atol=0.02)

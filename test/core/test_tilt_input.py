@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.tilt import angle_between, pitch_roll
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.inputs import HOLD, TILT_SPEED, TiltInput
+from exo_gravity.core.trunk.inputs import TILT, TiltInput
 from exo_gravity.lab.inputs.references import pinocchio
 
 from ..support.compensator_run import ROBOT, THETA, CompensatorRun
@@ -71,14 +71,14 @@ def test_a_tilt_is_extrapolated_by_the_gyroscope_over_its_age(axis):
 
 def test_between_two_messages_it_is_extrapolated_for_as_long_as_it_may_be_held():
     tilt, before, _ = turning((0, 1, 0), speed=1.0, age=0.0)
-    angles = [angle_between(before, tilt.at(10.0 + later).direction) for later in (0.02, 0.04, HOLD, 1.0)]
+    angles = [angle_between(before, tilt.at(10.0 + later).direction) for later in (0.02, 0.04, TILT.hold, 1.0)]
     assert angles[1] == pytest.approx(2 * angles[0], rel=0.01)
     assert angles[3] == pytest.approx(angles[2], abs=1e-9)
 
 
 def test_it_is_extrapolated_no_faster_than_a_trunk_tilts():
     tilt, before, _ = turning((0, 1, 0), speed=30.0, age=0.0)
-    assert angle_between(before, tilt.at(10.01).direction) <= 1.001 * TILT_SPEED * 0.01
+    assert angle_between(before, tilt.at(10.01).direction) <= 1.001 * TILT.speed * 0.01
 
 
 def test_pitch_and_roll_are_used_only_while_no_vector_arrives():

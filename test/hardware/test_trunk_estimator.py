@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.hardware.trunk_estimator import MAX_GAP, ImuSample, TrunkEstimator
+from exo_gravity.hardware.trunk_estimator import TUNING, ImuSample, TrunkEstimator
 
 ALIGNED = (0.0, 0.0, 0.0, 1.0)
 G = 9.80665
@@ -117,7 +117,7 @@ def test_an_impossible_sample_is_refused_and_leaves_the_estimate_as_it_was(sampl
 
 
 @pytest.mark.parametrize("report", [False, True])
-@pytest.mark.parametrize("start", [5.0 + MAX_GAP, 1e9, -1e3])
+@pytest.mark.parametrize("start", [5.0 + TUNING.longest_gap, 1e9, -1e3])
 def test_after_a_gap_or_a_clock_jump_there_is_no_estimate_until_it_has_settled_again(report, start):
     estimator = settled(report)
     tilted = Rotation.from_euler("y", 1.0)

@@ -19,7 +19,7 @@ from exo_gravity.nodes.imu import ImuDevice, ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..hardware.virtual_time import VirtualClock
-from ..support.fake_imu.chip import G
+from ..support.fake_imu.chips import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
 from ..support.waiting import wait_until
 

@@ -29,7 +29,7 @@ from exo_gravity.core.compensation.guidance import (
 )
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
 from exo_gravity.core.compensation.terms.terms import Active, Terms
-from exo_gravity.core.trunk.inputs import MAX_TURN, FeltMotion, TiltInput
+from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
@@ -130,7 +130,7 @@ class Compensator:
         held = self.tilt.problem(now) if self.settings.use_imu else ""
         if held:
             turn = self.tilt.unknown_turn(now)
-            if not turn <= MAX_TURN:
+            if not turn <= TILT.turn:
                 return Answer(None, held)
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         before = None

@@ -13,6 +13,7 @@ moment of the effect, leaves 1 and 7 %; from 10 Hz on, extrapolating is worse th
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,20 +25,35 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
-TILT_SPEED = 5.0  # rad/s, faster than a trunk can tilt
-TILT_JUMP = 0.1  # rad, by which two tilts may differ however close in time
-# A stamp may be ahead of our clock by MAX_LEAD s: /clock comes in steps, hosts differ by ms. A clock that goes fast
-# gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages, and
-# is forgotten by FORGET s a second, faster than a clock gains.
-MAX_LEAD, FORGET = 0.05, 0.002
-MAX_LAG = 1.0  # s that it may be behind; beyond, the stamp comes from another clock
 NO_ROTATION = ZERO  # rad/s
-# A tilt that is late for a moment is turned on, while the trunk can have turned otherwise by at most MAX_TURN: the
-# torque is then off by 10 % of gravity's largest. A quick bow, of 90 degrees in 1.5 s, accelerates by 4 rad/s^2, and so
-# makes the last angular velocity wrong by 0.4 rad/s on average over HOLD. A sender of pitch and roll gives none.
-MAX_TURN = 0.1  # rad
-TURN, TURN_ALONE = 0.5, 1.0  # rad/s, with the last angular velocity and without
-HOLD = MAX_TURN / TURN  # s
+
+
+@dataclass(frozen=True)
+class TiltLimits:
+    """What a message of the tilt may say, and how long it is used."""
+
+    speed: float = 5.0  #: rad/s, faster than a trunk can tilt
+    jump: float = 0.1  #: rad, by which two tilts may differ however close in time
+    #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
+    #: gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages,
+    lead: float = 0.05
+    lead_decay: float = 0.002  #: and is forgotten by this many s a second, faster than a clock gains
+    lag: float = 1.0  #: s by which a stamp may be behind; beyond, it comes from another clock
+    #: rad by which the trunk may have turned otherwise since a tilt that is late for a moment and is turned on: the
+    #: torque is then off by 10 % of gravity's largest
+    turn: float = 0.1
+    #: rad/s by which the last angular velocity may be wrong: a quick bow, of 90 degrees in 1.5 s, accelerates by
+    #: 4 rad/s^2, which is 0.4 rad/s on average over `hold`
+    turn_rate: float = 0.5
+    turn_rate_alone: float = 1.0  #: rad/s, without an angular velocity, which a sender of pitch and roll does not give
+
+    @property
+    def hold(self) -> float:
+        """For how long a late tilt with an angular velocity is turned on, s."""
+        return self.turn / self.turn_rate
+
+
+TILT = TiltLimits()
 
 
 class TiltInput:
@@ -72,12 +88,12 @@ class TiltInput:
         self._set(now, lambda: gravity, angular_velocity, age)
 
     def at(self, now: float) -> Tilt:
-        """Return the tilt at `now`, turned on from the newest measurement, by no more than TILT_SPEED."""
-        lead = min(now - self._time, max(self.timeout, HOLD))
+        """Return the tilt at `now`, turned on from the newest measurement, by no more than a trunk can tilt."""
+        lead = min(now - self._time, max(self.timeout, TILT.hold))
         rate = math.hypot(*self._angular_velocity)
         if not rate or not 0.0 < lead < math.inf:
             return self._tilt
-        lead *= min(1.0, TILT_SPEED / rate)
+        lead *= min(1.0, TILT.speed / rate)
         # A vector at rest in the world turns in the axes of a body by -w: g' = g x w.
         b, a, c = self._tilt.direction  # in the arm's base frame, whose right one is mirrored
         b, c = (b if self._side == "left" else -b), -c
@@ -96,7 +112,7 @@ class TiltInput:
         """
         if self._refusal:
             return math.inf
-        return (TURN if any(self._angular_velocity) else TURN_ALONE) * (now - self._in_time)
+        return (TILT.turn_rate if any(self._angular_velocity) else TILT.turn_rate_alone) * (now - self._in_time)
 
     def problem(self, now: float) -> str:
         """Return why there is no fresh tilt at `now`; '' if there is one."""
@@ -119,18 +135,17 @@ class TiltInput:
             raise
 
     def _accept(self, now: float, tilt: Tilt, angular_velocity: Floats3, age: float) -> None:
-        lead = max(0.0, self._lead - FORGET * (now - self._arrival))
-        if not -MAX_LEAD <= age + lead <= MAX_LAG:
-            expected = (
-                f"from {-MAX_LEAD:g} to {MAX_LAG:g} s: synchronise the clocks of the IMU driver and this computer"
-            )
+        lead = max(0.0, self._lead - TILT.lead_decay * (now - self._arrival))
+        if not -TILT.lead <= age + lead <= TILT.lag:
+            span = f"from {-TILT.lead:g} to {TILT.lag:g} s"
+            expected = f"{span}: synchronise the clocks of the IMU driver and this computer"
             raise ParameterError("age of the trunk tilt by its stamp", round(age + lead, 3), expected)
         lead = max(lead, -age)
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
-        reach = TILT_JUMP + TILT_SPEED * max(0.0, measured - self._time)
+        reach = TILT.jump + TILT.speed * max(0.0, measured - self._time)
         if angle_between(tilt.direction, self._tilt.direction) > reach:
-            expected = f"within {TILT_JUMP:g} rad plus {TILT_SPEED:g} rad/s of the last tilt"
+            expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last tilt"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
         self._tilt, self._angular_velocity = tilt, angular_velocity
         self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
@@ -138,14 +153,24 @@ class TiltInput:
             self._in_time = measured
 
 
-WINDOW = 0.045  # s; the samples that the parabola fits, 5 at 100 Hz
-MIN_SAMPLES = 4  # that it fits at a lower rate, or after losses, if
-LONGEST_WINDOW = 0.085  # s holds as many, as from 40 Hz on
-# s, added to the sample's age: 3 ms of delay in the sensor's low-pass filter (MPU-6050, 94 Hz), and 6 ms until the
-# middle of the 4 ms for which the motors apply the torque.
-EFFECT = 0.009
-LONGEST_LEAD = 0.03  # s beyond the newest sample; the parabola is not extrapolated farther
-FELT_RANGE = (0.2 * STANDARD_GRAVITY, 3.0 * STANDARD_GRAVITY)  # m/s^2; sitting down hard is felt as 2.3 g
+@dataclass(frozen=True)
+class FeltTuning:
+    """How the felt motion is extrapolated."""
+
+    window: float = 0.045  #: s of samples that the parabola fits, 5 at 100 Hz
+    samples: int = 4  #: that it fits at a lower rate, or after losses,
+    longest_window: float = 0.085  #: if this many s hold them, as from 40 Hz on
+    #: s, added to the sample's age: 3 ms of delay in the sensor's low-pass filter (MPU-6050, 94 Hz), and 6 ms until the
+    #: middle of the 4 ms for which the motors apply the torque
+    effect: float = 0.009
+    longest_lead: float = 0.03  #: s beyond the newest sample, farther than which the parabola is not extrapolated
+    range: tuple[float, float] = (
+        0.2 * STANDARD_GRAVITY,
+        3.0 * STANDARD_GRAVITY,
+    )  #: m/s^2; a hard seat is felt as 2.3 g
+
+
+FELT = FeltTuning()
 
 
 class Felt(NamedTuple):
@@ -177,10 +202,10 @@ class FeltMotion:
             return
         self._time = time
         self._samples.append((time, values))
-        while self._samples[0][0] < time - (WINDOW if len(self._samples) > MIN_SAMPLES else LONGEST_WINDOW):
+        while self._samples[0][0] < time - (FELT.window if len(self._samples) > FELT.samples else FELT.longest_window):
             self._samples.popleft()
         self._parabola = None
-        if len(self._samples) >= MIN_SAMPLES:
+        if len(self._samples) >= FELT.samples:
             times = np.array([taken - time for taken, _ in self._samples])
             self._parabola = np.linalg.lstsq(np.vander(times, 3), [row for _, row in self._samples], rcond=None)[0]
 
@@ -189,16 +214,16 @@ class FeltMotion:
 
         shoulder_from_imu: (3,) m in the trunk's axes. Where the trunk turns, its places accelerate differently.
         """
-        lead = time - self._time + EFFECT
-        if self._parabola is None or lead > WINDOW + EFFECT:
+        lead = time - self._time + FELT.effect
+        if self._parabola is None or lead > FELT.window + FELT.effect:
             return None
-        lead = min(lead, LONGEST_LEAD)
+        lead = min(lead, FELT.longest_lead)
         bend, slope, newest = self._parabola
         values = newest + lead * (slope + lead * bend)
         a, b, c = (slope + 2.0 * lead * bend)[3:].tolist()
         x, y, z, *turning = values.tolist()
         x, y, z = plus((x, y, z), acceleration_of(shoulder_from_imu, (turning[0], turning[1], turning[2]), (a, b, c)))
-        low, high = FELT_RANGE
+        low, high = FELT.range
         norm = math.hypot(x, y, z)
         share = max(low, min(high, norm)) / max(norm, 1e-9)
         return Felt((-share * x, -share * y, -share * z), (a, b, c))

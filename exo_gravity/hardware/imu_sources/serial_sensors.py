@@ -13,12 +13,16 @@ y'', by the data sheet's example, which its text contradicts (docs/imu.md).
 import contextlib
 import math
 import struct
-from typing import ClassVar
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Clock, ImuSource, Measurement
+from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
@@ -36,27 +40,42 @@ RVC_RATE = 100.0  # Hz, fixed
 RVC_ANGLE, RVC_ACCELERATION = 0.01 * RADIANS_PER_DEGREE, 1e-3 * STANDARD_GRAVITY
 
 
+class Measurement(NamedTuple):
+    """A sample without its time; None marks what the sensor does not report."""
+
+    angular_velocity: Axes | None  #: rad/s
+    acceleration: Axes  #: m/s^2
+    orientation: Quaternion | None
+    skipped: int  #: samples before it that the sensor took but that never arrived
+
+
 class SerialSource(ImuSource):
     """Base of the sensors on serial ports. After lost or extra bytes the start of a packet is found again."""
 
+    DEVICE: ClassVar[str]
     HEADER: ClassVar[bytes]
     LENGTH: ClassVar[int]  # bytes of a packet
     SUMMED: ClassVar[int]  # the first byte that counts into the sum in its last one
 
-    def __init__(self, device: str, port: str, baud: int, rate: float, clock: Clock) -> None:
-        """Open `port`. Raises DeviceError, and ParameterError without pyserial."""
-        super().__init__(f"{device} on {port}", rate, clock)
+    def __init__(self, values: Mapping[str, Any], rate: float, clock: Clock) -> None:
+        """Open the port of the parameter values for `rate` samples a second. Raises DeviceError, ParameterError."""
+        port = values["serial.port"]
+        if not port:
+            raise ParameterError("serial.port", port, "the sensor's port, e.g. /dev/ttyUSB0")
+        super().__init__(f"{self.DEVICE} on {port}")
         try:
             import serial
         except ImportError:
-            expected = "topic, or install the extra imu (pyserial)"
-            raise ParameterError("source", "an IMU on a serial port", expected) from None
+            expected = "topic, or install the extra imu (serial is missing)"
+            raise ParameterError("source", values["source"], expected) from None
         try:
-            self._port = serial.Serial(port, baud, timeout=0, write_timeout=0.2)
+            self._port = serial.Serial(port, values["serial.baud"], timeout=0, write_timeout=0.2)
         except (OSError, ValueError) as error:  # pyserial's own errors are OSErrors
             raise DeviceError(self.name, f"cannot be opened: {error}") from None
+        self._clock, self._sample_clock = clock, SampleClock(rate)
         self._pending = bytearray()
         self._in_step = False  # whether the last packet has arrived well
+        self._why_lost = ""  # of samples that are not counted yet
         self.silence = "not one byte"
 
     def close(self) -> None:
@@ -64,7 +83,21 @@ class SerialSource(ImuSource):
         with contextlib.suppress(OSError):
             self._port.close()
 
-    def _packets(self, now: float) -> list[bytes]:
+    def read(self) -> list[ImuSample]:
+        """Return every sample that has arrived since the last call. Raises DeviceError."""
+        arrival = self._clock()
+        measured = [measurement for packet in self._packets() if (measurement := self._decode(packet))]
+        stamps = self._sample_clock.stamps(arrival, [measurement.skipped for measurement in measured])
+        if self._sample_clock.lost > self.lost:
+            self.lost, self.loss = self._sample_clock.lost, self._why_lost or "not read in time"
+            self._why_lost = ""
+        return [
+            ImuSample(stamp, one.angular_velocity, one.acceleration, one.orientation)
+            for stamp, one in zip(stamps, measured, strict=True)
+        ]
+
+    def _packets(self) -> list[bytes]:
+        """Return the whole packets that have arrived since the last call."""
         try:
             data = self._port.read(self._port.in_waiting)
         except OSError as error:
@@ -89,19 +122,23 @@ class SerialSource(ImuSource):
         """Return whether the sum of the packet's content is right."""
         return sum(packet[self.SUMMED : -1]) & 0xFF == packet[-1]
 
+    @abstractmethod
+    def _decode(self, packet: bytes) -> Measurement | None:
+        """Return the measurement that a packet completes."""
+
 
 class WitMotion(SerialSource):
     """A WitMotion sensor. A sample is complete with its orientation: a quaternion, or angles if it sends none."""
 
-    HEADER, LENGTH, SUMMED = b"\x55", 11, 0
+    DEVICE, HEADER, LENGTH, SUMMED = "WitMotion", b"\x55", 11, 0
 
-    def __init__(self, port: str, baud: int, rate: float, clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], clock: Clock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
-        rate = min(RATES, key=lambda candidate: abs(candidate - rate))
+        rate, baud = min(RATES, key=lambda candidate: abs(candidate - values["rate"])), values["serial.baud"]
         needed = int(rate * PACKETS_A_SAMPLE * self.LENGTH * BITS_A_BYTE)
         if baud < needed:
             raise ParameterError("serial.baud", baud, f"{needed} or more for {rate:g} samples a second")
-        super().__init__("WitMotion", port, baud, rate, clock)
+        super().__init__(values, rate, clock)
         self._parts: dict[int, Numbers] = {}  # of the present sample, by type
         self._last_type = 0  # that completes a sample
         self._begun = False
@@ -147,11 +184,11 @@ class WitMotion(SerialSource):
 class Bno085(SerialSource):
     """A BNO085 with PS0 high and PS1 low, which selects UART-RVC."""
 
-    HEADER, LENGTH, SUMMED = b"\xaa\xaa", 19, 2
+    DEVICE, HEADER, LENGTH, SUMMED = "BNO085", b"\xaa\xaa", 19, 2
 
-    def __init__(self, port: str, baud: int, clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], clock: Clock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
-        super().__init__("BNO085", port, baud, RVC_RATE, clock)
+        super().__init__(values, RVC_RATE, clock)
         self._counter: int | None = None
 
     def _decode(self, packet: bytes) -> Measurement:

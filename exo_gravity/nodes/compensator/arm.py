@@ -23,7 +23,7 @@ from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
-from exo_gravity.core.trunk.inputs import MAX_LEAD
+from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare
@@ -190,9 +190,9 @@ class MultiArrayInterface(Repeated):
         hold a torque, from which the next one must begin.
         """
         age = (self._clock.now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        self._is_late = not -MAX_LEAD <= age <= self._timeout
+        self._is_late = not -TILT.lead <= age <= self._timeout
         if self._is_late:
-            raise ParameterError("age by its stamp", round(age, 3), f"from {-MAX_LEAD:g} to {self._timeout:g} s")
+            raise ParameterError("age by its stamp", round(age, 3), f"from {-TILT.lead:g} to {self._timeout:g} s")
         if self._fade.state == "waiting":
             self._applied = by_name(message, "effort", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)

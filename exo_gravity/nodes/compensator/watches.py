@@ -27,7 +27,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.inputs import FELT_RANGE
+from exo_gravity.core.trunk.inputs import FELT
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.momentum import COVER, ContactWatch, MomentumObserver, WearerEstimate
 from exo_gravity.nodes.ros.messages import by_name
@@ -144,7 +144,7 @@ class WearerWatch(Repeated):
         if not settings.use_imu:
             return Tilt.of(settings.side), ZERO
         felt_at, force, rate, _ = self.felt
-        if now - felt_at < FRESH and FELT_RANGE[0] < math.hypot(*force) < FELT_RANGE[1]:
+        if now - felt_at < FRESH and FELT.range[0] < math.hypot(*force) < FELT.range[1]:
             tilt = Tilt.of_felt(settings.side, [-component for component in force], STANDARD_GRAVITY)
             return tilt, turning_in_base(settings.side, rate)
         # Without the lock of the control loop: at worst a tilt is turned on by the angular velocity of the one before.

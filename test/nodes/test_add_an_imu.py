@@ -1,0 +1,65 @@
+"""CONTRIBUTING, "Add an IMU", followed literally: a class with `read` and `close`, and its name in two places."""
+
+import pytest
+from rclpy.time import Time
+
+from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.core.trunk.params import IMU_SOURCES
+from exo_gravity.hardware.imu_sources import SOURCES, ImuSource
+from exo_gravity.nodes.imu import ImuDevice
+
+from ..hardware.virtual_time import VirtualClock
+
+
+class LevelImu(ImuSource):
+    """A sensor that always lies level."""
+
+    def __init__(self, values, clock):
+        super().__init__(f"level IMU at {values['rate']:g} Hz")
+        self.clock, self.is_open = clock, True
+
+    def read(self):
+        return [ImuSample(self.clock(), (0.0, 0.0, 0.01), (0.0, 0.0, 9.81))]
+
+    def close(self):
+        self.is_open = False
+
+
+class Node:
+    """What ImuDevice needs of a node."""
+
+    def __init__(self, clock):
+        self.clock, self.published = clock, []
+
+    def create_publisher(self, msgtype, topic, depth):
+        return self
+
+    def publish(self, message):
+        self.published.append(message)
+
+    def get_clock(self):
+        return self
+
+    def now(self):
+        return Time(nanoseconds=round(self.clock.monotonic() * 1e9))
+
+
+def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monkeypatch):
+    monkeypatch.setitem(SOURCES, "level", LevelImu)
+    clock, received = VirtualClock(), []
+    device = ImuDevice(
+        Node(clock), {"source": "level", "rate": 100.0}, "/imu/data_raw", lambda m, info: received.append(m), clock
+    )
+    for _ in range(3):
+        clock.sleep(0.01)
+        device.poll()
+    assert [message.linear_acceleration.z for message in received] == pytest.approx([9.81] * 3)
+    assert received[0].orientation_covariance[0] == -1.0  # not reported
+    assert device.values["device"] == "level IMU at 100 Hz"
+    source = device.reopening.source
+    device.reopening.close()
+    assert not source.is_open
+
+
+def test_each_source_is_a_choice_of_the_parameter():
+    assert set(IMU_SOURCES) == {"topic", *SOURCES}
