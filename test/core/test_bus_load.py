@@ -73,7 +73,7 @@ def frames(kind: str) -> Iterator[tuple[int, bytes, bool]]:
             yield (MIT_V3.first_id + can_id) & ID_BITS, MIT_V3.pack_command(V3, 0.0, 0.0, 0.0, 0.0, torque), True
         else:
             reply = MotorReply(can_id, position, velocity, torque, temperature, 0)
-            yield MIT_V3.status_id(can_id) & ID_BITS, MIT_V3.pack_reply(V3, reply), True
+            yield MIT_V3.reply_id(can_id) & ID_BITS, MIT_V3.pack_reply(V3, reply), True
 
 
 @pytest.mark.parametrize("worst", [COMMAND[1], REPLY[1]])

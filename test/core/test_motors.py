@@ -132,7 +132,7 @@ def test_a_reply_survives_a_round_trip_and_is_a_reply(board, shares, can_id, tem
     assert (got.motor_id, got.temperature, got.error) == (can_id, temperature, error)
     for field, wanted, value in zip(OF_REPLY, sent[1:4], got[1:4], strict=True):
         assert abs(value - wanted) <= ((0.5 + 1e-6) * bounds(spec, field)[2] if wire_format is MIT else 0.02)
-    reply_id = can_id if wire_format is MIT else MIT_V3.status_id(can_id)
+    reply_id = can_id if wire_format is MIT else MIT_V3.reply_id(can_id)
     assert wire_format.classify(reply_id, data, frozenset((can_id,))) == (REPLY, can_id)
 
 
@@ -293,7 +293,7 @@ def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
     reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
     assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
     assert reply[3:] == (pytest.approx(-2.0 * 3.0 / 7.4), -5, 7)
-    assert MIT_V3.status_id(3) == EXTENDED | 0x2903
+    assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
     assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
 
 
@@ -311,7 +311,7 @@ def test_a_frame_of_any_control_mode_is_a_command_to_a_v3_board(mode):
 
 @pytest.mark.parametrize("length", [0, 7, 9])
 def test_a_v3_status_frame_of_another_length_is_ignored(length):
-    assert MIT_V3.classify(MIT_V3.status_id(1), bytes(length), IDS) == (OTHER, 0)
+    assert MIT_V3.classify(MIT_V3.reply_id(1), bytes(length), IDS) == (OTHER, 0)
 
 
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():

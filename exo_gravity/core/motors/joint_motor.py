@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
@@ -105,6 +105,7 @@ class JointMotor:
         return self.direction * joint_position + self.zero
 
 
+LARGEST_ZERO = max(spec.position_range for spec in MOTORS.values())  # rad; `JointMotor` has the limit of each motor
 SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
 
 # fmt: off
@@ -113,10 +114,11 @@ MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
     Param("can.channel", "", "python-can channel, e.g. can0; with two buses one per motor, e.g. can0,can0,can1,can1",
           fixed=True, required=True),
-    Param("motor", ["AK60-6", "AK80-9", "AK60-6", "AK60-6"], "motor types", choices=tuple(MOTORS), fixed=True),
+    Param("motor", list(USUAL_MOTORS), "motor types", choices=tuple(MOTORS), fixed=True),
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
-    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
+    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
+          fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
     Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
           choices=tuple(FORMATS), fixed=True),
