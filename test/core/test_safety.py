@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.safety.descent import DAMPING_RISE
+from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Fault, FaultCode, State
-from exo_gravity.core.safety.limits import DAMPING, GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
-from exo_gravity.core.safety.monitors import LONGEST_AGE, LONGEST_RIDE
+from exo_gravity.core.safety.limits import DAMPING, GUIDE, MAX_EFFORT_RATE
+from exo_gravity.core.safety.monitors import RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 
@@ -171,7 +171,7 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
     assert all(abs(e) <= limit for e, limit in zip(drive.effort, LIMITS.max_effort, strict=True))
     if machine.state in CARRYING:
         assert arm.effort is not None
-        assert arm.effort_age <= LONGEST_AGE + 1e-9
+        assert arm.effort_age <= RIDE.longest_age + 1e-9
         assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or min(drive.damping) > 0.0
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
@@ -189,7 +189,7 @@ def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again(
     assert 0.0 < min(arm.drive.damping) < 0.2
     arm.cycle(0.1)
     assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 1
-    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DAMPING_RISE)
+    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DESCENT.damping_rise)
     assert arm.drive.effort == pytest.approx(EFFORT)
     arm.effort_age = 0.002
     arm.cycle(0.12)
@@ -201,7 +201,7 @@ def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again(
 def test_a_ride_ends_and_who_is_late_more_often_than_once_in_ten_is_let_down(age):
     arm = SafetyRun().until_active()
     arm.effort_age, arm.held = age, True
-    arm.cycle(LONGEST_RIDE - PERIOD)
+    arm.cycle(RIDE.longest - PERIOD)
     assert arm.machine.state is State.ACTIVE
     arm.cycle(2 * PERIOD)
     assert (arm.machine.state, arm.fault_code) == (State.LETTING_DOWN, "command_stale")
@@ -227,7 +227,7 @@ def test_after_a_pause_of_the_loop_itself_only_the_age_of_the_efforts_counts():
     arm.effort_age = 0.1
     arm.cycle()
     assert arm.machine.state is State.ACTIVE
-    arm.effort_age = LONGEST_AGE + PERIOD
+    arm.effort_age = RIDE.longest_age + PERIOD
     arm.cycle()
     assert arm.fault_code == "command_stale"
 
@@ -298,19 +298,19 @@ def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(si
 def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_neither_steps_nor_stays():
     run = SafetyRun().until_active()
     run.damped = True
-    run.changes[1] = {"velocity": GUIDE_SPEED}
+    run.changes[1] = {"velocity": GUIDE.speed}
     run.changes[2] = {"velocity": -1.0}
     run.changes[3] = {"velocity": 0.4}
     steps = [run.drive.damping]
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping[:2] == (0.0, 0.0)
-    assert run.drive.damping[2] == pytest.approx(GUIDE_BRAKE)
-    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE_BRAKE
+    assert run.drive.damping[2] == pytest.approx(GUIDE.brake)
+    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE.brake
     run.damped = False
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping == NOTHING
     largest = np.abs(np.diff(steps, axis=0)).max()
-    assert largest <= DAMPING / DAMPING_RISE * PERIOD * 1.001
+    assert largest <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from exo_gravity.core.safety.drive import OFF, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import MAX_DISTURBED, MIN_PUSH, TEST_TORQUE, SignCheck
+from exo_gravity.core.safety.gate import SIGN_PUSH, SWITCH_ON, SignCheck
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
 from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
@@ -147,7 +147,7 @@ def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried()
     arm.enable()
     arm.cycle(3.0)
     assert arm.machine.state is State.ACTIVE
-    assert arm.largest_effort == [TEST_TORQUE] * 4  # the check that the motors are on
+    assert arm.largest_effort == [SWITCH_ON.torque] * 4  # the check that the motors are on
 
 
 @pytest.mark.parametrize(("mobility", "code"), [(-0.5, "wrong_sign"), (0.0, "sign_unproven")])
@@ -158,7 +158,7 @@ def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_ref
     assert arm.machine.state is State.FAULT
     assert arm.fault_code == code
     assert arm.machine.fault.reason.startswith("c: ")
-    assert arm.largest_effort[3] == TEST_TORQUE
+    assert arm.largest_effort[3] == SWITCH_ON.torque
 
 
 def assert_a_wrong_angle_is_refused(arm):
@@ -247,7 +247,7 @@ def test_a_joint_passes_after_a_push_each_way_and_is_released():
     joint = Joint()
     assert joint.run(20.0) is None
     assert joint.check.done
-    assert max(joint.pushes) > MIN_PUSH and min(joint.pushes) < -MIN_PUSH
+    assert max(joint.pushes) > SIGN_PUSH.least and min(joint.pushes) < -SIGN_PUSH.least
     assert joint.check.effort[0] == 0.0
 
 
@@ -265,7 +265,7 @@ def test_a_wearer_who_keeps_moving_the_joint_is_asked_to_hold_still_and_then_ref
     fault = joint.run(60.0)
     assert fault is not None and fault.code == "sign_unproven"
     assert "hold still" in fault.reason
-    assert MAX_DISTURBED >= 3
+    assert SIGN_PUSH.disturbed >= 3
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

@@ -18,11 +18,11 @@ import yaml
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.can.bus_scan import BusScan, MotorAnswer
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
+from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Person
-from exo_gravity.lab.calibration.motors import MotorSearch
+from exo_gravity.lab.calibration.motors import HandMotion, MotorSearch
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -215,7 +215,7 @@ def test_motors_on_two_buses_are_found_and_the_channel_of_each_joint_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))
-    monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)
+    monkeypatch.setattr(motors, "HAND", HandMotion(silence=10.0))
     arm = Arm(15)
     monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
     near, far = (f"{name}-{os.getpid()}" for name in ("near", "far"))  # the lock of a bus holds on the whole computer
@@ -234,7 +234,7 @@ def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))  # test_bus_scan.py scans all
-    monkeypatch.setattr(motors, "MAX_SILENCE", 10.0)  # of a thread on a busy computer
+    monkeypatch.setattr(motors, "HAND", HandMotion(silence=10.0))  # of a thread on a busy computer
     arm, channel = Arm(15), f"calibrate-motors-{os.getpid()}"
     monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
     params, output = params_of(tmp_path, channel), tmp_path / "new.yaml"
