@@ -122,19 +122,26 @@ def test_the_first_fault_stays():
     assert arm.fault_code == "bus_error"
 
 
-EVENTS = st.one_of(
-    st.tuples(st.just("enable"), st.none()),
-    st.tuples(st.just("disable"), st.none()),
-    st.tuples(st.just("clear"), st.none()),
-    st.tuples(st.just("trip"), st.none()),
-    st.tuples(st.just("off"), st.integers(0, 3)),
-    st.tuples(st.just("silent"), st.integers(0, 3)),
-    st.tuples(st.just("replies"), st.integers(0, 3)),
-    st.tuples(st.just("effort"), st.lists(st.floats(width=32), min_size=4, max_size=4) | st.none()),
-    st.tuples(st.just("age"), st.floats(0.0, 0.2)),
-    st.tuples(st.just("reading"), st.dictionaries(st.sampled_from(["position", "velocity"]), st.floats(-9, 9))),
-    st.tuples(st.just("time"), st.floats(0.004, 3.0)),
-)
+SET = {  # of an event, what its value sets
+    "off": lambda arm, joint: arm.off.add(joint),
+    "silent": lambda arm, joint: arm.silent.add(joint),
+    "replies": lambda arm, joint: arm.silent.discard(joint),
+    "effort": lambda arm, effort: setattr(arm, "effort", effort),
+    "age": lambda arm, age: setattr(arm, "effort_age", age),
+    "reading": lambda arm, change: arm.changes.__setitem__(0, change),
+    "trip": lambda arm, _: arm.machine.trip(FaultCode.BUS_ERROR, "test", arm.now),
+    **{name: lambda arm, _, name=name: getattr(arm.machine, name)(arm.now) for name in ("enable", "disable", "clear")},
+    "time": lambda arm, _: None,
+}
+VALUES = {
+    **dict.fromkeys(("off", "silent", "replies"), st.integers(0, 3)),
+    **dict.fromkeys(("enable", "disable", "clear", "trip"), st.none()),
+    "effort": st.lists(st.floats(width=32), min_size=4, max_size=4) | st.none(),
+    "age": st.floats(0.0, 0.2),
+    "reading": st.dictionaries(st.sampled_from(["position", "velocity"]), st.floats(-9, 9)),
+    "time": st.floats(0.004, 3.0),
+}
+EVENTS = st.one_of(*(st.tuples(st.just(name), values) for name, values in VALUES.items()))
 
 
 @settings(max_examples=60, deadline=None)
@@ -142,22 +149,7 @@ EVENTS = st.one_of(
 def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(events, sign_check_torque):
     arm = SafetyRun(sign_check_torque=sign_check_torque)
     for event, value in events:
-        if event in ("enable", "disable", "clear"):
-            getattr(arm.machine, event)(arm.now)
-        elif event == "trip":
-            arm.machine.trip(FaultCode.BUS_ERROR, "test", arm.now)
-        elif event == "off":
-            arm.off.add(value)
-        elif event == "silent":
-            arm.silent.add(value)
-        elif event == "replies":
-            arm.silent.discard(value)
-        elif event == "effort":
-            arm.effort = value
-        elif event == "age":
-            arm.effort_age = value
-        elif event == "reading":
-            arm.changes[0] = value
+        SET[event](arm, value)
         had_fault = arm.machine.fault
         arm.cycle(value if event == "time" else PERIOD)
         check(arm, had_fault if event != "clear" else None)
@@ -253,15 +245,7 @@ def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_f
 
 
 def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
-    others = [code for code in FaultCode if not code.is_resumable]
-    assert {*FaultCode} - {*others} == {
-        "motor_silent",
-        "command_stale",
-        "command_withdrawn",
-        "control_lost",
-        "bus_error",
-    }
-    for code in others[::4]:
+    for code in [code for code in FaultCode if not code.is_resumable][::4]:
         arm = let_down_by(code)
         assert not arm.machine.resume(arm.now)
         assert (arm.machine.state, arm.fault_code) == (State.FAULT, code)

@@ -14,14 +14,10 @@ from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
 
 
-def test_a_new_machine_keeps_the_motors_off():
+def test_a_new_machine_keeps_the_motors_off_and_torque_ramps_in_over_the_ramp_time_without_a_step():
     arm = SafetyRun().cycle(1.0)
     assert arm.machine.state is State.DISABLED
     assert arm.drive == OFF
-
-
-def test_torque_ramps_in_over_the_ramp_time_without_a_step():
-    arm = SafetyRun()
     arm.enable()
     arm.cycle(1.65)
     assert arm.machine.state is State.RAMPING_IN
@@ -63,13 +59,7 @@ def test_the_checks_require_a_whole_second_without_trouble():
     assert arm.machine.state is State.CHECKING
 
 
-@pytest.mark.parametrize(
-    ("change", "code"),
-    [
-        ({"error": 5}, "motor_error"),
-        ({"temperature": 95}, "over_temperature"),
-    ],
-)
+@pytest.mark.parametrize(("change", "code"), [({"error": 5}, "motor_error"), ({"temperature": 95}, "over_temperature")])
 def test_a_fault_during_the_checks_is_latched(change, code):
     arm = SafetyRun()
     arm.changes[2].update(change)
@@ -169,6 +159,19 @@ def assert_a_wrong_angle_is_refused(arm):
     assert arm.fault_code == "implausible_zero"
 
 
+@pytest.mark.parametrize("code", ["", "position_jump", "motor_error", "outside_limits", "torque_not_delivered"])
+def test_after_a_fault_that_may_have_moved_them_or_a_jump_while_the_arm_is_off_zeros_are_checked_again(code):
+    arm = SafetyRun().until_active()
+    if code:
+        arm.machine.trip(FaultCode(code), "test", arm.now)
+        arm.cycle(10.0)
+        assert arm.machine.clear(arm.now)
+    else:
+        arm.machine.disable(arm.now)
+        arm.cycle(8.0)
+    assert_a_wrong_angle_is_refused(arm)
+
+
 def test_a_motor_that_is_found_off_is_switched_on_again_with_the_torque_that_held_the_arm():
     arm = SafetyRun().until_active()
     arm.off.add(1)
@@ -181,22 +184,6 @@ def test_a_motor_that_is_found_off_is_switched_on_again_with_the_torque_that_hel
     assert arm.fault_code == "torque_not_delivered"
     assert "b: -4.00 Nm commanded" in arm.machine.fault.reason
     assert arm.drive.effort[1] < -3.0
-
-
-@pytest.mark.parametrize("doubt", ["position_jump", "motor_error", "outside_limits", "torque_not_delivered"])
-def test_after_a_fault_that_casts_doubt_on_them_zeros_are_checked_again(doubt):
-    arm = SafetyRun().until_active()
-    arm.machine.trip(FaultCode(doubt), "test", arm.now)
-    arm.cycle(10.0)
-    assert arm.machine.clear(arm.now)
-    assert_a_wrong_angle_is_refused(arm)
-
-
-def test_an_angle_that_jumps_while_the_arm_is_off_is_no_longer_trusted():
-    arm = SafetyRun().until_active()
-    arm.machine.disable(arm.now)
-    arm.cycle(8.0)
-    assert_a_wrong_angle_is_refused(arm)
 
 
 def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
@@ -265,7 +252,6 @@ def test_a_wearer_who_keeps_moving_the_joint_is_asked_to_hold_still_and_then_ref
     fault = joint.run(60.0)
     assert fault is not None and fault.code == "sign_unproven"
     assert "hold still" in fault.reason
-    assert SIGN_PUSH.disturbed >= 3
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
