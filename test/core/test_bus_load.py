@@ -10,10 +10,10 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import (
     BITRATE,
-    COMMAND,
-    REPLY,
-    STATUS,
-    V3_COMMAND,
+    COMMAND_BITS,
+    REPLY_BITS,
+    STATUS_BITS,
+    V3_COMMAND_BITS,
     Traffic,
     buses_of,
     traffic_of,
@@ -92,11 +92,12 @@ def test_every_frame_is_between_its_length_without_stuffing_and_the_worst_case(i
 
 
 @pytest.mark.parametrize(
-    ("kind", "bits"), [("command", COMMAND), ("reply", REPLY), ("V3 command", V3_COMMAND), ("V3 status", STATUS)]
+    ("kind", "bits"),
+    [("command", COMMAND_BITS), ("reply", REPLY_BITS), ("V3 command", V3_COMMAND_BITS), ("V3 status", STATUS_BITS)],
 )
 def test_typical_bits_are_the_mean_of_a_carried_arm_and_the_most_those_of_the_specification(kind, bits):
-    assert np.mean([stuffed_bits(*frame) for frame in frames(kind)]) == pytest.approx(bits[0], abs=1.0)
-    assert bits[1] == frame_bits(8, kind.startswith("V3"))[1]
+    assert np.mean([stuffed_bits(*frame) for frame in frames(kind)]) == pytest.approx(bits.typical, abs=1.0)
+    assert bits.most == frame_bits(8, kind.startswith("V3"))[1]
 
 
 def test_the_load_of_replying_and_reporting_motors():
@@ -106,7 +107,9 @@ def test_the_load_of_replying_and_reporting_motors():
     assert Traffic(4).load(Traffic(4).largest_rate) == pytest.approx(1.0)
     fast, slow = Traffic(0, 4), Traffic(0, 4, bitrate=250_000)
     assert (fast.status_rate, slow.status_rate) == (500.0, 200.0)
-    assert BITRATE * fast.load(250.0) == pytest.approx(4 * (500.0 * STATUS[0] + 250.0 * V3_COMMAND[0]))
+    assert BITRATE * fast.load(250.0) == pytest.approx(
+        4 * (500.0 * STATUS_BITS.typical + 250.0 * V3_COMMAND_BITS.typical)
+    )
     slow.check(160.0)
 
 

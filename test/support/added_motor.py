@@ -97,22 +97,23 @@ def carried(given: dict[str, Any]) -> dict[str, Any]:
     check_bridge(values["rate"], motors, limits)
     device, wire, period = device_of(values_of(SIMULATOR, given)), Wire(), 1.0 / values["rate"]
     wire.play(device)
-    bus = MotorBus(wire.open(), motors, clock=wire.clock)
+    clock: Any = wire.clock  # it has the methods of a `Clock`
+    bus = MotorBus(wire.open(), motors, clock=clock)
     safety = SafetyMachine(limits, period, motors)
 
     def efforts(_latest: float) -> EffortCommand:
         held = gravity_torque(device.arm.config.links, device.arm.positions)
-        return EffortCommand(tuple(held), wire.clock.monotonic())
+        return EffortCommand(tuple(held), clock.monotonic())
 
     loop = ControlLoop(bus, safety, period, get_efforts=efforts)
-    safety.enable(wire.clock.monotonic())
-    end = wire.clock.monotonic() + 5.0
-    while safety.state is not State.ACTIVE and wire.clock.monotonic() < end:
+    safety.enable(clock.monotonic())
+    end = clock.monotonic() + 5.0
+    while safety.state is not State.ACTIVE and clock.monotonic() < end:
         loop.cycle()
     state, is_on = safety.state.value, [motor.entered for motor in device.motors]
-    safety.disable(wire.clock.monotonic())
-    end = wire.clock.monotonic() + 20.0
-    while not loop.is_off and wire.clock.monotonic() < end:
+    safety.disable(clock.monotonic())
+    end = clock.monotonic() + 20.0
+    while not loop.is_off and clock.monotonic() < end:
         loop.cycle()
     bus.stop()
     return {

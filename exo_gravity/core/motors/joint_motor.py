@@ -6,7 +6,7 @@ A `JointMotor` translates joint angle, effort and damping to the frames of its w
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
@@ -20,8 +20,6 @@ MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 BITRATE = 1_000_000  # bit/s, of AK motors as delivered
-# Bits of a frame of 8 bytes: the mean over the poses, speeds and torques of an arm that is being carried, and the most.
-COMMAND, REPLY, V3_COMMAND, STATUS = (124, 135), (118, 135), (146, 160), (141, 160)
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
 # slow bus fewer, or four boards would fill it.
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
@@ -182,6 +180,17 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 
+class FrameBits(NamedTuple):
+    """The bits of a kind of frame with 8 bytes of data."""
+
+    typical: int  #: the mean over the poses, speeds and torques of an arm that is being carried
+    most: int
+
+
+COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and V2 boards
+V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
+
+
 @dataclass(frozen=True)
 class Traffic:
     """The motors on one bus, its bit rate, and the highest control rate that fits. Raises ParameterError.
@@ -208,7 +217,8 @@ class Traffic:
 
     def load(self, rate: float, worst: bool = False) -> float:
         """Return the share of the bus that `rate` cycles a second take, for typical or for `worst` stuffing."""
-        command, reply, v3_command, status = (bits[worst] for bits in (COMMAND, REPLY, V3_COMMAND, STATUS))
+        kinds = COMMAND_BITS, REPLY_BITS, V3_COMMAND_BITS, STATUS_BITS
+        command, reply, v3_command, status = (bits.most if worst else bits.typical for bits in kinds)
         cycle = self.replying * (command + reply) + self.reporting * v3_command
         return (rate * cycle + self.reporting * self.status_rate * status) / self.bitrate
 
