@@ -34,7 +34,7 @@ from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, FaultCode
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.motion_monitor import PATIENCE
+from exo_gravity.core.safety.motion_monitor import MOTION
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
@@ -314,7 +314,7 @@ def quiet(
     def is_over() -> bool:
         nonlocal share
         columns = zip(monitor.impulse, monitor.full, strict=True)
-        share = max(share, *(impulse / (PATIENCE * full or 1.0) for impulse, full in columns))
+        share = max(share, *(impulse / (MOTION.patience * full or 1.0) for impulse, full in columns))
         return trial.safety.fault is not None
 
     wearer.is_over = is_over

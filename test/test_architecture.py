@@ -32,7 +32,19 @@ MAY_IMPORT: dict[str, Iterable[str]] = {
     "tools": ("core", "hardware", "sim", "lab", "tools"),
 }
 # From the bottom up: a room imports only those before it, and itself.
-ROOMS = {"core": ("errors", "numbers", "params", "motors", "arm", "trunk", "safety", "compensation")}
+ROOMS = {
+    "core": ("errors", "numbers", "params", "motors", "arm", "trunk", "safety", "compensation"),
+    "hardware": (
+        "clock",
+        "network",
+        "can",
+        "control_loop",
+        "ownership",
+        "trunk_estimator",
+        "imu_sources",
+        "urdf_arm",
+    ),
+}
 EXCEPTIONS: dict[str, set[str]] = {
     "core.compensation.weighing": {"lab.observer.momentum"},
     "nodes.compensator.watches": {"lab.observer.adaptation", "lab.observer.momentum"},

@@ -237,7 +237,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     clock, faded, is_down = bus.clock, 0.0, False
     rest, supply = RestTracker(), SupplyMonitor()
     if any(drive.unsure):
-        supply.doubt(drive.effort)
+        supply.suspect(drive.effort)
     while True:
         time, joints = clock.monotonic(), tuple(bus.samples)
         silent = [time - joint.time > REPLY_TIMEOUT for joint in joints]
@@ -247,7 +247,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             return
         effort = tuple(max(0.0, 1.0 - faded / LOWERING_FADE) * effort for effort in drive.effort)
         if all(silent):
-            supply.doubt(effort)
+            supply.suspect(effort)
         else:
             faded += period
         supply.step(period, joints, silent)

@@ -22,7 +22,7 @@ import numpy as np
 
 from exo_gravity.core.errors import named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, Traffic, motors_of, traffic_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, FROZEN, check_bridge, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, check_bridge, limits_of
 from exo_gravity.hardware.clock import favour, request_real_time
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.lab.inputs.arms import node_values
@@ -290,7 +290,7 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     buses = list(of_buses(nodes, bridges, root))
     settings = list(bridges.values()) or [{param.name: param.default for param in CAN_BRIDGE}]
     period, priority = 1.0 / max(s["rate"] for s in settings), max(s["thread_priority"] for s in settings)
-    timeout = min(FROZEN, *(s["command_timeout"] for s in settings))
+    timeout = min(LOOP.frozen, *(s["command_timeout"] for s in settings))
     wakeups = measured(period, seconds, priority)
     late = of_wakeups(wakeups, period, timeout)
     keep_to_this_machine()

@@ -3,7 +3,7 @@
 Standard Denavit-Hartenberg, Table 1 of the paper: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
 (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity of
 link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
-these and not from the laws of `core.model.gravity`, so that it can contradict them.
+these and not from the laws of `core.arm.gravity`, so that it can contradict them.
 
 In the axes of an accelerated base, gravity is g - a: turned and scaled. If the base also turns, the Euler, centrifugal
 and Coriolis forces act on each link. They are not small: a sway of 2 degrees at 1 Hz accelerates a forearm 0.4 m from
@@ -25,6 +25,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
 from exo_gravity.core.arm.gravity import MAX_OFFSET
+from exo_gravity.core.arm.kinematics import ROTORS
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
@@ -66,10 +67,7 @@ class ArmConfig:
     #: The passive arm of a wearer: the upper arm on link 3, forearm and hand on link 4.
     wearer_mass: Sequence[float] = owned(_ZEROS, "mass of the wearer's passive arm on each link", (0.0, MAX_MASS), "kg")
     wearer_cog: Sequence[float] = owned(_ZEROS, "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m")
-    #: 243.5 and 607 g cm^2 (published motor tables) times the gear ratio squared.
-    rotor_inertia: Sequence[float] = owned(
-        (8.8e-4, 4.9e-3, 8.8e-4, 8.8e-4), "rotor inertia at the gear's output", (0.0, 1.0), "kg m^2"
-    )
+    rotor_inertia: Sequence[float] = owned(ROTORS, "rotor inertia at the gear's output", (0.0, 1.0), "kg m^2")
     #: Estimates for backdrivable planetary gears.
     coulomb_friction: Sequence[float] = owned((0.2, 0.4, 0.2, 0.2), "Coulomb friction", (0.0, 10.0), "Nm")
     viscous_friction: Sequence[float] = owned((0.02, 0.05, 0.02, 0.02), "viscous friction", (0.0, 10.0), "Nm s/rad")

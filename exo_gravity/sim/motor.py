@@ -10,16 +10,19 @@ What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_
 - A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
   switches the motor off. Other control modes are ignored here.
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
+
+A further wire format needs nothing here: the frames that switch a motor on and off and set its zero, whether it
+replies, its commands and its replies all come from its `WireFormat`.
 """
 
 import math
 import random
 from dataclasses import dataclass, replace
 
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO, MotorCommand, MotorReply, unpack_command
-from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, MIT_V3, MODE_CURRENT, Frame
+from exo_gravity.core.motors.specs import MotorCommand, MotorReply
+from exo_gravity.core.motors.wire_formats import MASTER_ID, Frame, V3Format
 from exo_gravity.core.params import owned
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -51,17 +54,17 @@ class SimulatedMotor:
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None) -> None:
         self.joint = joint
         self.firmware = firmware or Firmware()
+        to_master = self.firmware.reply_to_master and joint.wire_format.replies
         #: Arbitration IDs of replies or status frames, and of the frames that the motor obeys.
-        self.reply_id = MASTER_ID if self.firmware.reply_to_master else joint.can_id
-        self.received_ids: tuple[int, ...] = (joint.command_id,)
-        if not joint.wire_format.replies:
-            self.reply_id = MIT_V3.status_id(joint.can_id)
-            self.received_ids = joint.command_id, EXTENDED | MODE_CURRENT << 8 | joint.can_id
+        self.reply_id = MASTER_ID if to_master else joint.wire_format.reply_id(joint.can_id)
+        frames = (*joint.enter, *joint.exit, *joint.set_zero)
+        self.received_ids = tuple(dict.fromkeys((joint.command_id, *(frame_id for frame_id, _ in frames))))
         self.unplugged = False  #: a fault: no power, no torque, no replies, and only the zero is remembered
         self.temperature = 30.0  #: degC
         self.error = 0  #: a code of MOTOR_ERRORS, reported only
         self.entered = False  #: the motor is on, after ENTER and before EXIT
-        self._command, self._data = _NO_COMMAND, b""
+        self._command = _NO_COMMAND
+        self._data: bytes | None = None  # of the last command
         self._silent_until = -math.inf  # s, after SET_ZERO
         self._random = random.Random(joint.can_id)
 
@@ -85,32 +88,40 @@ class SimulatedMotor:
         """
         if self.unplugged or now < self._silent_until:
             return None
-        if not self.joint.wire_format.replies:
-            self._receive_v3(data, frame_id)
-            return None
-        if len(data) != 8:
-            return None
-        if data == SET_ZERO:
-            self.joint = replace(self.joint, zero=-self.joint.direction * position)
+        joint = self.joint
+        frame = joint.command_id if frame_id is None else frame_id, data
+        if frame in joint.set_zero:
+            self.joint = replace(joint, zero=-joint.direction * position)
             self._silent_until = now + self.firmware.zero_silence
             return None
-        if data == ENTER:
+        if frame in joint.enter:
             self.entered = True
-        elif data == EXIT:
+        elif frame in joint.exit:
             self.entered = False
-        elif data != self._data:  # an arm at rest gets the same command in every cycle
-            self._command, self._data = unpack_command(self.joint.spec, data), data
-        return self._state(position, velocity)
+        elif not (self._take_command(data) if frame[0] == joint.command_id else self._take_current(data)):
+            return None
+        return self._state(position, velocity) if joint.wire_format.replies else None
 
-    def _receive_v3(self, data: bytes, frame_id: int | None) -> None:
-        if frame_id == self.received_ids[1]:
-            if len(data) == 4:
-                current = int.from_bytes(data, "big", signed=True) / 1000.0
-                self._command = MotorCommand(0.0, 0.0, 0.0, 0.0, current * self.joint.spec.torque_per_ampere)
-                self.entered = current != 0.0
-        elif len(data) == 8:
-            self._command = MIT_V3.unpack_command(self.joint.spec, data)
-            self.entered = True
+    def _take_command(self, data: bytes) -> bool:
+        """Take a command, which switches the motor on if no other frame does; return whether it is one."""
+        joint = self.joint
+        if data != self._data:  # an arm at rest gets the same command in every cycle
+            try:
+                self._command, self._data = joint.wire_format.unpack_command(joint.spec, data), data
+            except FrameError:
+                return False
+        self.entered = self.entered or not joint.enter
+        return True
+
+    def _take_current(self, data: bytes) -> bool:
+        """Take a current, which a V3 board applies like a command; return whether it is one."""
+        joint = self.joint
+        if not isinstance(joint.wire_format, V3Format) or len(data) != 4:
+            return False
+        current = int.from_bytes(data, "big", signed=True) / 1000.0
+        torque = current * joint.spec.torque_per_ampere
+        self._command, self._data, self.entered = MotorCommand(0.0, 0.0, 0.0, 0.0, torque), None, True
+        return True
 
     def status(self, position: float, velocity: float) -> Frame | None:
         """Return the status frame of a V3 board at `position` rad and `velocity` rad/s; None without power.
@@ -131,7 +142,7 @@ class SimulatedMotor:
         The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale`, clamped to the peak torque.
         """
         if self.unplugged:
-            self.entered, self._command, self._data, self._silent_until = False, _NO_COMMAND, b"", -math.inf
+            self.entered, self._command, self._data, self._silent_until = False, _NO_COMMAND, None, -math.inf
         if not self.entered:
             return 0.0
         joint, command = self.joint, self._command

@@ -7,6 +7,7 @@ from typing import Any
 from exo_gravity.core.arm.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
+from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param, param_of, params_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
@@ -20,7 +21,6 @@ ARM_FIELDS = {
     "cog_z": "robot.cog_z",
     "wearer_mass": "wearer.mass",
     "wearer_cog": "wearer.cog",
-    "rotor_inertia": "rotor_inertia",
     "coulomb_friction": "friction.coulomb",
     "viscous_friction": "friction.viscous",
     "stribeck_friction": "friction.stribeck",
@@ -28,6 +28,11 @@ ARM_FIELDS = {
     "position_min": "stop.min",
     "position_max": "stop.max",
 }
+ROTOR_INERTIA = replace(
+    param_of(ArmConfig, "rotor_inertia", fixed=True),
+    default=[0.0] * JOINT_COUNT,
+    description="rotor inertia at the gear's output; 0: that of the motor",
+)
 IMU_FIELDS = ("rate", "rotation_trunk_from_imu", "delay")
 _LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
 SIMULATOR = (
@@ -39,6 +44,7 @@ SIMULATOR = (
     Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
     Param("robot.cog", _COG, "true centre of gravity from joint n", (0.0, MAX_LENGTH), "m", fixed=True),
     *(replace(param_of(ArmConfig, field, fixed=True), name=name) for field, name in ARM_FIELDS.items()),
+    ROTOR_INERTIA,
     Param("imu.topic", "", "topic of the trunk's IMU; empty: this simulator has no IMU", fixed=True),
     *(replace(param_of(ImuConfig, field, fixed=True), name=f"imu.{field}") for field in IMU_FIELDS),
     Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
@@ -59,9 +65,12 @@ SIMULATOR = (
 def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
     links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
-    arm = ArmConfig(links, **{field: values[name] for field, name in ARM_FIELDS.items()})
+    joints = motors_of(values)
+    given = zip(values[ROTOR_INERTIA.name], joints, strict=True)
+    rotors = [inertia or joint.spec.rotor_inertia for inertia, joint in given]
+    arm = ArmConfig(links, rotor_inertia=rotors, **{field: values[name] for field, name in ARM_FIELDS.items()})
     firmware = Firmware(**{param.name: values[param.name] for param in params_of(Firmware)})
-    motors = [SimulatedMotor(motor, firmware) for motor in motors_of(values)]
+    motors = [SimulatedMotor(joint, firmware) for joint in joints]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if values["truth"]:

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from exo_gravity.core.safety.descent import DESCENT_SPEED, JointDescent
+from exo_gravity.core.safety.descent import DESCENT, JointDescent
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 PERIOD = 0.004  # s
@@ -66,6 +66,6 @@ def test_a_joint_that_nothing_moves_loses_its_torque_within_two_seconds_and_then
 def test_damping_returns_when_a_joint_without_torque_moves_too_fast():
     joint = JointDescent(0.0, 0.0, 3.0)
     run(joint, 0.0, 6.0)
-    run(joint, 3.0 * DESCENT_SPEED, 0.25)
+    run(joint, 3.0 * DESCENT.speed, 0.25)
     assert joint.damping == DAMPING
     assert joint.effort == 0.0

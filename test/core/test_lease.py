@@ -1,4 +1,4 @@
-"""Who holds control of an arm: one holder at a time, with a name, for as long as he renews it."""
+"""Who holds control of an arm: one holder at a time, with a name, for as long as they renew it."""
 
 import pytest
 
@@ -22,7 +22,7 @@ def test_a_lease_lasts_as_long_as_it_is_renewed_and_is_lost_once():
     assert lease.request(now + 60.0, "ben", "hold") == "ben holds control"
 
 
-def test_a_free_control_is_not_waited_for():
+def test_a_control_that_was_released_is_free():
     lease = held()
     assert lease.request(100.1, "anna", "release") == "anna has released control"
     assert Lease().lost(1e6) == lease.lost(1e6) == ""

@@ -123,35 +123,33 @@ def test_a_command_survives_a_round_trip_within_half_a_code_and_is_a_command(boa
 
 
 @seeded
-@given(boards(), st.tuples(*[SHARES] * 3), st.integers(1, MAX_CAN_ID), st.integers(-40, 127), st.integers(0, 255))
-def test_a_reply_survives_a_round_trip_and_is_a_reply(board, shares, can_id, temperature, error):
-    wire_format, spec = board
+@given(joints(), st.tuples(*[SHARES] * 3), st.integers(-40, 127), st.integers(0, 255), st.floats(-3.0, 3.0))
+def test_a_reply_survives_a_round_trip_and_is_a_reply(motor, shares, temperature, error, angle):
+    wire_format, spec, can_id = motor.wire_format, motor.spec, motor.can_id
     sent = MotorReply(can_id, *scaled(spec, OF_REPLY, shares), temperature, error)
     data = wire_format.pack_reply(spec, sent)
     got = wire_format.unpack_reply(spec, can_id, data)
     assert (got.motor_id, got.temperature, got.error) == (can_id, temperature, error)
     for field, wanted, value in zip(OF_REPLY, sent[1:4], got[1:4], strict=True):
         assert abs(value - wanted) <= ((0.5 + 1e-6) * bounds(spec, field)[2] if wire_format is MIT else 0.02)
-    reply_id = can_id if wire_format is MIT else MIT_V3.status_id(can_id)
-    assert wire_format.classify(reply_id, data, frozenset((can_id,))) == (REPLY, can_id)
-
-
-@pytest.mark.parametrize("temperature", [-40, 215])
-def test_a_reply_of_a_v1_board_has_any_temperature_of_a_byte(temperature):
-    assert unpack_reply(AK60, pack_reply(AK60, 255, 0.0, 0.0, 0.0, temperature, 0)).temperature == temperature
+    assert wire_format.classify(wire_format.reply_id(can_id), data, frozenset((can_id,))) == (REPLY, can_id)
+    turned = wire_format.pack_reply(spec, sent._replace(position=motor.motor_position(angle)))
+    assert motor.joint_reply(turned).position == pytest.approx(angle, abs=0.001)
 
 
 @seeded
-@given(specs(), BYTES)
-def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(spec, data):
+@given(joints(), BYTES)
+def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(motor, data):
+    is_mit = motor.wire_format is MIT
     try:
-        reply = unpack_reply(spec, data)
+        reply = motor.wire_format.unpack_reply(motor.spec, motor.can_id, data)
     except FrameError as error:
-        assert len(data) not in (6, 8) and error.data == data
+        assert len(data) not in ((6, 8) if is_mit else (8,)) and error.data == data
         return
-    assert len(data) in (6, 8) and 0 <= reply.motor_id <= 255
-    assert_within(spec, OF_REPLY, reply[1:4])
     assert (reply.temperature is None) == (reply.error is None) == (len(data) == 6)
+    if is_mit:
+        assert_within(motor.spec, OF_REPLY, reply[1:4])
+    assert all(map(math.isfinite, motor.joint_reply(data)[1:4]))
 
 
 @seeded
@@ -196,27 +194,6 @@ def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_r
     assert abs(applied - max(-spec.torque_range, min(spec.torque_range, torque))) <= slack
 
 
-@seeded
-@given(joints(), BYTES)
-def test_a_joint_decodes_any_bytes_to_finite_numbers_or_rejects_them(motor, data):
-    try:
-        reply = motor.joint_reply(data)
-    except FrameError:
-        assert len(data) not in ((6, 8) if motor.wire_format is MIT else (8,))
-        return
-    assert all(map(math.isfinite, reply[1:4]))
-    limit = motor.spec.position_range if motor.wire_format is MIT else math.radians(0.1) * 0x8000
-    assert abs(reply.position) <= limit + abs(motor.zero) + 1e-9
-
-
-@seeded
-@given(joints(), st.floats(-3.0, 3.0))
-def test_a_joint_angle_survives_a_round_trip(motor, angle):
-    reply = MotorReply(motor.can_id, motor.motor_position(angle), 0.0, 0.0, 30, 0)
-    got = motor.joint_reply(motor.wire_format.pack_reply(motor.spec, reply))
-    assert got.position == pytest.approx(angle, abs=0.001)
-
-
 def test_a_reversed_motor_has_reversed_angle_and_torque():
     motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
     commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
@@ -232,29 +209,26 @@ def test_damping_alone_does_not_push_an_arm_at_rest(spec):
 
 
 LAYOUT = (("position", 16), ("velocity", 12), ("kp", 12), ("kd", 12), ("torque", 12))  # as in the manual's table
+COMMAND_CODES = {"position": 0x1234, "velocity": 0x567, "kp": 0x89A, "kd": 0xBC, "torque": 0xDEF}
+REPLY_LAYOUT = (("id", 8), ("position", 16), ("velocity", 12), ("torque", 12))
+REPLY_CODES = {"id": 5, "position": 0x1234, "velocity": 0x567, "torque": 0x89A}
 
 
-def some_codes(width):
-    """Every 13th code, and the highest."""
-    return *range(0, 1 << width, 13), (1 << width) - 1
+def frame_of(layout, codes):
+    """The bytes of a frame with these codes, written one after the other."""
+    bits = "".join(f"{codes[name]:0{width}b}" for name, width in layout)
+    return int(bits, 2).to_bytes(len(bits) // 8, "big")
 
 
 @SPECS
 @pytest.mark.parametrize(("field", "width"), LAYOUT)
-def test_the_codes_of_every_command_field_survive_unpack_and_pack(spec, field, width):
-    codes = {"position": 0x1234, "velocity": 0x567, "kp": 0x89A, "kd": 0xBC, "torque": 0xDEF}
-    for codes[field] in some_codes(width):
-        bits = "".join(f"{codes[name]:0{size}b}" for name, size in LAYOUT)
-        data = int(bits, 2).to_bytes(8, "big")
-        assert pack_command(spec, *unpack_command(spec, data)) == data
-
-
-@SPECS
-@pytest.mark.parametrize(("offset", "width"), [(24, 16), (12, 12), (0, 12)])
-def test_the_codes_of_every_reply_field_survive_unpack_and_pack(spec, offset, width):
-    for code in some_codes(width):
-        data = (5 << 40 | (0x123456789 & ~(((1 << width) - 1) << offset)) | code << offset).to_bytes(6, "big")
-        assert pack_reply(spec, *unpack_reply(spec, data)) == data
+def test_the_codes_of_every_field_survive_unpack_and_pack(spec, field, width):
+    for code in (*range(0, 1 << width, 13), (1 << width) - 1):
+        command = frame_of(LAYOUT, COMMAND_CODES | {field: code})
+        assert pack_command(spec, *unpack_command(spec, command)) == command
+        if field in OF_REPLY:
+            reply = frame_of(REPLY_LAYOUT, REPLY_CODES | {field: code})
+            assert pack_reply(spec, *unpack_reply(spec, reply)) == reply
 
 
 @pytest.mark.parametrize("codes_below_top", [1, 2, 3])
@@ -265,10 +239,12 @@ def test_a_command_that_would_spell_a_special_frame_gets_a_slightly_lower_torque
     assert 0.0 <= torque - unpack_command(AK60, data).torque < 0.025
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, 99.0])
-def test_a_reply_out_of_range_or_not_finite_is_rejected(value):
-    with pytest.raises(ParameterError):
-        pack_reply(AK60, 1, value, 0.0, 0.0)
+def test_a_reply_has_any_temperature_of_a_byte_and_no_angle_beyond_its_range():
+    for temperature in (-40, 215):
+        assert unpack_reply(AK60, pack_reply(AK60, 255, 0.0, 0.0, 0.0, temperature, 0)).temperature == temperature
+    for value in (math.nan, math.inf, 99.0):
+        with pytest.raises(ParameterError):
+            pack_reply(AK60, 1, value, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -279,6 +255,14 @@ def test_an_impossible_motor_is_rejected_by_name(field, value):
     with pytest.raises(ParameterError) as caught:
         JointMotor(AK60, **{"can_id": 1, field: value})
     assert caught.value.name == field
+
+
+def test_a_v1_command_and_reply_have_the_bytes_worked_out_by_hand():
+    # position 0 -> 32767.5 -> 32768, velocity 0 -> 2047.5 -> 2048, kp 0, kd 4095, torque 3 of +-15 -> 2457
+    assert pack_command(AK60, 0.0, 0.0, 0.0, 5.0, 3.0) == bytes.fromhex("8000800000fff999")
+    # motor 7, position 0xffff -> 12.5, velocity 0 -> -45, torque 2457 -> 3, 70 - 40 degC, error 2
+    data = bytes.fromhex("07 ffff 000999 46 02")
+    assert unpack_reply(AK60, data) == (7, *(pytest.approx(value) for value in (12.5, -45.0, 3.0)), 30, 2)
 
 
 def test_a_v3_command_has_the_bytes_worked_out_by_hand():
@@ -293,25 +277,19 @@ def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
     reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
     assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
     assert reply[3:] == (pytest.approx(-2.0 * 3.0 / 7.4), -5, 7)
-    assert MIT_V3.status_id(3) == EXTENDED | 0x2903
+    assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
     assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
 
 
-def test_a_v3_board_is_switched_off_by_a_current_of_0():
+def test_a_v3_board_is_switched_off_by_a_current_of_0_and_obeys_every_control_mode():
     motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)
     assert motor.exit == ((EXTENDED | 0x105, bytes(4)),)
     assert motor.enter == motor.set_zero == ()
-
-
-@pytest.mark.parametrize("mode", range(16))
-def test_a_frame_of_any_control_mode_is_a_command_to_a_v3_board(mode):
-    assert MIT_V3.classify(EXTENDED | mode << 8 | 2, bytes(4), IDS) == (COMMAND, 2)
-    assert MIT_V3.classify(EXTENDED | mode << 8 | 9, bytes(4), IDS) == (OTHER, 0)
-
-
-@pytest.mark.parametrize("length", [0, 7, 9])
-def test_a_v3_status_frame_of_another_length_is_ignored(length):
-    assert MIT_V3.classify(MIT_V3.status_id(1), bytes(length), IDS) == (OTHER, 0)
+    for mode in range(16):
+        assert MIT_V3.classify(EXTENDED | mode << 8 | 2, bytes(4), IDS) == (COMMAND, 2)
+        assert MIT_V3.classify(EXTENDED | mode << 8 | 9, bytes(4), IDS) == (OTHER, 0)
+    for length in (0, 7, 9):  # of a status frame
+        assert MIT_V3.classify(MIT_V3.reply_id(1), bytes(length), IDS) == (OTHER, 0)
 
 
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.safety.descent import DAMPING_RISE
+from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Fault, FaultCode, State
-from exo_gravity.core.safety.limits import DAMPING, GUIDE_BRAKE, GUIDE_SPEED, MAX_EFFORT_RATE
-from exo_gravity.core.safety.monitors import LONGEST_AGE, LONGEST_RIDE
+from exo_gravity.core.safety.limits import DAMPING, GUIDE, MAX_EFFORT_RATE
+from exo_gravity.core.safety.monitors import RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
 
@@ -122,19 +122,26 @@ def test_the_first_fault_stays():
     assert arm.fault_code == "bus_error"
 
 
-EVENTS = st.one_of(
-    st.tuples(st.just("enable"), st.none()),
-    st.tuples(st.just("disable"), st.none()),
-    st.tuples(st.just("clear"), st.none()),
-    st.tuples(st.just("trip"), st.none()),
-    st.tuples(st.just("off"), st.integers(0, 3)),
-    st.tuples(st.just("silent"), st.integers(0, 3)),
-    st.tuples(st.just("replies"), st.integers(0, 3)),
-    st.tuples(st.just("effort"), st.lists(st.floats(width=32), min_size=4, max_size=4) | st.none()),
-    st.tuples(st.just("age"), st.floats(0.0, 0.2)),
-    st.tuples(st.just("reading"), st.dictionaries(st.sampled_from(["position", "velocity"]), st.floats(-9, 9))),
-    st.tuples(st.just("time"), st.floats(0.004, 3.0)),
-)
+SET = {  # of an event, what its value sets
+    "off": lambda arm, joint: arm.off.add(joint),
+    "silent": lambda arm, joint: arm.silent.add(joint),
+    "replies": lambda arm, joint: arm.silent.discard(joint),
+    "effort": lambda arm, effort: setattr(arm, "effort", effort),
+    "age": lambda arm, age: setattr(arm, "effort_age", age),
+    "reading": lambda arm, change: arm.changes.__setitem__(0, change),
+    "trip": lambda arm, _: arm.machine.trip(FaultCode.BUS_ERROR, "test", arm.now),
+    **{name: lambda arm, _, name=name: getattr(arm.machine, name)(arm.now) for name in ("enable", "disable", "clear")},
+    "time": lambda arm, _: None,
+}
+VALUES = {
+    **dict.fromkeys(("off", "silent", "replies"), st.integers(0, 3)),
+    **dict.fromkeys(("enable", "disable", "clear", "trip"), st.none()),
+    "effort": st.lists(st.floats(width=32), min_size=4, max_size=4) | st.none(),
+    "age": st.floats(0.0, 0.2),
+    "reading": st.dictionaries(st.sampled_from(["position", "velocity"]), st.floats(-9, 9)),
+    "time": st.floats(0.004, 3.0),
+}
+EVENTS = st.one_of(*(st.tuples(st.just(name), values) for name, values in VALUES.items()))
 
 
 @settings(max_examples=60, deadline=None)
@@ -142,22 +149,7 @@ EVENTS = st.one_of(
 def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(events, sign_check_torque):
     arm = SafetyRun(sign_check_torque=sign_check_torque)
     for event, value in events:
-        if event in ("enable", "disable", "clear"):
-            getattr(arm.machine, event)(arm.now)
-        elif event == "trip":
-            arm.machine.trip(FaultCode.BUS_ERROR, "test", arm.now)
-        elif event == "off":
-            arm.off.add(value)
-        elif event == "silent":
-            arm.silent.add(value)
-        elif event == "replies":
-            arm.silent.discard(value)
-        elif event == "effort":
-            arm.effort = value
-        elif event == "age":
-            arm.effort_age = value
-        elif event == "reading":
-            arm.changes[0] = value
+        SET[event](arm, value)
         had_fault = arm.machine.fault
         arm.cycle(value if event == "time" else PERIOD)
         check(arm, had_fault if event != "clear" else None)
@@ -171,7 +163,7 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
     assert all(abs(e) <= limit for e, limit in zip(drive.effort, LIMITS.max_effort, strict=True))
     if machine.state in CARRYING:
         assert arm.effort is not None
-        assert arm.effort_age <= LONGEST_AGE + 1e-9
+        assert arm.effort_age <= RIDE.longest_age + 1e-9
         assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or min(drive.damping) > 0.0
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
@@ -189,7 +181,7 @@ def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again(
     assert 0.0 < min(arm.drive.damping) < 0.2
     arm.cycle(0.1)
     assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 1
-    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DAMPING_RISE)
+    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DESCENT.damping_rise)
     assert arm.drive.effort == pytest.approx(EFFORT)
     arm.effort_age = 0.002
     arm.cycle(0.12)
@@ -201,7 +193,7 @@ def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again(
 def test_a_ride_ends_and_who_is_late_more_often_than_once_in_ten_is_let_down(age):
     arm = SafetyRun().until_active()
     arm.effort_age, arm.held = age, True
-    arm.cycle(LONGEST_RIDE - PERIOD)
+    arm.cycle(RIDE.longest - PERIOD)
     assert arm.machine.state is State.ACTIVE
     arm.cycle(2 * PERIOD)
     assert (arm.machine.state, arm.fault_code) == (State.LETTING_DOWN, "command_stale")
@@ -227,7 +219,7 @@ def test_after_a_pause_of_the_loop_itself_only_the_age_of_the_efforts_counts():
     arm.effort_age = 0.1
     arm.cycle()
     assert arm.machine.state is State.ACTIVE
-    arm.effort_age = LONGEST_AGE + PERIOD
+    arm.effort_age = RIDE.longest_age + PERIOD
     arm.cycle()
     assert arm.fault_code == "command_stale"
 
@@ -253,15 +245,7 @@ def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_f
 
 
 def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
-    others = [code for code in FaultCode if not code.is_resumable]
-    assert {*FaultCode} - {*others} == {
-        "motor_silent",
-        "command_stale",
-        "command_withdrawn",
-        "control_lost",
-        "bus_error",
-    }
-    for code in others[::4]:
+    for code in [code for code in FaultCode if not code.is_resumable][::4]:
         arm = let_down_by(code)
         assert not arm.machine.resume(arm.now)
         assert (arm.machine.state, arm.fault_code) == (State.FAULT, code)
@@ -298,19 +282,19 @@ def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(si
 def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_neither_steps_nor_stays():
     run = SafetyRun().until_active()
     run.damped = True
-    run.changes[1] = {"velocity": GUIDE_SPEED}
+    run.changes[1] = {"velocity": GUIDE.speed}
     run.changes[2] = {"velocity": -1.0}
     run.changes[3] = {"velocity": 0.4}
     steps = [run.drive.damping]
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping[:2] == (0.0, 0.0)
-    assert run.drive.damping[2] == pytest.approx(GUIDE_BRAKE)
-    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE_BRAKE
+    assert run.drive.damping[2] == pytest.approx(GUIDE.brake)
+    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE.brake
     run.damped = False
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping == NOTHING
     largest = np.abs(np.diff(steps, axis=0)).max()
-    assert largest <= DAMPING / DAMPING_RISE * PERIOD * 1.001
+    assert largest <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE

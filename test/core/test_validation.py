@@ -11,7 +11,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import GONE, values_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, HOME_TOLERANCE, check_bridge, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 
 
 def check(**given):
@@ -78,8 +78,8 @@ def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it(name):
 
 
 def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
-    for motor, tolerance in HOME_TOLERANCE.items():
-        assert tolerance < math.pi / MOTORS[motor].gear_ratio
+    for motor in MOTORS.values():
+        assert motor.home_tolerance < math.pi / motor.gear_ratio
     values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "motor": ["AK80-9"] * 4})
     assert limits_of(values).home_tolerance == (0.34,) * 4
 

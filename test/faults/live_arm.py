@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 import yaml
 
-from exo_gravity.core.safety.limits import REPLY_TIMEOUT
+from exo_gravity.core.safety.limits import READING
 
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
@@ -24,7 +24,7 @@ from .stall_clock import StallClock
 from .wearer_cases import HOLD, MOVED, PUSH_DOWN, SHAKE, THROW, Steps, begin
 
 MINUTE = 60.0  # s
-STALL = REPLY_TIMEOUT  # s
+STALL = READING.reply_timeout  # s
 IDLE = 0.03  # share
 NODES = (
     "/imu",

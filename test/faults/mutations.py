@@ -101,7 +101,7 @@ MUTATIONS = (
     Mutation(
         "a soft wall without damping",
         ("elbow pushed into the soft wall",),
-        (Edit(LIMITS, "damping.append(WALL_DAMPING * min(", "damping.append(0.0 * min("),),
+        (Edit(LIMITS, "damping.append(WALL.damping * min(", "damping.append(0.0 * min("),),
     ),
     Mutation(
         "torque delivery is not checked",
@@ -131,10 +131,10 @@ MUTATIONS = (
         (
             Edit(
                 DESCENT,
-                "return self.effort == 0.0 and self.damping <= FREE_DAMPING",
+                "return self.effort == 0.0 and self.damping <= DESCENT.free_damping",
                 "return self.effort == 0.0",
             ),
-            Edit(DESCENT, "free >= REST_TIME and now - rest_since >= REST_TIME", "free >= 0.0"),
+            Edit(DESCENT, "min(free, now - rest_since) >= DESCENT.rest_time", "free >= 0.0"),
         ),
     ),
     Mutation(
@@ -145,7 +145,7 @@ MUTATIONS = (
     Mutation(
         "a ride that never ends",
         ("compensator frozen, the rest runs on",),
-        (Edit("exo_gravity/core/safety/monitors.py", "if self._left >= 0.0 and age <= LONGEST_AGE:", "if True:"),),
+        (Edit("exo_gravity/core/safety/monitors.py", "if self._left >= 0.0 and age <= RIDE.longest_age:", "if True:"),),
     ),
     Mutation(
         "a ride without damping",
@@ -155,8 +155,8 @@ MUTATIONS = (
     Mutation(
         "a motor that replies no torque is taken for sound",
         ("motor 2 restarts in 30 ms",),
-        (Edit("exo_gravity/core/safety/delivery.py", "excess = abs(joint.effort - nearest) -",
-              "excess = (abs(joint.effort) > 0.1) * abs(joint.effort - nearest) -"),),
+        (Edit("exo_gravity/core/safety/delivery.py", "DELIVERY.excess(joint.effort, nearest) * dt",
+              "(abs(joint.effort) > 0.1) * DELIVERY.excess(joint.effort, nearest) * dt"),),
     ),
     Mutation(
         "a change of load that ignores the joint's speed",
@@ -202,12 +202,13 @@ MUTATIONS = (
         "the brake of the descent grows without a bound",
         ("compensator frozen while the wearer presses it down from the horizontal",),
         (Edit(DESCENT, "self._most = max(self._most, abs(effort))", "self._most = 18.0"),
-         Edit(DESCENT, "rate = min(BRAKE_GROWTH, BRAKE_GAIN * excess)", "rate = BRAKE_GAIN * excess")),
+         Edit(DESCENT, "rate = min(DESCENT.brake_growth, DESCENT.brake_gain * excess)",
+              "rate = DESCENT.brake_gain * excess")),
     ),
     Mutation(
         "the descent drives a joint that the wearer pushed down",
         ("compensator frozen while the wearer presses it down from the horizontal",),
-        (Edit(DESCENT, "if self.effort * velocity > 0.0 and speed > DRIVEN_SPEED:", "if False:"),),
+        (Edit(DESCENT, "if self.effort * velocity > 0.0 and speed > DESCENT.driven_speed:", "if False:"),),
     ),
     Mutation(
         "powered frames are sent while the supply is cut",
@@ -222,13 +223,13 @@ MUTATIONS = (
     Mutation(
         "unexplained torque is never a fault",
         ("effort of joint 2 with the wrong sign", "efforts oscillate at 8 Hz"),
-        (Edit(MONITOR, "if not self.impulse[i] <= PATIENCE * full and fault is None:", "if False:"),),
+        (Edit(MONITOR, "if not self.impulse[i] <= MOTION.patience * full and fault is None:", "if False:"),),
     ),
     Mutation(
         "unexplained torque is passed on, and takes ten times as long",
         ("effort of joint 2 with the wrong sign",),
         (Edit(MONITOR, "passed.append(within)", "passed.append(torque)"),
-         Edit(MONITOR, "PATIENCE = 0.012 ", "PATIENCE = 0.15 ")),
+         Edit(MONITOR, "patience: float = 0.012 ", "patience: float = 0.15 ")),
     ),
 )  # fmt: skip
 

@@ -12,7 +12,7 @@ from exo_gravity.core.compensation.guidance import MAX_FADE_RATE
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.limits import GUIDE_BRAKE
+from exo_gravity.core.safety.limits import GUIDE
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from .compensated_arm import CYCLE, PEAK, CompensatedArm
@@ -119,4 +119,4 @@ def test_a_wearer_who_moves_on_is_not_stopped():
         assert arm.top_speed < 1.3 * speed + 0.05
         felt[is_damped] = np.array(hand.torques)
     length = min(map(len, felt.values()))
-    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE_BRAKE + 1.0  # Nm that the damping costs him
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE.brake + 1.0  # Nm that the damping costs him

@@ -122,7 +122,7 @@ def test_a_v3_board_that_still_reports_torque_may_be_powered(wire, other) -> Non
     def report(torque: float) -> None:
         for joint in joints_of(V3):
             data = MIT_V3.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, torque, 30, 0))
-            status_id = MIT_V3.status_id(joint.can_id) & ID_BITS
+            status_id = MIT_V3.reply_id(joint.can_id) & ID_BITS
             other.send(can.Message(arbitration_id=status_id, data=data, is_extended_id=True))
         bus.exchange(OFF, now(bus))
 

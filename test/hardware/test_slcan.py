@@ -117,7 +117,7 @@ def test_an_acknowledgement_does_not_hide_late_replies_which_are_not_taken_for_n
     with can.Bus(interface="virtual", channel=channel) as other:
         for joint in joints_of(MIXED):
             data = joint.wire_format.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, 0.0, 30, 0))
-            reply_id = joint.can_id if joint.wire_format is MIT else MIT_V3.status_id(joint.can_id) & ID_BITS
+            reply_id = joint.can_id if joint.wire_format is MIT else MIT_V3.reply_id(joint.can_id) & ID_BITS
             other.send(can.Message(arbitration_id=reply_id, data=data, is_extended_id=joint.wire_format is MIT_V3))
             lengths += 22 if joint.wire_format is MIT else 27  # characters
         wait_until(lambda: adapter.unread >= unread + lengths)

@@ -11,9 +11,9 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import OFF
-from exo_gravity.core.safety.limits import FROZEN
+from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
-from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT_TIMEOUT, LONGEST_LOOK, OwnedBus, Silence
+from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
 
 from ..support.launched_nodes import children
@@ -155,7 +155,7 @@ def test_the_inhibiting_program_runs_until_it_is_released() -> None:
 def test_a_frozen_bridge_is_killed_before_the_first_frame_and_its_arm_let_down(bridge: Bridge) -> None:
     when = bridge.at(1.0, bridge.freeze)
     assert bridge.guard() == 0
-    assert when < bridge.killed[0] < when + FROZEN + 0.02
+    assert when < bridge.killed[0] < when + LOOP.frozen + 0.02
     assert bridge.log[0] == f"can_bridge was frozen for 80 ms and has been killed: {LET_DOWN[0]}"
     bridge.rig.assert_let_down()
 
@@ -203,7 +203,7 @@ def test_a_bridge_that_dies_before_its_arm_is_known_leaves_motors_that_may_be_po
 def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(bridge: Bridge) -> None:
     def stall() -> None:
         """Nothing runs for a while; then the watchdog runs first."""
-        bridge.clock.stall(5.0 * FROZEN)
+        bridge.clock.stall(5.0 * LOOP.frozen)
 
     for delay in (0.5, 1.0):
         bridge.at(delay, stall)
@@ -215,11 +215,14 @@ def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(bridge: Bridge) -
 
 
 def test_silence_is_the_time_in_which_the_observer_ran_since_the_last_new_sign() -> None:
-    silence = Silence(10.0, LONGEST_LOOK)
+    silence = Silence(10.0, HEARTBEAT.longest_look)
     assert silence.look(10.1, 1.0) == 0.0
     assert silence.look(10.2, 1.0) == pytest.approx(0.1)
-    assert silence.look(15.2, 1.0) == pytest.approx(0.1 + LONGEST_LOOK) and 0.1 + LONGEST_LOOK < HEARTBEAT_TIMEOUT
-    assert silence.look(15.3, 1.0) > HEARTBEAT_TIMEOUT
+    assert (
+        silence.look(15.2, 1.0) == pytest.approx(0.1 + HEARTBEAT.longest_look)
+        and 0.1 + HEARTBEAT.longest_look < HEARTBEAT.timeout
+    )
+    assert silence.look(15.3, 1.0) > HEARTBEAT.timeout
     assert silence.look(15.4, 2.0) == 0.0
     assert silence.look(15.5, 2.0, is_due=False) == 0.0
     assert silence.look(15.6, 2.0) == pytest.approx(0.1)

@@ -25,7 +25,7 @@ COMMAND_ID, CURRENT_ID = JOINT.command_id, JOINT.exit[0][0]
 def reported(motor: SimulatedMotor, position: float = 0.5, velocity: float = 0.0):
     """Return what the joint reads from the status frame; None without one."""
     frame = motor.status(position, velocity)
-    assert frame is None or frame[0] == MIT_V3.status_id(3)
+    assert frame is None or frame[0] == MIT_V3.reply_id(3)
     return frame and JOINT.joint_reply(frame[1])
 
 
@@ -94,6 +94,6 @@ def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up(monkey
     device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
     device.run(bus, lambda: bus.now > 10.0)
     times = [now for now, frame_id in bus.sent]
-    assert {frame_id for _, frame_id in bus.sent} == {MIT_V3.status_id(2) & ID_BITS}
+    assert {frame_id for _, frame_id in bus.sent} == {MIT_V3.reply_id(2) & ID_BITS}
     assert len(times) == pytest.approx(900, abs=5)
     assert np.diff(times).min() > 0.009 and np.diff(times).max() == pytest.approx(1.0, abs=0.02)

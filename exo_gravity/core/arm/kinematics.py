@@ -24,11 +24,10 @@ import numpy as np
 from exo_gravity.core.arm.arm import ZEROS, ArmModel
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
-# kg m^2 at the gear's output: 243.5 and 607 g cm^2 (published motor tables) times the gear ratio squared, AK60-6 and
-# AK80-9.
-ROTORS = (8.8e-4, 4.9e-3, 8.8e-4, 8.8e-4)
+ROTORS = tuple(MOTORS[name].rotor_inertia for name in USUAL_MOTORS)  # kg m^2, where the motors are not known
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which the mass of an arm given by its moments is assumed
 LEAST_REACH = 0.01  # m
 GRID = tuple(map(math.radians, (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)))  # of joints 2 to 4, for the least inertia

@@ -6,7 +6,7 @@ torque moves from what the settings before it would give in this pose to what th
     torque = after + share * (before - after + offset)
 
 The share falls from 1 to 0 within FADE_TIME or longer, more slowly the faster the joint moves where the change drives
-it. Beyond GUIDE_SPEED it rises again, at SPEED_GAIN: so an arm that becomes heavy sinks at about that speed until it
+it. Beyond GUIDE.speed it rises again, at SPEED_GAIN: so an arm that becomes heavy sinks at about that speed until it
 hangs, and a spring that is switched on pulls no faster. The torque always lies between the old load's and the new
 one's in this pose, wherever the arm has moved meanwhile: it cannot wind up. What the two settings do not explain,
 because a change follows another or a law does not apply in this pose, is the constant offset of the start.
@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.safety.limits import GUIDE_SPEED
+from exo_gravity.core.safety.limits import GUIDE
 
 RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
 # s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
@@ -111,12 +111,12 @@ class GuidedChange:
             way = old - new + offset
             size = max(SMALL, abs(way))
             driven = -math.copysign(speed, way * speed)  # > 0 where the change drives the joint
-            if driven > GUIDE_SPEED:
-                share = min(1.0, share + SPEED_GAIN / size * (driven - GUIDE_SPEED) * dt)
+            if driven > GUIDE.speed:
+                share = min(1.0, share + SPEED_GAIN / size * (driven - GUIDE.speed) * dt)
             else:
                 fastest = max(MAX_FADE_RATE / size, 1.0 / LONGEST_FADE)
                 pace = min(1.0 / FADE_TIME, fastest) if velocity else 1.0 / LONGEST_FADE
-                share = max(0.0, share - pace * (1.0 - max(0.0, driven) / GUIDE_SPEED) * dt)
+                share = max(0.0, share - pace * (1.0 - max(0.0, driven) / GUIDE.speed) * dt)
             shares.append(share)
             ways.append(abs(way))
             remainder.append(share * way)

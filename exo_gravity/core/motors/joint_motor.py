@@ -6,10 +6,10 @@ A `JointMotor` translates joint angle, effort and damping to the frames of its w
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
@@ -20,8 +20,6 @@ MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 BITRATE = 1_000_000  # bit/s, of AK motors as delivered
-# Bits of a frame of 8 bytes: the mean over the poses, speeds and torques of an arm that is being carried, and the most.
-COMMAND, REPLY, V3_COMMAND, STATUS = (124, 135), (118, 135), (146, 160), (141, 160)
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
 # slow bus fewer, or four boards would fill it.
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
@@ -105,6 +103,7 @@ class JointMotor:
         return self.direction * joint_position + self.zero
 
 
+LARGEST_ZERO = max(spec.position_range for spec in MOTORS.values())  # rad; `JointMotor` has the limit of each motor
 SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
 
 # fmt: off
@@ -113,10 +112,11 @@ MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
     Param("can.channel", "", "python-can channel, e.g. can0; with two buses one per motor, e.g. can0,can0,can1,can1",
           fixed=True, required=True),
-    Param("motor", ["AK60-6", "AK80-9", "AK60-6", "AK60-6"], "motor types", choices=tuple(MOTORS), fixed=True),
+    Param("motor", list(USUAL_MOTORS), "motor types", choices=tuple(MOTORS), fixed=True),
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
-    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-12.5, 12.5), "rad", fixed=True),
+    Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
+          fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
     Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
           choices=tuple(FORMATS), fixed=True),
@@ -180,6 +180,17 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
 
 
+class FrameBits(NamedTuple):
+    """The bits of a kind of frame with 8 bytes of data."""
+
+    typical: int  #: the mean over the poses, speeds and torques of an arm that is being carried
+    most: int
+
+
+COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and V2 boards
+V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
+
+
 @dataclass(frozen=True)
 class Traffic:
     """The motors on one bus, its bit rate, and the highest control rate that fits. Raises ParameterError.
@@ -206,7 +217,8 @@ class Traffic:
 
     def load(self, rate: float, worst: bool = False) -> float:
         """Return the share of the bus that `rate` cycles a second take, for typical or for `worst` stuffing."""
-        command, reply, v3_command, status = (bits[worst] for bits in (COMMAND, REPLY, V3_COMMAND, STATUS))
+        kinds = COMMAND_BITS, REPLY_BITS, V3_COMMAND_BITS, STATUS_BITS
+        command, reply, v3_command, status = (bits.most if worst else bits.typical for bits in kinds)
         cycle = self.replying * (command + reply) + self.reporting * v3_command
         return (rate * cycle + self.reporting * self.status_rate * status) / self.bitrate
 

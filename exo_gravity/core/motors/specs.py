@@ -1,4 +1,4 @@
-"""The AK60-6 and AK80-9 motors: physical limits, and the frames of MIT mode on V1 and V2 boards.
+"""AK motors: a record of each type, and the frames of MIT mode on V1 and V2 boards.
 
 Command, 8 bytes, a big-endian bit stream, arbitration ID = motor ID (CubeMars driver manual V1.0.15, "MIT mode"):
 
@@ -13,6 +13,7 @@ rounded to the nearest step: the manual's 2^b overflows at the maximum, and trun
 code is exactly 0 Nm.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -40,25 +41,24 @@ MOTOR_ERRORS = {
 
 @dataclass(frozen=True)
 class MotorSpec:
-    """A motor type: the ranges of its wire format, which are not physical limits, and its physical limits.
+    """All that is known of a motor type. Torque, velocity and inertia are those of the output. Raises ParameterError.
 
-    No CAN message reports the ranges; some firmware has others. Raises ParameterError.
+    The ranges of the wire format are not physical limits. No CAN message reports them, and some firmware has others.
     """
 
     name: str
-    #: rad/s, Nm: the wire range is +- this value
-    velocity_range: float
-    torque_range: float
-    #: Nm at the output
-    rated_torque: float
-    peak_torque: float
-    gear_ratio: int  #: turns of the motor per turn of the output
-    pole_pairs: int  #: of the motor
-    torque_per_ampere: float  #: Nm at the output, rated torque by rated current; only V3 boards report a current
+    velocity_range: float  #: rad/s: the wire range of V1 and V2 boards is +- this value
+    torque_range: float  #: Nm: likewise
+    v3_ranges: tuple[float, float] | None  #: rad/s and Nm, those of a V3 board; None if they are not known
+    rated_torque: float  #: Nm, for any time
+    peak_torque: float  #: Nm, for seconds
+    gear_ratio: int  #: turns of the rotor per turn of the output
+    pole_pairs: int  #: of the rotor; only V3 boards report a speed of it
+    torque_per_ampere: float  #: Nm, rated torque by rated current; only V3 boards report a current
+    rotor_inertia: float  #: kg m^2, that of the rotor times the gear ratio squared
     position_range: float = 12.5  #: rad: the wire range is +- this value
-    #: Nm/rad, Nm s/rad: the wire range starts at 0
-    kp_max: float = 500.0
-    kd_max: float = 5.0
+    kp_max: float = 500.0  #: Nm/rad: the wire range starts at 0
+    kd_max: float = 5.0  #: Nm s/rad: likewise
 
     def __post_init__(self) -> None:
         for name in ("velocity_range", "torque_range"):
@@ -83,11 +83,52 @@ class MotorSpec:
         """The velocity in rad/s that the motor decodes from a command of 0 rad/s."""
         return unpack_fields(self, pack_fields(self, velocity=0.0), "velocity")[0]
 
+    @property
+    def rotor_turn(self) -> float:
+        """The angle in rad of the output per turn of the rotor, by whole ones of which an angle after power-up is off.
 
+        The encoder is on the rotor, and does not count its turns while the power is off.
+        """
+        return 2.0 * math.pi / self.gear_ratio
+
+    @property
+    def home_tolerance(self) -> float:
+        """The angle in rad from zero at which an arm that hangs may start, too small to be off by a rotor's turn.
+
+        Just under half a turn of the rotor, to the hundredth of a rad that a refusal shows.
+        """
+        return min(round(0.48 * self.rotor_turn, 2), 0.49 * self.rotor_turn)
+
+
+# CubeMars driver manual V1.0.15, "MIT mode", and V3.0.0 for V3 boards; data sheets; published motor tables for the
+# inertia of the rotors alone, 243.5 and 607 g cm^2.
 MOTORS = {
-    "AK60-6": MotorSpec("AK60-6", 45.0, 15.0, 3.0, 9.0, gear_ratio=6, pole_pairs=14, torque_per_ampere=3.0 / 7.4),
-    "AK80-9": MotorSpec("AK80-9", 50.0, 18.0, 9.0, 18.0, gear_ratio=9, pole_pairs=21, torque_per_ampere=9.0 / 10.3),
+    "AK60-6": MotorSpec(
+        "AK60-6",
+        velocity_range=45.0,
+        torque_range=15.0,
+        v3_ranges=(60.0, 12.0),
+        rated_torque=3.0,
+        peak_torque=9.0,
+        gear_ratio=6,
+        pole_pairs=14,
+        torque_per_ampere=3.0 / 7.4,
+        rotor_inertia=8.8e-4,
+    ),
+    "AK80-9": MotorSpec(
+        "AK80-9",
+        velocity_range=50.0,
+        torque_range=18.0,
+        v3_ranges=(65.0, 18.0),
+        rated_torque=9.0,
+        peak_torque=18.0,
+        gear_ratio=9,
+        pole_pairs=21,
+        torque_per_ampere=9.0 / 10.3,
+        rotor_inertia=4.9e-3,
+    ),
 }
+USUAL_MOTORS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")  # of the paper's arm, from shoulder to elbow
 
 
 class MotorCommand(NamedTuple):

@@ -5,7 +5,7 @@ command, with its own ID or the master's (0); the first byte is the motor's ID. 
 commands.
 
 `mit_v3` (CubeMars driver manual V3.0.0): 29-bit IDs, control mode << 8 | motor ID. Command, control mode 8, 8 bytes, a
-big-endian bit stream, ranges in `V3_RANGES`:
+big-endian bit stream, ranges in `MotorSpec.v3_ranges`:
 
     kp 12 | kd 12 | position 16 | velocity 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
 
@@ -37,7 +37,6 @@ MODE_CURRENT, MODE_MIT, LAST_MODE = 1, 8, 15  # control modes of V3 boards
 STATUS = 0x29
 NO_CURRENT = bytes(4)  # int32, mA
 V3_POSITION_RANGE = 12.56  # rad
-V3_RANGES = {"AK60-6": (60.0, 12.0), "AK80-9": (65.0, 18.0)}  # rad/s, Nm
 POSITION_STEP = math.radians(0.1)  # rad
 SPEED_STEP = 10.0 * 2.0 * math.pi / 60.0  # electrical rad/s
 CURRENT_STEP = 0.01  # A
@@ -65,8 +64,12 @@ class WireFormat:
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
-        """Return the motor with the usual ranges of this format."""
+        """Return the motor with the usual ranges of this format. Raises ParameterError if they are not known."""
         return spec
+
+    def reply_id(self, motor_id: int) -> int:
+        """Return the arbitration ID of a motor's replies or status frames; firmware may have another."""
+        return motor_id
 
     # Data of a command, as in `core.motors.specs`.
     pack_command = staticmethod(specs.pack_command)
@@ -97,11 +100,14 @@ class V3Format(WireFormat):
     """The frames of V3 boards; the methods are those of `WireFormat`."""
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
-        """Return the motor with the ranges of manual V3.0.0."""
-        velocity_range, torque_range = V3_RANGES[spec.name]
-        return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity_range, torque_range=torque_range)
+        """Return the motor with the ranges of manual V3.0.0. Raises ParameterError if it has none for the motor."""
+        if spec.v3_ranges is None:
+            expected = f"another format for an {spec.name}, because the ranges of a V3 board of it are not known"
+            raise ParameterError("wire_format", self.name, expected)
+        velocity, torque = spec.v3_ranges
+        return replace(spec, position_range=V3_POSITION_RANGE, velocity_range=velocity, torque_range=torque)
 
-    def status_id(self, motor_id: int) -> int:
+    def reply_id(self, motor_id: int) -> int:
         """Return the 29-bit ID of a motor's status frames."""
         return EXTENDED | STATUS << 8 | motor_id
 

@@ -3,25 +3,40 @@
 A motor that has been switched off, has restarted, missed its ENTER, or obeys another commander still replies, but with
 another torque. The expected torque is effort - damping * velocity. An ordinary reply is one command old, behind a
 current loop of up to 8 ms, late by a batch of its adapter or a stall of the computer, or answers the command before a
-lost one: it lies within the span of what the commands of the last `SPAN` asked for. What exceeds that span and a
-tolerance is evidence; it is summed over the replies, so that noise of 0.15 Nm cancels and a lost frame adds nothing.
+lost one: it lies between the least and the most that the commands of the last `DELIVERY.span` asked for. What exceeds
+these by more than a tolerance is evidence; it is summed over the replies, so that noise of 0.15 Nm cancels and a lost
+frame adds nothing.
 """
 
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.safety.drive import Drive, Fault, FaultCode
 from exo_gravity.core.safety.limits import JointSample, Limits
 
-ABSOLUTE = 0.25  # Nm
-RELATIVE = 0.25  # of the expected torque
-SPAN = 0.03  # s of the loop before the last reply, whose commands a reply may answer
-# Nm s, excess times the period of a reply; one reply adds at most half. No false alarm in 2 hours at 0.15 Nm of noise
-# and 100 Hz: docs/safety.md.
-EVIDENCE = 0.0075
-MOST = 256  # commands noted while a motor is silent
 THERMAL_TIME = 60.0  # s; an assumption for motors of this size: the data sheets state none
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """How much a replied torque may differ from the commanded one."""
+
+    least: float = 0.25  #: Nm
+    share: float = 0.25  #: of the expected torque, in addition
+    span: float = 0.03  #: s of the loop before the last reply, whose commands a reply may answer
+    #: Nm s, excess times the period of a reply; one reply adds at most half. No false alarm in 2 hours at 0.15 Nm of
+    #: noise and 100 Hz: docs/safety.md
+    evidence: float = 0.0075
+    noted: int = 256  #: commands, at most, while a motor is silent
+
+    def excess(self, replied: float, expected: float) -> float:
+        """Return by how much in Nm a replied torque differs from the expected one beyond the tolerance."""
+        return abs(replied - expected) - self.least - self.share * abs(expected)
+
+
+DELIVERY = Delivery()
 
 
 class DeliveryMonitor:
@@ -40,12 +55,12 @@ class DeliveryMonitor:
         self._replied = [0.0] * len(self._peak)  # s of it, at the last reply
         self._evidence = [0.0] * len(self._peak)  # Nm s
         # Torque in Nm that each command asked for, and when.
-        self._expected: list[deque[tuple[float, float]]] = [deque(maxlen=MOST) for _ in self._peak]
+        self._expected: list[deque[tuple[float, float]]] = [deque(maxlen=DELIVERY.noted) for _ in self._peak]
 
     @property
     def missing(self) -> tuple[bool, ...]:
         """Whether each joint (4,) does not deliver its torque."""
-        return tuple(evidence >= EVIDENCE for evidence in self._evidence)
+        return tuple(evidence >= DELIVERY.evidence for evidence in self._evidence)
 
     def applied(self, drive: Drive, silent: Sequence[bool]) -> tuple[Sequence[float], Sequence[float]]:
         """Return the effort (4,) Nm and damping (4,) Nm s/rad that the motors apply after `drive` was sent.
@@ -60,10 +75,14 @@ class DeliveryMonitor:
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], damping: Sequence[float]
     ) -> Fault | None:
-        """Take the replies `joints` to the last commands, `effort` (4,) Nm and `damping` (4,) Nm s/rad.
+        """Take the replies to the last commands; return a fault if a joint does not deliver its torque.
 
-        dt: s that the loop ran since the last replies. Returns a fault if a joint does not deliver its torque. A joint
-        without a new reply keeps its evidence.
+        A joint without a new reply keeps its evidence.
+
+        dt: s that the loop ran since the last replies.
+        joints: (4,) the replies.
+        effort: (4,) Nm, commanded.
+        damping: (4,) Nm s/rad, commanded.
         """
         self._time += dt
         fault = None
@@ -72,15 +91,15 @@ class DeliveryMonitor:
             expected.append((max(-peak, min(peak, effort[i] - damping[i] * joint.velocity)), self._time))
             if not joint.time > self._newest[i]:
                 continue
-            while expected[0][1] < self._replied[i] - SPAN:
+            while expected[0][1] < self._replied[i] - DELIVERY.span:
                 expected.popleft()
             self._newest[i], self._replied[i] = joint.time, self._time
             self._received[i] = effort[i], damping[i]
             least, most = min(expected)[0], max(expected)[0]
             nearest = max(least, min(most, joint.effort))
-            excess = abs(joint.effort - nearest) - ABSOLUTE - RELATIVE * abs(nearest)
-            self._evidence[i] = max(0.0, min(EVIDENCE, self._evidence[i] + min(EVIDENCE / 2, excess * dt)))
-            if self._evidence[i] >= EVIDENCE and not fault:
+            added = min(DELIVERY.evidence / 2, DELIVERY.excess(joint.effort, nearest) * dt)
+            self._evidence[i] = max(0.0, min(DELIVERY.evidence, self._evidence[i] + added))
+            if self._evidence[i] >= DELIVERY.evidence and not fault:
                 name = self._limits.joint_names[i]
                 reason = f"{name}: {nearest:.2f} Nm commanded, {joint.effort:.2f} Nm replied"
                 fault = Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)

@@ -2,31 +2,52 @@
 
 import math
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, JointSample, Limits
 
-AT_REST = 0.1  # rad/s; two to four codes of the 12-bit velocity
-CALM = 1.0  # s without a fault before the motors are switched on: middleware and machine stutter while nodes start
 # The gate waits for these to pass; other faults refuse the start.
 WAITED_OUT = frozenset({FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED, FaultCode.OUTSIDE_LIMITS})
 
-TEST_TORQUE = 0.4  # Nm, each way, that shows that a motor is on
-TEST_TIME = 0.06  # s, each way
-TEST_SHARE = 0.5  # of the test torque that must appear in the replies
-TEST_LAG = 0.02  # s, time constant: replies are one command old and behind a current loop, a batch, a stall
-TEST_TIMEOUT = 0.48  # s until every motor has shown that it is on: four pushes each way
 
-RISE = 2.0  # Nm/s
-FALL = 10.0  # Nm/s
-MIN_PUSH = 0.1  # Nm; motion under a smaller push is not caused by it
-MOVED = 0.02  # rad; fifty codes of the position
-STILL = 0.003  # rad within which a joint is still
-STILL_TIME = 0.2  # s for which it must stay within STILL
-PUSH_TIMEOUT = 0.5  # s at full torque
-REST_TIMEOUT = 5.0  # s for the joint to come to rest
-MAX_DISTURBED = 5  # times that a joint may move without a push
+@dataclass(frozen=True)
+class StartGate:
+    """What the readings must be before the motors are switched on."""
+
+    at_rest: float = 0.1  #: rad/s; two to four codes of the 12-bit velocity
+    calm: float = 1.0  #: s without a fault: middleware and machine stutter while nodes start
+
+
+@dataclass(frozen=True)
+class SwitchOn:
+    """The pushes that show that motors are on."""
+
+    torque: float = 0.4  #: Nm, each way
+    time: float = 0.06  #: s, each way
+    share: float = 0.5  #: of the test torque that must appear in the replies
+    #: s, time constant: replies are one command old and behind a current loop, a batch, a stall
+    lag: float = 0.02
+    timeout: float = 0.48  #: s until every motor has shown that it is on: four pushes each way
+
+
+@dataclass(frozen=True)
+class SignPush:
+    """The pushes that show which way a motor moves its joint."""
+
+    rise: float = 2.0  #: Nm/s
+    fall: float = 10.0  #: Nm/s
+    least: float = 0.1  #: Nm; motion under a smaller push is not caused by it
+    moved: float = 0.02  #: rad; fifty codes of the position
+    still: float = 0.003  #: rad within which a joint is still
+    still_time: float = 0.2  #: s for which it must stay within `still`
+    timeout: float = 0.5  #: s at full torque
+    rest_timeout: float = 5.0  #: s for the joint to come to rest
+    disturbed: int = 5  #: times at most that a joint may move without a push
+
+
+START_GATE, SWITCH_ON, SIGN_PUSH = StartGate(), SwitchOn(), SignPush()
 
 
 def missing_for_a_start(
@@ -58,7 +79,7 @@ def missing_for_a_start(
                     "bring the joint there by hand, or correct the parameter zero"
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
-    return "the arm to be at rest" if any(abs(joint.velocity) > AT_REST for joint in joints) else ""
+    return "the arm to be at rest" if any(abs(joint.velocity) > START_GATE.at_rest for joint in joints) else ""
 
 
 def _at_least(angle: float) -> str:
@@ -69,17 +90,19 @@ def _at_least(angle: float) -> str:
 class SwitchOnCheck:
     """Checks that all four motors are on: short pushes each way, under damping, must appear in their replies.
 
-    A motor is on if the regression of its replied on its commanded torque is at least TEST_SHARE; each pair of pushes
-    tells 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it after a
-    pair may have missed its ENTER: it gets another one, until TEST_TIMEOUT.
+    A motor is on if the regression of its replied on its commanded torque is at least `SWITCH_ON.share`. Each pair of
+    pushes tells 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
+    after a pair may have missed its ENTER: it gets another one, until the time-out.
 
-    effort: (4,) Nm to apply now. enter: (4,) which motors to switch on again now. done: whether the check has ended.
+    effort: (4,) Nm to apply now.
+    enter: (4,) which motors to switch on again now.
+    done: whether the check has ended.
     """
 
     def __init__(self, limits: Limits) -> None:
         self.done = False
         self._names = limits.joint_names
-        self._torque = [min(TEST_TORQUE, most) for most in limits.max_effort]
+        self._torque = [min(SWITCH_ON.torque, most) for most in limits.max_effort]
         self.effort, self.enter = list(NOTHING), [False] * JOINT_COUNT
         self._last_time = [-math.inf] * JOINT_COUNT
         self._commanded = list(NOTHING)  # Nm, as the replies show it
@@ -91,24 +114,24 @@ class SwitchOnCheck:
     def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
         """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
 
-        damping: (4,) Nm s/rad, last sent. Its torque is part of the replies, and a light joint moves.
+        damping: (4,) Nm s/rad, last sent; its torque is part of the replies, and a light joint moves.
         """
         self._elapsed += dt
         self.enter = [False] * len(self.enter)
         for i, joint in enumerate(joints):
-            self._commanded[i] += min(1.0, dt / TEST_LAG) * (self.effort[i] - self._commanded[i])
+            self._commanded[i] += min(1.0, dt / SWITCH_ON.lag) * (self.effort[i] - self._commanded[i])
             if joint.time > self._last_time[i]:
                 self._last_time[i] = joint.time
                 replied = joint.effort + damping[i] * joint.velocity
                 self._products[i] += self._commanded[i] * replied
                 self._squares[i] += self._commanded[i] ** 2
-        pushes = int(self._elapsed / TEST_TIME)
+        pushes = int(self._elapsed / SWITCH_ON.time)
         if pushes > self._pushes and pushes % 2 == 0:
             for i, name in enumerate(self._names):
                 share = self._products[i] / max(1e-9, self._squares[i])
-                self._is_on[i] = self._is_on[i] or share >= TEST_SHARE
+                self._is_on[i] = self._is_on[i] or share >= SWITCH_ON.share
                 self.enter[i] = not self._is_on[i]
-                if self.enter[i] and self._elapsed >= TEST_TIMEOUT - 1e-9:
+                if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
                     reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
             self._products, self._squares = list(NOTHING), list(NOTHING)
@@ -130,8 +153,10 @@ class SignCheck:
     before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
     `direction` that reverses torque and encoder alike: such a joint moves as expected.
 
-    torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped. effort: (4,) Nm to apply now. done:
-    whether every joint has passed. hint: what the wearer should do, '' for nothing.
+    torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped.
+    effort: (4,) Nm to apply now.
+    done: whether every joint has passed.
+    hint: what the wearer should do, '' for nothing.
     """
 
     def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
@@ -154,7 +179,7 @@ class SignCheck:
         for i, most in enumerate(torque):
             if not most:
                 continue
-            for _ in range(MAX_DISTURBED + 1):
+            for _ in range(SIGN_PUSH.disturbed + 1):
                 yield from self._wait_for_rest(i)
                 if (yield from self._push_both_ways(i, most)):
                     break
@@ -162,36 +187,36 @@ class SignCheck:
             else:
                 yield self._fault(i, "it moves without being pushed: hold still and let it hang")
             while self.effort[i]:
-                self._approach(i, 0.0, FALL)
+                self._approach(i, 0.0, SIGN_PUSH.fall)
                 yield None
             self.hint = ""
         self.done = True
 
     def _wait_for_rest(self, i: int) -> Iterator[Fault | None]:
         start, still, waited = math.inf, 0.0, 0.0
-        while still < STILL_TIME:
-            self._approach(i, 0.0, FALL)
+        while still < SIGN_PUSH.still_time:
+            self._approach(i, 0.0, SIGN_PUSH.fall)
             still, waited = still + self._dt, waited + self._dt
-            if not abs(self._position[i] - start) <= STILL or self.effort[i] != 0.0:
+            if not abs(self._position[i] - start) <= SIGN_PUSH.still or self.effort[i] != 0.0:
                 start, still = self._position[i], 0.0
-            is_late = waited > REST_TIMEOUT and still < STILL_TIME
+            is_late = waited > SIGN_PUSH.rest_timeout and still < SIGN_PUSH.still_time
             yield self._fault(i, "it does not come to rest: hold still and let it hang") if is_late else None
 
     def _push_both_ways(self, i: int, most: float) -> Generator[Fault | None, None, bool]:
         """Return whether the joint moved under a push each way, False if it moved without one."""
         for sign in (1.0, -1.0):
             start, waited = self._position[i], 0.0
-            while not abs(moved := sign * (self._position[i] - start)) >= MOVED:
+            while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
                 push = self.effort[i]
-                if abs(push) >= most and waited > PUSH_TIMEOUT:
+                if abs(push) >= most and waited > SIGN_PUSH.timeout:
                     yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
                 waited += self._dt if abs(push) >= most else 0.0
                 start = self._position[i] if push * sign <= 0.0 else start
                 # A push in the old direction is released faster than a new one is built up.
-                self._approach(i, sign * most, FALL if push * sign < 0.0 else RISE)
+                self._approach(i, sign * most, SIGN_PUSH.fall if push * sign < 0.0 else SIGN_PUSH.rise)
                 yield None
             push = self.effort[i]
-            if sign * push < MIN_PUSH:
+            if sign * push < SIGN_PUSH.least:
                 return False
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"

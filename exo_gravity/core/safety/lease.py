@@ -4,7 +4,7 @@
     take     takes it from its holder
     release  gives it back: the arm stays as it is
 
-A lease that is not renewed for LEASE_TIME runs out: its holder is gone, and the arm must not be carried without him.
+A lease that is not renewed for LEASE_TIME runs out: its holder is gone, and the arm must not be carried without them.
 While no one holds the lease, the arm is carried without an operator.
 
 LEASE_TIME is chosen for a holder on Wi-Fi that sends three times a second over TCP. A station that roams or scans is

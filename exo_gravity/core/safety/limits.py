@@ -13,37 +13,70 @@ from typing import Any, ClassVar, NamedTuple
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor, channels_of
-from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS
+from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS, USUAL_MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
-PEAK_TORQUE = max(spec.peak_torque for spec in MOTORS.values())  # Nm
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
-# The soft wall before a joint limit. These figures make it passive, for inertias of 0.005 to 0.3 kg m^2 and any rate:
-# behind the rate limit a spring alone would throw the arm back. The motor applies the damping without delay.
-WALL_WIDTH = 0.1  # rad before a joint limit, as in crisp_controllers
-WALL_STIFFNESS = 25.0  # Nm/rad
-WALL_TORQUE = 5.0  # Nm, largest
-WALL_DAMPING = DAMPING  # from WALL_EDGE on
-WALL_EDGE = 0.02  # rad into the wall over which the damping rises
-WALL_RELEASE = 0.03  # rad/s out of the wall, from which on the spring no longer pushes
-OVERSHOOT = 0.1  # rad past a joint limit that is not yet a fault, because mechanical stops are not infinitely stiff
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
-# While the load changes (core/compensation/guidance.py), joints are braked beyond GUIDE_SPEED, by GUIDE_BRAKE at most:
-# a wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in his hand.
-GUIDE_SPEED = 0.25  # rad/s; above the noise of a motor's velocity
-GUIDE_BRAKE = 1.5  # Nm
-MAX_TEMPERATURE = 80.0  # degC, an assumption: a motor whose own protection switches it off would drop the arm
-DERATING = 10.0  # degC below MAX_TEMPERATURE over which the permitted torque falls to half
-MAX_VELOCITY = (5.0, 5.0, 5.0, 6.0)  # rad/s; a reach stays below, a throw does not
-MISSED = 7  # cycles without a reply; with 3 % lost each way an arm misses so many once in 270 hours at 100 Hz
-REPLY_TIMEOUT = 0.05  # s, and MISSED cycles at least; an ordinary computer is late by 0.02 s
-JUMP = 0.05  # rad that two readings may differ by in addition to what MAX_VELOCITY allows
-# rad from the hanging arm at the first start. The zero of a motor with a single encoder may be off by whole turns of
-# the rotor (60 degrees of an AK60-6's output, 40 of an AK80-9's): less than half of that shows it.
-HOME_TOLERANCE = {"AK60-6": 0.5, "AK80-9": 0.34}
+
+
+@dataclass(frozen=True)
+class SoftWall:
+    """What holds a joint back before its limit.
+
+    The figures make it passive, for inertias of 0.005 to 0.3 kg m^2 and any rate: behind the rate limit a spring alone
+    would throw the arm back. The motor applies the damping without delay.
+    """
+
+    width: float = 0.1  #: rad before a joint limit, as in crisp_controllers
+    stiffness: float = 25.0  #: Nm/rad
+    most: float = 5.0  #: Nm, of the spring
+    damping: float = DAMPING  #: Nm s/rad, from `edge` on
+    edge: float = 0.02  #: rad into the wall over which the damping rises
+    release: float = 0.03  #: rad/s out of the wall, from which on the spring no longer pushes
+
+
+@dataclass(frozen=True)
+class Derating:
+    """The temperatures of a motor in degC: one whose own protection switches it off would drop the arm."""
+
+    most: float = 80.0  #: a fault from here on; an assumption
+    span: float = 10.0  #: below `most`, over which the permitted torque falls to half
+
+
+@dataclass(frozen=True)
+class Guide:
+    """The brake of joints while the load changes (core/compensation/guidance.py).
+
+    A wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in their hand.
+    """
+
+    speed: float = 0.25  #: rad/s beyond which it brakes; above the noise of a motor's velocity
+    brake: float = 1.5  #: Nm, at most
+
+
+@dataclass(frozen=True)
+class ReadingLimits:
+    """Which readings of a motor are plausible, and when it is silent."""
+
+    overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
+    jump: float = 0.05  #: rad between two readings, in addition to what the largest velocity allows
+    missed: int = 7  #: cycles without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
+    reply_timeout: float = 0.05  #: s, and `missed` cycles at least; an ordinary computer is late by 0.02 s
+
+
+@dataclass(frozen=True)
+class LoopTiming:
+    """What a control loop must keep to."""
+
+    frozen: float = 0.08  #: s without a drive, while the watchdog itself runs, after which the watchdog takes over
+    periods: int = 2  #: of control that must fit into each time-out, so that one late cycle is not a fault
+
+
+WALL, HEAT, GUIDE, READING, LOOP = SoftWall(), Derating(), Guide(), ReadingLimits(), LoopTiming()
 
 
 class JointSample(NamedTuple):
@@ -70,12 +103,17 @@ class Limits:
     joint_names: tuple[str, ...]
     position_min: Sequence[float] = owned((-1.65, -0.17, -0.78, -0.17), "lower joint limits", (-3.15, 3.15), "rad")
     position_max: Sequence[float] = owned((1.65, 3.14, 2.53, 3.14), "upper joint limits", (-3.15, 3.15), "rad")
-    max_velocity: Sequence[float] = MAX_VELOCITY  #: rad/s that trips a fault
+    #: rad/s that trips a fault; a reach stays below, a throw does not
+    max_velocity: Sequence[float] = (5.0, 5.0, 5.0, 6.0)
     max_effort: Sequence[float] = owned(
-        (3.0, 9.0, 3.0, 3.0), "torque limit, by default the motors' rated torque", (0.0, PEAK_TORQUE), "Nm"
+        tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS),
+        "torque limit, by default the motors' rated torque",
+        (0.0, max(spec.peak_torque for spec in MOTORS.values())),
+        "Nm",
     )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
-    reply_timeout: float = REPLY_TIMEOUT  #: s without a reply that makes a motor silent; `limits_of` has it of the rate
+    #: s without a reply that makes a motor silent; `limits_of` derives it from the rate
+    reply_timeout: float = READING.reply_timeout
     enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
@@ -95,7 +133,7 @@ class Limits:
         "Nm",
     )
     #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
-    home_tolerance: Sequence[float] = tuple(HOME_TOLERANCE[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6"))
+    home_tolerance: Sequence[float] = tuple(MOTORS[name].home_tolerance for name in USUAL_MOTORS)
     channels: Sequence[str] = ("",) * JOINT_COUNT  #: of the motors' buses
     #: (4,) rad, the hanging arm, from which joint angles are measured
     home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
@@ -104,8 +142,8 @@ class Limits:
         if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
             raise ParameterError("joint_names", list(self.joint_names), "4 different names")
         check_owned(self)
-        if any(high - low < 4 * WALL_WIDTH for low, high in zip(self.position_min, self.position_max, strict=True)):
-            expected = f"at least {4 * WALL_WIDTH} rad above position_min = {list(self.position_min)}"
+        if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
+            expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
             raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
@@ -122,15 +160,15 @@ class Limits:
         if joint.error:
             text = MOTOR_ERRORS.get(joint.error, "unknown")
             return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
-        if joint.temperature is not None and joint.temperature >= MAX_TEMPERATURE:
-            reason = f"{name}: {joint.temperature} degC, the limit is {MAX_TEMPERATURE:g}"
+        if joint.temperature is not None and joint.temperature >= HEAT.most:
+            reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
             return Fault(FaultCode.OVER_TEMPERATURE, reason)
         if not abs(joint.velocity) <= fastest:
             return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
-        if abs(joint.position - last.position) > JUMP + fastest * (joint.time - since):
+        if abs(joint.position - last.position) > READING.jump + fastest * (joint.time - since):
             reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
             return Fault(FaultCode.POSITION_JUMP, reason)
-        if not low - OVERSHOOT <= joint.position <= high + OVERSHOOT:
+        if not low - READING.overshoot <= joint.position <= high + READING.overshoot:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
         return None
@@ -148,19 +186,19 @@ class Limits:
         for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
             if not abs(effort[i]) <= MAX_COMMAND:
                 raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
-            above = joint.position - self.position_max[i] + WALL_WIDTH
-            below = self.position_min[i] + WALL_WIDTH - joint.position
+            above = joint.position - self.position_max[i] + WALL.width
+            below = self.position_min[i] + WALL.width - joint.position
             depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
             # Once the joint leaves the wall, no spring pushes it.
-            is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL_RELEASE
-            wall = 0.0 if is_left or not depth else -max(-WALL_TORQUE, min(WALL_TORQUE, WALL_STIFFNESS * depth))
-            colder = DERATING if joint.temperature is None else MAX_TEMPERATURE - joint.temperature
-            permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / DERATING)))
+            is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL.release
+            wall = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
+            colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
+            permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
             wanted = share * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
             shaped.append(limited)
-            damping.append(WALL_DAMPING * min(1.0, abs(depth) / WALL_EDGE))
+            damping.append(WALL.damping * min(1.0, abs(depth) / WALL.edge))
             if depth != 0.0:
                 acted.add(f"soft wall ({name})")
             if permitted < self.max_effort[i]:
@@ -174,12 +212,9 @@ class Limits:
 
 def guide_damping(velocity: float) -> float:
     """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
-    speed = max(GUIDE_SPEED, abs(velocity))
-    return min(DAMPING * (speed - GUIDE_SPEED), GUIDE_BRAKE) / speed
+    speed = max(GUIDE.speed, abs(velocity))
+    return min(DAMPING * (speed - GUIDE.speed), GUIDE.brake) / speed
 
-
-FROZEN = 0.08  # s without a drive from the control loop while the watchdog itself runs, after which it takes over
-PERIODS = 2  # control periods that must fit into each time-out, so that one late cycle is not a fault
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
@@ -196,8 +231,9 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
     given["channels"] = channels_of(values["can.channel"])
-    given["home_tolerance"] = tuple(HOME_TOLERANCE[name] for name in values["motor"])
-    given["reply_timeout"] = min(2.0 * REPLY_TIMEOUT, max(REPLY_TIMEOUT, MISSED / values["rate"]))
+    given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
+    shortest = READING.reply_timeout
+    given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)
 
 
@@ -208,10 +244,10 @@ def check_bridge(
 
     status_rate: status frames a second of V3 boards. Raises ParameterError that names both values.
     """
-    timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": FROZEN}
+    timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": LOOP.frozen}
     name, shortest = min(timeouts.items(), key=lambda item: item[1])
-    if rate * shortest < PERIODS - 1e-9:
-        expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"
+    if rate * shortest < LOOP.periods - 1e-9:
+        expected = f"at least {LOOP.periods / shortest:g} Hz: {name} = {shortest:g} s must span {LOOP.periods} periods"
         raise ParameterError("rate", rate, expected)
     if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
         expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"

@@ -32,11 +32,11 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
-from exo_gravity.core.safety.descent import DAMPING_RISE, SETTLING_TIME, ArmDescent
+from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import CALM, SignCheck, SwitchOnCheck, missing_for_a_start
+from exo_gravity.core.safety.gate import START_GATE, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
-from exo_gravity.core.safety.monitors import Readings, RestTracker, RideThrough, SupplyMonitor
+from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough, SupplyMonitor
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
@@ -135,17 +135,17 @@ class SafetyMachine:
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (4,) Nm and `damping` (4,)."""
         self._sent = Drive(tuple(effort), tuple(damping), True)
-        self._supply.doubt(effort)
+        self._supply.suspect(effort)
         self._let_down(now)
 
     def meet(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
         self._descent = ArmDescent(now, NOTHING, (DAMPING,) * JOINT_COUNT, self.limits.max_effort)
-        self._supply.doubt(NOTHING)
+        self._supply.suspect(NOTHING)
 
     def settled(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
-        return now - self._rest.since >= SETTLING_TIME
+        return now - self._rest.since >= REST.time
 
     def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
         """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
@@ -159,7 +159,7 @@ class SafetyMachine:
             self._is_trusted = False
         self._rest.step(now, readings.joints, readings.silent)
         if all(readings.silent) and sent.powered:
-            supply.doubt(sent.effort)
+            supply.suspect(sent.effort)
         self._is_found_on = supply.step(self._dt, readings.joints, readings.silent)
         if self.state is State.CHECKING:
             self._check(effort is not None and age <= self.limits.command_timeout)
@@ -191,23 +191,23 @@ class SafetyMachine:
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), self._now)
         if self.state is State.PROVING:
-            damping = DAMPING * min(1.0, (self._now - self._since) / DAMPING_RISE)
+            damping = DAMPING * min(1.0, (self._now - self._since) / DESCENT.damping_rise)
             pushed = (self._signs if self._switch_on.done else self._switch_on).effort
             return Drive(tuple(pushed), (damping,) * 4, True, tuple(self._switch_on.enter))
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
     def _check(self, efforts_are_fresh: bool) -> None:
-        """Continue to PROVING once all has been well for CALM s, or trip on a fault that refuses the start."""
+        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
         readings, limits = self._readings, self.limits
         missing = missing_for_a_start(limits, readings.joints, readings.fault, self._is_trusted)
         if isinstance(missing, Fault):
             self._trip(missing)
             return
         missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
-        self.waiting_for = missing or f"{CALM:g} s without a fault"
+        self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:
             self._calm_since = self._now
-        if self._now - self._calm_since >= CALM:
+        if self._now - self._calm_since >= START_GATE.calm:
             self.waiting_for = ""
             largest = 0.0 if self._is_trusted else limits.sign_check_torque
             self._switch_on = SwitchOnCheck(limits)
@@ -239,8 +239,8 @@ class SafetyMachine:
         shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
         self.acted.update(dict.fromkeys(acted, self._now))
         # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
-        # rises over DAMPING_RISE, and any damping falls so.
-        step = DAMPING / DAMPING_RISE * self._dt
+        # rises over `damping_rise`, and any damping falls so.
+        step = DAMPING / DESCENT.damping_rise * self._dt
         guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
         columns = zip(walls, wanted, self._sent.damping, strict=True)
@@ -255,7 +255,7 @@ class SafetyMachine:
             self._enter(State.LETTING_DOWN)
         if (all(supply.unsure) and supply.are_off) or descent.is_down(self._now, self._rest.since):
             self.is_unreached = any(silent)
-            supply.settle(may_differ)
+            supply.clear(may_differ)
             self._enter(State.FAULT if self.fault else State.DISABLED)
             return self._stand()
         columns = zip(self._delivery.missing, self._unsure, strict=True)
@@ -267,14 +267,14 @@ class SafetyMachine:
 
     @property
     def _unsure(self) -> tuple[bool, ...]:
-        """Which motors (4,) may be off: those in doubt, and those that do not reply, whose power may return."""
+        """Which motors (4,) may be off: those that are unsure, and those that do not reply, whose power may return."""
         return tuple(map(operator.or_, self._readings.silent, self._supply.unsure))
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
         supply = self._supply
         if supply.are_off:
-            supply.settle()
+            supply.clear()
             if self.is_unreached and self.state is State.CHECKING:
                 self._refuse("the motors have just returned, switched off: enable them again")
             self.is_unreached = False

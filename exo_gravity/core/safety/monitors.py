@@ -7,33 +7,66 @@ ten, adapters that deliver in batches of 1 ms, and a motor that reports one wron
 import math
 import operator
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import MISSED, UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.limits import READING, UNKNOWN, JointSample, Limits
 
-# s without a reply, while the motors hold the arm and while they are off, for which a motor's turn count stays trusted
-# if its angle is then within `home_tolerance` of the one before: a lost turn is twice as large, less what the joint has
-# moved. A forearm whose motor has lost its power falls by 0.3 rad in 0.1 s; an arm that is down, only a person moves.
-TRUSTED_SILENCE, TRUSTED_SILENCE_OFF = 0.1, 0.3
-SETTLED = 0.005  # rad that a joint at rest may turn
-# A motor that is off may report 0.15 Nm of noise (standard deviation); smoothed at 100 Hz that is 0.05 Nm, so one read
-# in ten thousand takes such a motor for one that is on. Less than SHOWN cannot throw an arm when it is switched off.
-SHOWN = 0.2  # Nm of smoothed torque that shows a motor on
-SMOOTHING = 0.05  # s, time constant
-READ_TIME = 0.2  # s of replies without torque that show motors off; an arm that sinks under damping shows torque sooner
-LONGEST_AGE = 0.18  # s of efforts; less than the break after which the compensator ramps in from zero
-LONGEST_RIDE = 0.13  # s
-RECOVERY = 0.1  # s of riding that each s with sound efforts makes good
+
+@dataclass(frozen=True)
+class TurnCount:
+    """For how long in s a motor may be silent until its turn count is no longer trusted.
+
+    Until then it is, if the angle is within `home_tolerance` of the one before: a lost turn is twice as large, less
+    what the joint has moved.
+    """
+
+    on: float = 0.1  #: while the motors hold the arm: a forearm whose motor has lost its power falls by 0.3 rad
+    off: float = 0.3  #: while they are off: an arm that is down, only a person moves
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What a joint at rest is."""
+
+    turn: float = 0.005  #: rad that it may turn meanwhile
+    time: float = 0.5  #: s without such a turn, after which the arm counts as at rest
+
+
+@dataclass(frozen=True)
+class Supply:
+    """What in its replies shows a motor on or off.
+
+    A motor that is off may report 0.15 Nm of noise (standard deviation); smoothed at 100 Hz that is 0.05 Nm, so one
+    read in ten thousand takes such a motor for one that is on.
+    """
+
+    torque: float = 0.2  #: Nm, smoothed, from which on it is on; less cannot throw an arm when it is switched off
+    smoothing: float = 0.05  #: s, time constant
+    read_time: float = 0.2  #: s without torque that show motors off; an arm that sinks under damping shows it sooner
+
+
+@dataclass(frozen=True)
+class Ride:
+    """For how long in s late efforts are still applied."""
+
+    longest_age: float = 0.18  #: of efforts; less than the gap after which the compensator ramps in from zero
+    longest: float = 0.13  #: at a time
+    recovery: float = 0.1  #: of riding that each s with sound efforts makes good
+
+
+TURN_COUNT, REST, SUPPLY, RIDE = TurnCount(), Rest(), Supply(), Ride()
 
 
 class Readings:
     """Follows the readings of an arm's motors, cycle by cycle.
 
-    joints: (4,) the newest ones, less those in doubt: a reading that shows a fault counts once the next one shows one
-    too. silent: (4,) whether a motor is silent: no reply for `reply_timeout`, nor in MISSED cycles: a loop that stood
-    still has not asked. fault: what the newest readings show, or None. lost: whether a motor may have lost its power
-    now, and with it the turn count of its encoder.
+    joints: (4,) the newest ones. One that shows a fault is left out until the next one shows a fault too.
+    silent: (4,) whether a motor is silent: no reply for `reply_timeout`, nor in `missed` cycles. A loop that stood
+        still has not asked.
+    fault: what the newest readings show, or None.
+    lost: whether a motor may have lost its power in this cycle, and with it the turn count of its encoder.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -43,15 +76,20 @@ class Readings:
         self.lost = True
         self._limits = limits
         self._newest = [-math.inf] * JOINT_COUNT  # s
-        self._missed = [MISSED] * JOINT_COUNT
+        self._missed = [READING.missed] * JOINT_COUNT
         self._asked = [-math.inf] * JOINT_COUNT  # s; each of `joints` was taken later
-        self._is_doubted = [False] * JOINT_COUNT
+        self._is_suspect = [False] * JOINT_COUNT
         self._now = -math.inf  # s, of the last cycle
 
     def step(self, now: float, joints: Sequence[JointSample], powered: bool = True) -> None:
-        """Take the newest readings `joints` (4,) in the cycle at `now` s; powered: whether the motors are on."""
+        """Take the newest readings of a cycle.
+
+        now: s.
+        joints: (4,) the newest readings.
+        powered: whether the motors are on.
+        """
         limits = self._limits
-        longest = TRUSTED_SILENCE if powered else TRUSTED_SILENCE_OFF
+        longest = TURN_COUNT.on if powered else TURN_COUNT.off
         counting = list(self.joints)
         self.fault, self.lost = None, False
         for i, joint in enumerate(joints):
@@ -61,19 +99,20 @@ class Readings:
                 self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
                 self._newest[i], self._missed[i] = joint.time, 0
                 fault = limits.find_fault(i, joint, self.joints[i], self._asked[i])
-                is_confirmed, self._is_doubted[i] = self._is_doubted[i], fault is not None
+                is_confirmed, self._is_suspect[i] = self._is_suspect[i], fault is not None
                 if is_confirmed or not fault or self.joints[i] is UNKNOWN:
                     counting[i], self._asked[i] = joint, self._now
                     self.fault = self.fault or (fault if is_confirmed else None)
             else:
                 self._missed[i] += 1
-                self.lost |= self._missed[i] >= MISSED and now - joint.time > longest
+                self.lost |= self._missed[i] >= READING.missed and now - joint.time > longest
         self.joints = tuple(counting)
         asked = zip(joints, self._missed, strict=True)
-        self.silent = [missed >= MISSED and limits.is_silent(now, joint) for joint, missed in asked]
+        self.silent = [missed >= READING.missed and limits.is_silent(now, joint) for joint, missed in asked]
         if any(self.silent):
             name, buses = limits.joint_names[self.silent.index(True)], set(limits.channels)
-            replying = {bus for bus, missed in zip(limits.channels, self._missed, strict=True) if missed < MISSED}
+            columns = zip(limits.channels, self._missed, strict=True)
+            replying = {bus for bus, missed in columns if missed < READING.missed}
             reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
             if len(buses) > 1 and (dead := buses - replying):
                 reason += f"; no motor on {' and '.join(sorted(dead))} replies: the bus is lost, or the supply is cut"
@@ -84,7 +123,7 @@ class Readings:
 class RestTracker:
     """Whether an arm is at rest, judged by position: a damped arm can creep at less than one code of the velocity.
 
-    since: s, the time since which no replying joint has turned by more than SETTLED.
+    since: s, the time since which no replying joint has turned by more than `REST.turn`.
     """
 
     def __init__(self) -> None:
@@ -92,10 +131,13 @@ class RestTracker:
         self._reference: Sequence[JointSample] = (UNKNOWN,) * JOINT_COUNT
 
     def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
-        """Take the newest readings at `now` (s); silent: (4,) whose motor does not reply."""
+        """Take the newest readings at `now` s.
+
+        silent: (4,) whether the joint's motor does not reply.
+        """
         columns = zip(joints, self._reference, silent, strict=True)
         if any(
-            not is_silent and not abs(joint.position - last.position) <= SETTLED for joint, last, is_silent in columns
+            not is_silent and not abs(joint.position - last.position) <= REST.turn for joint, last, is_silent in columns
         ):
             self.since, self._reference = now, joints
         if any(silent):  # a silent joint may have moved by the time it replies again
@@ -111,39 +153,48 @@ class SupplyMonitor:
     its last command, and must be let down. Until it is known, a motor is sent nothing that could switch it on
     (`MotorBus`). The same holds for the motors of an owner that left no notes.
 
-    unsure: (4,) the motors of which it is not known.
+    unsure: (4,) whether it is not known of a motor.
     """
 
     def __init__(self) -> None:
         self._times = list(NOTHING)  # s, of each motor's last reply
-        self.doubt(NOTHING)
-        self.settle()
+        self.suspect(NOTHING)
+        self.clear()
 
     @property
     def returning(self) -> tuple[bool, ...]:
-        """Those (4,) in doubt that were silent: they may apply another torque than the last one sent."""
+        """Which motors (4,) are unsure and were silent: they may apply another torque than the last one sent."""
         return tuple(map(operator.and_, self.unsure, self._were_silent))
 
     @property
     def are_off(self) -> bool:
-        """Whether every motor in doubt has replied for READ_TIME without torque."""
-        doubtful = [heard for heard, is_unsure in zip(self._heard, self.unsure, strict=True) if is_unsure]
-        return bool(doubtful) and min(doubtful) >= READ_TIME
+        """Whether every unsure motor has replied for `SUPPLY.read_time` without torque."""
+        unsure = [heard for heard, is_unsure in zip(self._heard, self.unsure, strict=True) if is_unsure]
+        return bool(unsure) and min(unsure) >= SUPPLY.read_time
 
-    def doubt(self, held: Sequence[float]) -> None:
-        """Doubt every motor; they apply `held` (4,) Nm if they are on."""
+    def suspect(self, held: Sequence[float]) -> None:
+        """Take every motor for unsure from now on.
+
+        held: (4,) Nm, what they apply if they are on.
+        """
         self._held = held
         self.unsure: tuple[bool, ...] = (True,) * len(held)
         self._torque = list(NOTHING)  # smoothed, since the motor replies again
         self._heard = list(NOTHING)  # s for which it has replied again
         self._were_silent = [False] * len(held)
 
-    def settle(self, may_differ: Sequence[bool] = (False,) * JOINT_COUNT) -> None:
-        """End all doubt, apart from that of motors that are silent or `returning`, `may_differ` (4,)."""
-        self.unsure = tuple(map(operator.and_, self.unsure, may_differ))
+    def clear(self, still: Sequence[bool] = (False,) * JOINT_COUNT) -> None:
+        """Take the motors for sure from now on.
+
+        still: (4,) which stay unsure, if they are: those that are silent or `returning`.
+        """
+        self.unsure = tuple(map(operator.and_, self.unsure, still))
 
     def step(self, dt: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> bool:
-        """Take the newest readings; return whether one shows that its motor is on. silent: (4,) who does not reply."""
+        """Take the newest readings, `dt` s after the last ones; return whether one shows that its motor is on.
+
+        silent: (4,) whether the joint's motor does not reply.
+        """
         if not any(self.unsure):
             return False
         for i, joint in enumerate(joints):
@@ -151,14 +202,14 @@ class SupplyMonitor:
             if silent[i]:
                 self._torque[i], self._were_silent[i] = 0.0, True
             elif joint.time > self._times[i]:
-                self._torque[i] += min(1.0, dt / SMOOTHING) * (joint.effort - self._torque[i])
+                self._torque[i] += min(1.0, dt / SUPPLY.smoothing) * (joint.effort - self._torque[i])
                 self._times[i] = joint.time
-        shown = [abs(torque) > SHOWN for torque in self._torque]
+        shown = [abs(torque) > SUPPLY.torque for torque in self._torque]
         if not any(shown):
             return False
         # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
         self.unsure = tuple(
-            is_unsure and not is_shown and (is_silent or abs(held) > 2.0 * SHOWN)
+            is_unsure and not is_shown and (is_silent or abs(held) > 2.0 * SUPPLY.torque)
             for is_unsure, is_shown, is_silent, held in zip(self.unsure, shown, silent, self._held, strict=True)
         )
         return True
@@ -170,11 +221,13 @@ class RideThrough:
     A compensator that is late on a busy computer, or whose tilt is late, needs no descent. While efforts are older than
     `timeout` (s), or computed from a late tilt, the motors apply the newest ones, and their damping rises as in a
     descent; once the efforts are sound again it falls. The ride ends in a fault once it is too long, efforts are too
-    old, or they have been late too often: ordinary computers are late for less than RECOVERY of the time. Up to
-    LONGEST_AGE an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
+    old, or they have been late too often: ordinary computers are late for less than `RIDE.recovery` of the time. Up to
+    `RIDE.longest_age` an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
 
-    is_riding: whether efforts are late and still used. rides: how often that began. why: of the last ride; ended: s,
-    when it was last going on.
+    is_riding: whether efforts are late and still used.
+    rides: how often that began.
+    why: of the last ride.
+    ended: s, when it was last going on.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -182,23 +235,26 @@ class RideThrough:
         self.rides = 0
         self.why, self.ended = "", -math.inf
         self._timeout = timeout
-        self._left = LONGEST_RIDE
+        self._left = RIDE.longest
 
     def step(self, now: float, dt: float, age: float, held: bool) -> Fault | None:
-        """Take the `age` (s) of the newest efforts at `now` s; return a fault if they can no longer be used.
+        """Take the age of the newest efforts; return a fault if they can no longer be used.
 
-        dt: s that the loop ran since the last call. held: whether the efforts are computed from a late tilt.
+        now: s.
+        dt: s that the loop ran since the last call.
+        age: s, of the efforts.
+        held: whether they are computed from a late tilt.
         """
         if age <= self._timeout and not held:
             self.is_riding = False
-            self._left = min(LONGEST_RIDE, self._left + RECOVERY * dt)
+            self._left = min(RIDE.longest, self._left + RIDE.recovery * dt)
             return None
         self.rides += not self.is_riding
         self.is_riding, self.ended = True, now
         self._left -= dt
         self.why = f"efforts {1000.0 * age:.0f} ms old" + (", of a tilt that is late" if held else "")
-        if self._left >= 0.0 and age <= LONGEST_AGE:
+        if self._left >= 0.0 and age <= RIDE.longest_age:
             return None
         self.is_riding = False
-        limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * LONGEST_RIDE:.0f} ms more for a moment"
+        limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * RIDE.longest:.0f} ms more for a moment"
         return Fault(FaultCode.COMMAND_STALE, f"{self.why}: must be less than {limit}")

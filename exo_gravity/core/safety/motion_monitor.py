@@ -6,27 +6,37 @@ and so on). Any load from none to these, in the arm's pose and at the trunk's ti
 joint, which `largest_addition` widens both ways: what assistance, springs, friction and inertia terms or a calibration
 may add. What is asked for outside that range, beyond a margin, is unexplained.
 
-Unexplained torque is summed over time, with both signs as positive, and forgotten over `MEMORY`. The sum is an impulse:
+Unexplained torque is summed over time, with both signs as positive, and forgotten over `memory`. The sum is an impulse:
 it bounds the speed that the motors cause and gravity does not, whatever the wearer does meanwhile. A joint of a link
-with moment M has an inertia of about M l, l = 0.3 m: so the impulse that is permitted, `PATIENCE` times the full load
-g M, is a speed of about g PATIENCE / l = 0.4 rad/s.
+with moment M has an inertia of about M l, l = 0.3 m: so the impulse that is permitted, `patience` times the full load
+g M, is a speed of about g patience / l = 0.4 rad/s.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_COMMAND, JointSample, Limits
 
 GRAVITY = 9.81  # m/s^2
-UPRIGHT = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
-SURPLUS = 1.1  # times the largest moments
-ABSOLUTE = 0.1  # Nm
-RELATIVE = 0.1  # of the full load: 6 degrees of the trunk's tilt
-LATE = 0.02  # s by which a torque that is fresh may answer an old pose
-SLOW = 0.1  # s, time constant; faster than this, torque changes only with the pose
-PATIENCE = 0.012  # s
-MEMORY = 1.0  # s, time constant
+ALONG_BASE = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """How much torque gravity need not account for, and for how long."""
+
+    surplus: float = 1.1  #: times the largest moments
+    least: float = 0.1  #: Nm of margin
+    share: float = 0.1  #: of the full load, in addition: 6 degrees of the trunk's tilt
+    late: float = 0.02  #: s by which a torque that is fresh may answer an old pose
+    slow: float = 0.1  #: s, time constant; faster than this, torque changes only with the pose
+    patience: float = 0.012  #: s of the full load
+    memory: float = 1.0  #: s, time constant
+
+
+MOTION = MotionLimits()
 
 
 class MotionMonitor:
@@ -36,7 +46,7 @@ class MotionMonitor:
     """
 
     def __init__(self, limits: Limits) -> None:
-        self.gravity: tuple[float, float, float] = UPRIGHT
+        self.gravity: tuple[float, float, float] = ALONG_BASE
         self._limits = limits
         self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
         one, two, three, four = self._load
@@ -66,18 +76,19 @@ class MotionMonitor:
         for i, full in enumerate(self.full):
             most = self._limits.max_effort[i]
             torque = max(-most, min(most, effort[i]))
-            margin = ABSOLUTE + self._limits.largest_addition[i] + (RELATIVE + max(LATE, age) * fastest) * full
+            share = MOTION.share + max(MOTION.late, age) * fastest
+            margin = MOTION.least + self._limits.largest_addition[i] + share * full
             low, high = lowest[i] - margin, highest[i] + margin
             within = max(low, min(high, torque))
             passed.append(within)
             change = torque - self._slow[i]
-            self._slow[i] += min(1.0, dt / SLOW) * change
-            excess = max(abs(torque - within), abs(change) - margin - SLOW * fastest * full)
-            self.impulse[i] += dt * (max(0.0, excess) - self.impulse[i] / MEMORY)
-            if not self.impulse[i] <= PATIENCE * full and fault is None:
+            self._slow[i] += min(1.0, dt / MOTION.slow) * change
+            excess = max(abs(torque - within), abs(change) - margin - MOTION.slow * fastest * full)
+            self.impulse[i] += dt * (max(0.0, excess) - self.impulse[i] / MOTION.memory)
+            if not self.impulse[i] <= MOTION.patience * full and fault is None:
                 reason = f"{torque:.2f} Nm asked for, gravity explains {low:.2f} to {high:.2f} Nm"
                 if low <= torque <= high:
-                    reason = f"{change:+.2f} Nm asked for in {SLOW:g} s, in which the arm hardly moved"
+                    reason = f"{change:+.2f} Nm asked for in {MOTION.slow:g} s, in which the arm hardly moved"
                 fault = Fault(FaultCode.UNEXPLAINED_TORQUE, f"{self._limits.joint_names[i]}: {reason}")
         return passed, fault
 
@@ -100,6 +111,6 @@ class MotionMonitor:
             (turn3, turn4),
             (turn4,),
         )
-        lowest = tuple([SURPLUS * sum([min(0.0, torque) for torque in torques]) for torques in parts])
-        highest = tuple([SURPLUS * sum([max(0.0, torque) for torque in torques]) for torques in parts])
+        lowest = tuple([MOTION.surplus * sum([min(0.0, torque) for torque in torques]) for torques in parts])
+        highest = tuple([MOTION.surplus * sum([max(0.0, torque) for torque in torques]) for torques in parts])
         return lowest, highest

@@ -29,7 +29,7 @@ from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge
-ATTEMPT_PERIOD = 0.02  # s
+ATTEMPT_PERIOD = 0.02  # s, of looking whether it has
 
 NAME = "\0exo_gravity/"  # the first character makes a socket's name abstract
 # The first that every user may write to; /dev/shm only after it, because logind empties it when a user logs out.
@@ -77,10 +77,11 @@ class DriveNotes(ctypes.Structure):
 
 
 class BusLock:
-    """Exclusive ownership of the bus at `address` until `release`. owner: shown to others who want the bus.
+    """Exclusive ownership of the bus at `address` until `release`. Raises BusError with the present owner.
 
-    asks: whether to ask for the bus, so that the watchdog of motors that do not reply hands it over. Raises BusError
-    with the present owner if the bus is still held after `patience` s.
+    owner: shown to others who want the bus.
+    patience: s for which a bus that is held is waited for.
+    asks: whether to ask for the bus, so that the watchdog of motors that do not reply hands it over.
     """
 
     def __init__(
@@ -119,9 +120,11 @@ class BusLock:
 
 
 class ArmNotes:
-    """The notes of all buses of an arm as one. pages: of the bus of each joint's motor (4,).
+    """The notes of all buses of an arm as one; every bus has the notes of the whole arm.
 
-    joints: (0..3) on whose buses to note. Every bus has the notes of the whole arm. clock: of their times.
+    pages: of the bus of each joint's motor (4,).
+    joints: (0..3) on whose buses to note.
+    clock: of the times of the notes.
     """
 
     def __init__(self, pages: Sequence[DriveNotes], joints: Sequence[int] = range(JOINT_COUNT)) -> None:

@@ -12,11 +12,11 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
+from exo_gravity.core.safety.delivery import DELIVERY
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -24,19 +24,35 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
 
-OPEN_PERIOD = 0.05  # s between two attempts to open the bus
-FIRST_REPLIES = 0.05  # s in which the motors must reply to the first commands
-START_TIME = 15.0  # s until the first heartbeat, before which no arm is enabled: imports on a busy machine take long
-HEARTBEAT_TIMEOUT = 0.3  # s without a heartbeat, while this process itself runs
-LONGEST_LOOK = 0.15  # s between two looks of a process that runs
-END_TIME = 2.0  # s for the watchdog to end after `close`
+
+@dataclass(frozen=True)
+class TakeOver:
+    """How an arm is reached that another process has left."""
+
+    open_period: float = 0.05  #: s between two attempts to open the bus
+    first_replies: float = 0.05  #: s in which the motors must reply to the first commands
+
+
+@dataclass(frozen=True)
+class Heartbeat:
+    """When the watchdog's process counts as alive, in s."""
+
+    start: float = 15.0  #: until the first heartbeat, before which no arm is enabled: imports take long when busy
+    timeout: float = 0.3  #: without a heartbeat, while this process itself runs
+    longest_look: float = 0.15  #: between two looks of a process that runs
+    end: float = 2.0  #: for the watchdog to end after `close`
+
+
+TAKE_OVER, HEARTBEAT = TakeOver(), Heartbeat()
 
 
 def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_wanted: Callable[[], bool]) -> bool:
     """Let down an arm whose motors apply what is noted; return whether its motors have confirmed that they are off.
 
-    log: called with each change worth knowing. is_wanted: whether to give up, because someone else waits for the bus,
-    while the bus or a motor cannot be reached. The joints on a bus that cannot be opened come after the others.
+    The joints on a bus that cannot be opened come after the others.
+
+    log: called with each change worth knowing.
+    is_wanted: whether to give up while the bus or a motor cannot be reached, because someone else waits for the bus.
     """
     ports: list[CanPort | None] = []
     is_logged = False
@@ -49,13 +65,13 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
         if not any(ports):
             if is_wanted():
                 return False
-            notes.clock.sleep(OPEN_PERIOD)
+            notes.clock.sleep(TAKE_OVER.open_period)
     left = [joint for joint in arm.joints if not ports[joint]]
     own = notes.of([joint for joint in arm.joints if ports[joint]])
     drive, clock, is_complete = notes.drive, notes.clock, False
     motors = MotorBus(ports, arm.motors, powered=True, note=own.note, clock=clock)
     first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
-    end = clock.monotonic() + FIRST_REPLIES
+    end = clock.monotonic() + TAKE_OVER.first_replies
     while not is_complete and clock.monotonic() < end:
         try:
             is_complete = motors.exchange(first, clock.monotonic() + arm.period)
@@ -65,7 +81,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
     effort, damping = list(drive.effort), list(drive.damping)
     for i, joint in enumerate(motors.samples):
         expected = effort[i] - damping[i] * joint.velocity
-        if abs(joint.effort - expected) > ABSOLUTE + RELATIVE * abs(expected):  # not without a reply: that is NaN
+        if DELIVERY.excess(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
             effort[i], damping[i] = joint.effort, 0.0
     machine = SafetyMachine(arm.limits, arm.period, arm.motors)
     machine.take_over(effort, damping, clock.monotonic())
@@ -87,8 +103,9 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
 class Silence:
     """How long another process has given no sign of life, seen by a process that may have stood still itself.
 
-    now: s. longest_look: s between two looks of a process that runs. If more time has passed, the whole machine may
-    have stood still, and the other process gets another chance: only `longest_look` is added.
+    now: s.
+    longest_look: s between two looks of a process that runs. If more time has passed, the whole machine may have stood
+        still, and the other process gets another chance: only `longest_look` is added.
     """
 
     def __init__(self, now: float, longest_look: float) -> None:
@@ -98,7 +115,10 @@ class Silence:
         self._duration = 0.0
 
     def look(self, now: float, sign: float, is_due: bool = True) -> float:
-        """Return the silence in s at `now`, 0 if `sign` is new. is_due: whether the other process must give signs."""
+        """Return the silence in s at `now`, 0 if `sign` is new.
+
+        is_due: whether the other process must give signs.
+        """
         is_silent = is_due and sign == self._sign
         self._duration = self._duration + min(now - self._last_look, self._longest_look) if is_silent else 0.0
         self._last_look, self._sign = now, sign
@@ -112,7 +132,7 @@ class Watchdog:
         self._notes = lock.notes
         self._now = lock.notes.clock.monotonic
         self._start = self._now()
-        self._silence = Silence(self._start, LONGEST_LOOK)
+        self._silence = Silence(self._start, HEARTBEAT.longest_look)
         receiver, self._sender = Pipe(duplex=False)
         pages, locks = [own.descriptor for own in lock.of_joints], [own.socket.fileno() for own in lock.locks]
         shared = (receiver.fileno(), *pages, *locks)
@@ -137,8 +157,8 @@ class Watchdog:
             return False
         now, heartbeat = self._now(), self._notes.heartbeat
         if heartbeat == 0.0:
-            return now - self._start < START_TIME
-        return self._silence.look(now, heartbeat) < HEARTBEAT_TIMEOUT
+            return now - self._start < HEARTBEAT.start
+        return self._silence.look(now, heartbeat) < HEARTBEAT.timeout
 
     def hand_over(self, reason: str) -> bool:
         """Request the watchdog to kill this process and let the arm down; return whether it is alive."""
@@ -154,17 +174,20 @@ class Watchdog:
         if self._notes.drive.powered:
             return
         try:
-            self.process.wait(END_TIME)
+            self.process.wait(HEARTBEAT.end)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
 
 
 class OwnedBus:
-    """The bus of `arm`, or its buses, locked for `owner` (shown to others who want one) until `close`.
+    """The bus of `arm`, or its buses, owned until `close`.
 
-    If the previous owner and its watchdog ended while the motors were on, that arm is let down first. log: called with
-    what happens then. Raises BusError if the bus is held or cannot be opened, or if that arm cannot be let down.
+    If the previous owner and its watchdog ended while the motors were on, that arm is let down first. Raises BusError
+    if the bus is held or cannot be opened, or if that arm cannot be let down.
+
+    owner: shown to others who want the bus.
+    log: called with what happens when an arm is let down first.
     """
 
     def __init__(self, arm: ArmOnBus, owner: str, log: Callable[[str], None], clock: Clock = COMPUTER_CLOCK) -> None:
@@ -195,8 +218,10 @@ def take_over(
 ) -> ArmLock:
     """Lock each bus for `owner`, and let down the arm that its last owner left with its motors on.
 
-    patience: s for that owner's watchdog to do so first. If the arm cannot be reached, a watchdog stays and keeps
-    trying, until the next owner asks for the bus. Raises BusError.
+    If the arm cannot be reached, a watchdog stays and keeps trying, until the next owner asks for the bus. Raises
+    BusError.
+
+    patience: s for the last owner's watchdog to let it down first.
     """
     lock = ArmLock(arm, owner, patience, clock)
     try:

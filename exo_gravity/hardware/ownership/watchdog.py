@@ -2,8 +2,9 @@
 
 It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
 inherits the lock of each bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
-has noted nothing for `FROZEN` is killed first: two processes must never command one motor. Once a motor has not replied
-for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes stay.
+has noted nothing for `LOOP.frozen` is killed first: two processes must never command one motor. Once a motor has not
+replied for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes
+stay.
 
 While the motors are on it keeps the computer from being suspended: that would freeze both processes.
 
@@ -27,7 +28,7 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.limits import FROZEN
+from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
@@ -50,8 +51,10 @@ def guard(
 ) -> int:
     """Watch the bridge until it has ended, let its arm down if necessary, and return the exit code.
 
-    kill: kills the bridge. receiver: the watchdog's end of the pipe. is_wanted: whether the next bridge waits for the
-    bus. inhibit: called often with whether the computer must not be suspended.
+    kill: kills the bridge.
+    receiver: the watchdog's end of the pipe.
+    is_wanted: whether the next bridge waits for the bus.
+    inhibit: called often with whether the computer must not be suspended.
     """
     arm: ArmOnBus | None = None
     clock = notes.clock
@@ -72,9 +75,9 @@ def guard(
                 for page in notes.noted:
                     page.heartbeat = now
             inhibit(is_powered)
-            if silence.look(now, noted, is_powered) > FROZEN:
+            if silence.look(now, noted, is_powered) > LOOP.frozen:
                 kill()  # it sends nothing from here on, even if it takes long to die
-                why = f"was frozen for {FROZEN * 1000:.0f} ms and has been killed"
+                why = f"was frozen for {LOOP.frozen * 1000:.0f} ms and has been killed"
                 break
     if not notes.drive.powered:
         return 0

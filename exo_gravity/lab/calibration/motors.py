@@ -8,7 +8,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
 
@@ -18,7 +18,7 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
 from exo_gravity.core.motors.specs import MOTOR_ERRORS
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.hardware.can.bus_scan import ArmScan, BusScan, MotorAnswer
+from exo_gravity.lab.calibration.bus_scan import ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.arms import ConfiguredArm
@@ -34,16 +34,31 @@ MOTIONS = (
     "lift the upper arm to the front",
     "bend the elbow",
 )
-MIN_TURN = 10.0  # deg by which a joint must be moved
-MAX_OTHER = 0.5  # of that turn, which another motor may turn meanwhile
-MAX_BACK = 0.5  # of that turn, which the same motor may turn the other way
-ATTEMPTS = 3  # of each joint
-REST_SAMPLES = 40
-MAX_UNREST = math.radians(0.5)  # between two of these samples
-SAME_ANGLE = math.radians(5.0)  # within which the arm hangs again after the power was off
-MAX_SILENCE = 0.15  # s: some replies in a row may be late on a busy computer
 UNCHECKED = "not checked after a power-up"
-SET_ZERO = "call can_bridge's service set_zero with the arm hanging, and begin again"
+CALL_SET_ZERO = "call can_bridge's service set_zero with the arm hanging, and begin again"
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """What a person's motion of a joint must be like."""
+
+    least: float = 10.0  #: deg by which the joint must be moved
+    other: float = 0.5  #: of that turn, which another motor may turn meanwhile
+    back: float = 0.5  #: of that turn, which the same motor may turn the other way
+    attempts: int = 3  #: at each joint
+    silence: float = 0.15  #: s without an answer: some replies in a row may be late on a busy computer
+
+
+@dataclass(frozen=True)
+class StillArm:
+    """What an arm that hangs is like."""
+
+    samples: int = 40  #: of each angle
+    unrest: float = math.radians(0.5)  #: rad between two of these
+    same: float = math.radians(5.0)  #: rad within which it hangs again after the power was off
+
+
+HAND, STILL = HandMotion(), StillArm()
 
 
 def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -105,7 +120,7 @@ class MotorSearch:
             try:
                 JointMotor(motor.spec, can_id, direction, zero)
             except ParameterError as error:  # the angle would wrap
-                refusals.append(f"{name}: {error}: {SET_ZERO}")
+                refusals.append(f"{name}: {error}: {CALL_SET_ZERO}")
         node, directions = f"{self._arm.namespace}/can_bridge", [direction for _, direction in self.found.values()]
         formats = [self._last[can_id].wire_format for can_id in self.found]
         changes = (
@@ -130,9 +145,9 @@ class MotorSearch:
     def _watch(self, request: str, unclear: Callable[[], str] = str) -> None:
         """Let the person do what is requested, and keep what all motors answer meanwhile.
 
-        unclear: returns why that does not show what was asked for, or ''. Raises DataError after ATTEMPTS.
+        unclear: returns why that does not show what was asked for, or ''. Raises DataError after some attempts.
         """
-        for left in reversed(range(ATTEMPTS)):
+        for left in reversed(range(HAND.attempts)):
             self._angles = {can_id: [] for can_id in self._last}
             self._answered, self._was_silent = dict.fromkeys(self._last, self._clock()), set()
             self._poll()
@@ -155,7 +170,7 @@ class MotorSearch:
     def _table(self) -> Table:
         """Return what all motors answered last; remember who is silent."""
         now = self._clock()
-        silent = {can_id for can_id, answered in self._answered.items() if now - answered > MAX_SILENCE}
+        silent = {can_id for can_id, answered in self._answered.items() if now - answered > HAND.silence}
         self._was_silent |= silent
         columns = ("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", "wire format")
         table = Table(*columns, header_style="bold")
@@ -183,12 +198,12 @@ class MotorSearch:
         (other, _, second), (turn, back, most) = sorted(ways, key=lambda way: abs(way[0]))[-2:]
         if self._was_silent:
             return f"{name}: motor {min(self._was_silent)} did not answer while the arm was moved: check its plug"
-        if abs(turn) < MIN_TURN:
-            return f"{name}: no motor turned by {MIN_TURN:g} degrees; motor {most} by {abs(turn):.1f}"
-        if abs(other) > MAX_OTHER * abs(turn):
+        if abs(turn) < HAND.least:
+            return f"{name}: no motor turned by {HAND.least:g} degrees; motor {most} by {abs(turn):.1f}"
+        if abs(other) > HAND.other * abs(turn):
             both = f"{abs(turn):.0f} and {abs(other):.0f} degrees"
             return f"{name}: motors {most} and {second} both turned, by {both}: move one joint alone"
-        if back > MAX_BACK * abs(turn):
+        if back > HAND.back * abs(turn):
             return f"{name}: motor {most} turned both ways: move the joint in one direction only"
         if most in self.found:
             return f"{name}: motor {most} turned, which is that of {self.found[most][0]}"
@@ -197,9 +212,9 @@ class MotorSearch:
         return ""
 
     def _sample(self) -> None:
-        """Take the angles of REST_SAMPLES polls from now on."""
+        """Take the angles of `STILL.samples` polls from now on."""
         self._angles = {can_id: [] for can_id in self._last}
-        for _ in range(REST_SAMPLES):
+        for _ in range(STILL.samples):
             self._poll()
 
     def _unrest(self) -> str:
@@ -207,9 +222,9 @@ class MotorSearch:
         self._sample()
         for can_id, (name, _) in self.found.items():
             angles = self._angles[can_id]
-            if len(angles) < REST_SAMPLES // 2:
+            if len(angles) < STILL.samples // 2:
                 return f"motor {can_id} did not answer: check its plug"
-            if (moved := max(angles) - min(angles)) > MAX_UNREST:
+            if (moved := max(angles) - min(angles)) > STILL.unrest:
                 return f"{name} moved by {math.degrees(moved):.1f} degrees: the arm must be still"
         return ""
 
@@ -223,13 +238,13 @@ class MotorSearch:
         for (can_id, (name, _)), motor, angle in zip(self.found.items(), self._arm.motors, before, strict=True):
             if not self._angles[can_id]:
                 return UNCHECKED, [f"motor {can_id} does not answer after the power-up"]
-            away, turn = self._angles[can_id][-1] - angle, 2.0 * math.pi / motor.spec.gear_ratio
-            if is_checked and abs(away) > SAME_ANGLE:
+            away, turn = self._angles[can_id][-1] - angle, motor.spec.rotor_turn
+            if is_checked and abs(away) > STILL.same:
                 turns = round(away / turn)
-                is_turn = turns and abs(away - turns * turn) < SAME_ANGLE
+                is_turn = turns and abs(away - turns * turn) < STILL.same
                 cause = f"{turns:+d} rotor turns" if is_turn else "no whole number of rotor turns"
                 refusals.append(
-                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {SET_ZERO}"
+                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {CALL_SET_ZERO}"
                 )
         unchecked = f"{UNCHECKED}: hang the arm each time the motors are switched on"
         return "the same after a power-up with the arm hanging" if is_checked else unchecked, refusals

@@ -18,7 +18,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
-from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
+from exo_gravity.core.safety.limits import WALL, Limits
 from exo_gravity.lab.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
 
 
@@ -223,7 +223,7 @@ def candidates(limits: Limits) -> np.ndarray:
 
 def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and highest pose (4,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
-    margin = WALL_WIDTH + amplitude + CHOICE.edge
+    margin = WALL.width + amplitude + CHOICE.edge
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.drive import CARRYING, State
-from exo_gravity.core.safety.limits import WALL_WIDTH
+from exo_gravity.core.safety.limits import WALL
 from exo_gravity.lab.view.urdf import ArmDescription, arm_pose
 
 Colour = tuple[float, float, float, float]
@@ -88,7 +88,7 @@ def arm_shapes(view: ArmView) -> list[Shape]:
     limits, shapes = view.arm.limits, []
     for n, (origin, axis, along) in enumerate(zip(*arm_pose(view.arm, view.theta), strict=False)):
         low, high = limits.position_min[n] - view.theta[n], limits.position_max[n] - view.theta[n]
-        colour = GREY if low + WALL_WIDTH <= 0.0 <= high - WALL_WIDTH else RED
+        colour = GREY if low + WALL.width <= 0.0 <= high - WALL.width else RED
         tip = origin + SIZES.range_radius * along
         shapes.append(
             Shape("limits", LINE, _arc(origin, axis, along, low, high, SIZES.range_radius), SIZES.limit_width, colour)

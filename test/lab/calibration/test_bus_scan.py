@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import can
 import pytest
@@ -10,16 +11,20 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_command
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.hardware.can.bus_scan import DAMPED, BusScan
+from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.lab.calibration.bus_scan import DAMPED, BusScan
 from exo_gravity.sim import Firmware
 
-from ..support.simulated_device import SPECS, frame, make_device
-from .virtual_time import Responder, Wire
+from ...hardware.virtual_time import Responder, Wire
+from ...support.simulated_device import SPECS, frame, make_device
 
 ADDRESS = ("wire", f"of process {os.getpid()}", {})
 
-pytestmark = pytest.mark.usefixtures("lock_folder")
+
+@pytest.fixture(autouse=True)
+def notes_of_buses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
 
 
 @pytest.fixture

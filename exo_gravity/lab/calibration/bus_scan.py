@@ -1,4 +1,4 @@
-"""Finds the AK motors on a bus without moving any, whatever the wire formats of their boards.
+"""Finds the AK motors on a bus without moving any, on boards of V1, V2 and V3.
 
 V1 and V2 boards: a motor that is off still answers a command frame. The scan sends each ID a command with damping
 alone, whose bytes are the same for every motor type: the gains' ranges are, and the other ranges are symmetric. ENTER
@@ -29,7 +29,7 @@ SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
 DAMPED = pack_command(SPEC, 0.0, 0.0, 0.0, DAMPING, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
-ATTEMPTS = 2  # for each ID, in case a frame is lost
+COMMANDS = 2  # to each ID, in case a frame is lost
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
 IDS = frozenset(range(1, 256))
 
@@ -84,8 +84,10 @@ class ArmScan(contextlib.ExitStack):
 class BusScan(contextlib.ExitStack):
     """Owns the bus at `address` until `close`, so that no bridge can start meanwhile.
 
-    open_bus: opens the bus. Raises BusError if a bridge holds the bus, with its name; if another host commands the
-    motors; if a dead bridge left them on; or if the bus cannot be opened.
+    Raises BusError if a bridge holds the bus, with its name; if another host commands the motors; if a dead bridge left
+    them on; or if the bus cannot be opened.
+
+    open_bus: opens the bus.
     """
 
     def __init__(
@@ -124,7 +126,7 @@ class BusScan(contextlib.ExitStack):
         found = {can_id: self._v3[can_id] for can_id in can_ids if can_id in self._v3}
         problems: dict[str, None] = {}
         for can_id in sorted(set(can_ids) - set(found)):
-            for sent in range(1, ATTEMPTS + 1):
+            for sent in range(1, COMMANDS + 1):
                 angles = []
                 for message, answer in self._ask(can_id):
                     if answer is None:
