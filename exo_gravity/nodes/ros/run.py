@@ -47,7 +47,10 @@ def keep_to_this_machine() -> None:
 
 
 def open_to_others() -> str:
-    """Return the setting that lets other hosts publish to our topics; '' if none does, or if SROS2 is enforced."""
+    """Return the environment's setting that lets other hosts publish to our topics; '' if none does.
+
+    None does where SROS2 is enforced.
+    """
     get = os.environ.get
     if get("ROS_SECURITY_ENABLE") == "true" and get("ROS_SECURITY_STRATEGY") == "Enforce":
         return ""
@@ -67,8 +70,10 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     priority: 1..20, requests nice value -priority, where permitted. Not SCHED_FIFO: four such nodes can fill a core,
     and Linux then stops them all for 50 ms in every second.
 
-    A node may have `close()`, which is called however the node ends; `failure`, an exception raised in one of its
-    threads; and `needed`: while it is true the node keeps running after its launcher has died.
+    A node may have
+    close(): called however the node ends;
+    failure: an exception raised in one of its threads, or None;
+    needed: while it is true, the node keeps running after its launcher has died.
     """
     keep_to_this_machine()
     ending: list[int] = []
