@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 import time
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from ..support import CONFIG
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
+from .injected import injected
 from .rig import CARRY_LIMIT, NEAR, SIMULATOR, Rig
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -51,17 +51,15 @@ class FailingStepRig(TwoLaunchersRig):
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         super().__init__(folder, shipped_timeouts)
         self.failure = folder / "failure"
+        self._injected = injected(EXO_TEST_FAILURE=str(self.failure))
 
     def start(self) -> None:
-        paths = (str(Path(__file__).with_name("failing_step")), os.environ.get("PYTHONPATH", ""))
-        self._environment = dict(os.environ)
-        os.environ |= {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "EXO_TEST_FAILURE": str(self.failure)}
+        self._injected.__enter__()  # the nodes' processes start later, on the launcher's thread
         super().start()
 
     def close(self) -> None:
         super().close()
-        os.environ.clear()
-        os.environ.update(self._environment)
+        self._injected.__exit__(None, None, None)
 
 
 class CommandedRig(Rig):

@@ -1,23 +1,31 @@
-"""The deliberate defects of `make mutations` match the source that they change."""
+"""The deliberate defects of `make mutations` can be injected into this package, and name rows of the fault matrix."""
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
+import os
+import subprocess
+import sys
 
 import pytest
 
 from ..faults.cases import CASES
-from ..faults.mutations import MUTATIONS, Mutation, apply
-from ..support import ROOT
+from ..faults.injected import injected
+from ..faults.injected.defects import DEFECTS, Defect, find
 
 
-@pytest.mark.parametrize("mutation", MUTATIONS, ids=[mutation.name for mutation in MUTATIONS])
-def test_each_deliberate_defect_can_be_applied_and_has_rows_that_are_meant_to_see_it(
-    mutation: Mutation, tmp_path: Path
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.name)
+def test_each_defect_replaces_something_and_has_rows_that_are_meant_to_see_it(
+    defect: Defect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for edit in mutation.edits:
-        (tmp_path / edit.file).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / edit.file, tmp_path / edit.file)
-    apply(mutation, tmp_path)
-    assert set(mutation.rows) <= {case.name for case in CASES}
+    before = {target: find(target)[2] for target in defect.patches}
+    for owner, name, replacement in tuple(defect.replacements()):
+        monkeypatch.setattr(owner, name, replacement, raising=False)
+    assert all(find(target)[2] is not original for target, original in before.items())
+    assert set(defect.rows) <= {case.name for case in CASES}
+
+
+def test_a_process_that_cannot_have_its_defect_does_not_start() -> None:
+    with injected(EXO_TEST_DEFECT="no such defect"):
+        done = subprocess.run([sys.executable, "-c", "print('runs')"], capture_output=True, text=True)
+    assert done.returncode == 3 and "no defect 'no such defect'" in done.stderr and not done.stdout
+    assert "EXO_TEST_DEFECT" not in os.environ
