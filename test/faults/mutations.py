@@ -1,6 +1,6 @@
 """`make mutations`: does the fault matrix see a defect? Each of these defects must turn a row unsafe.
 
-    python -m test.faults.mutations [--only TEXT ...]
+    python -m test.faults.mutations [--only TEXT ...] [--busy]
 
 The rows that are meant to see a defect are played with nodes that have it (injected/defects.py). The exit code is 1 if
 a defect is not seen.
@@ -19,11 +19,11 @@ from .injected.defects import DEFECTS, Defect
 from .run import run_all
 
 
-def unsafe_rows(defect: Defect, console: Console) -> dict[str, str]:
+def unsafe_rows(defect: Defect, console: Console, shipped_timeouts: bool) -> dict[str, str]:
     """Play the rows of `defect`; return what was unsafe by row. A row that could not run shows nothing."""
     rows = [case for case in CASES if case.name in defect.rows]
     with injected(EXO_TEST_DEFECT=defect.name):
-        results = list(run_all(rows, console))
+        results = list(run_all(rows, console, shipped_timeouts))
     return {row["fault"]: row["unsafe"] for row in results if row["unsafe"] and row["result"] != "not run"}
 
 
@@ -31,12 +31,13 @@ def main() -> int:
     """Try each defect; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m test.faults.mutations", description="Try deliberate defects.")
     parser.add_argument("--only", default=[""], nargs="+", metavar="TEXT", help="only defects whose name contains TEXT")
+    parser.add_argument("--busy", action="store_true", help="for a busy machine: long time-outs, reactions not judged")
     arguments = parser.parse_args()
     console = Console(width=max(120, Console().width))
     unseen = 0
     for defect in DEFECTS:
         if any(text in defect.name for text in arguments.only):
-            rows = unsafe_rows(defect, console)
+            rows = unsafe_rows(defect, console, not arguments.busy)
             seen = "; ".join(f"{row}: {failure}" for row, failure in rows.items())
             unseen += not seen
             missed = f"NOT SEEN by {', '.join(defect.rows)}"

@@ -37,11 +37,22 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core.motors.specs import EXIT
 from exo_gravity.lab.bag.reader import read_bag
 
-from .actions import enable, in_turn, pause, publish, send_signal, states_at, tilt
+from .actions import (
+    END_SILENCE,
+    ERROR,
+    NO_ERROR,
+    SILENCE,
+    enable,
+    foreign_frames,
+    in_turn,
+    pause,
+    publish,
+    send_signal,
+    states_at,
+    tilt,
+)
 from .cases import CONTINUE, EFFORTS, STATES, STOP, TILT
-from .device_faults import END_SILENCE, ERROR, NO_ERROR, SILENCE
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
-from .frames import foreign_frames
 from .live_arm import MINUTE, NODES, STALL, LiveArm, SoakRig
 from .runner import Result, RigPool
 from .stall_clock import StallClock
