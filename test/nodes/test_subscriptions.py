@@ -74,19 +74,14 @@ def spin(executor: SingleThreadedExecutor) -> None:
         executor.spin_once(timeout_sec=0.01)
 
 
-def test_messages_arrive_in_order_on_their_own_thread_without_an_executor(pair):
-    pair.subscription.start()
+@pytest.mark.parametrize("has_thread", [True, False])
+def test_messages_are_passed_on_in_order_with_their_numbers_by_a_thread_or_a_poll(pair, has_thread):
     pair.send("a", "b", "c")
-    pair.wait_until(lambda: len(pair.received) == 3)
-    assert pair.texts() == ["a", "b", "c"]
-    assert {thread for _, _, thread in pair.received} == {pair.topic}
-
-
-def test_a_poll_takes_all_waiting_messages_and_their_sequence_numbers(pair):
-    pair.send("a", "b", "c")
-    pair.wait_until(lambda: len(pair.received) == 3, pair.subscription.poll)
-    assert [number for _, number, _ in pair.received] == [1, 2, 3]
-    assert {thread for _, _, thread in pair.received} == {threading.current_thread().name}
+    if has_thread:
+        pair.subscription.start()
+    pair.wait_until(lambda: len(pair.received) == 3, pause if has_thread else pair.subscription.poll)
+    thread = pair.topic if has_thread else threading.current_thread().name
+    assert pair.received == [("a", 1, thread), ("b", 2, thread), ("c", 3, thread)]
 
 
 def test_a_poll_waits_for_a_message_until_its_timeout(pair):
