@@ -38,7 +38,7 @@ REACH: Steps = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], l
 
 
 def while_wearer(does: str, steps: Steps, after: float, rig: type[Rig] = WornRig, **options: Any) -> FaultCase:
-    """The compensator freezes `after` s after the wearer began his `steps`, with which he goes on."""
+    """The compensator freezes `after` s after the wearer began `steps`, and goes on with them."""
 
     def inject(rig: Rig) -> float:
         wearer(rig, steps)
