@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from ..faults.cases import CASES
-from ..faults.injected import injected
-from ..faults.injected.defects import DEFECTS, Defect, find
+from .cases import CASES
+from .injected import injected
+from .injected.defects import DEFECTS, Defect, find
 
 
 @pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.name)
