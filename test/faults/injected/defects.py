@@ -4,13 +4,14 @@ A defect replaces methods, properties or constants of the running nodes as they 
 behaviour that it breaks. Where the package changes, the targets below follow; one that no longer exists is an error.
 """
 
+import copy
 import importlib
 import math
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def after(change: Callable[..., Any]) -> Callable[[Any], Any]:
 
 def with_arguments(change: Callable[..., Any]) -> Callable[[Any], Any]:
     """Call the method with what `change(*arguments)` returns."""
-    return lambda method: lambda self, *args: method(self, *change(*args))
+    return lambda method: lambda self, *args, **options: method(self, *change(*args), **options)
 
 
 def latching(_: Any) -> property:
@@ -130,6 +131,12 @@ def without_enter(drive: Any, machine: Any, *_: Any) -> Any:
 def replies_with_torque(dt: float, joints: Any, *others: Any) -> Any:
     """Take a reply without torque for none."""
     return dt, [joint if abs(joint.effort) > 0.1 else joint._replace(time=-math.inf) for joint in joints], *others
+
+
+def without_timeout(limits: Any, *others: Any) -> Any:
+    patient = copy.copy(limits)
+    object.__setattr__(patient, "enable_timeout", math.inf)  # which a parameter may not be
+    return patient, *others
 
 
 def once(doubt: Callable[..., None]) -> Callable[..., None]:
@@ -269,7 +276,7 @@ DEFECTS = (
     Defect(
         "an enable never expires",
         ("enabled, and the supply cut for 4 s while checking",),
-        {MACHINE: with_arguments(lambda limits, *others: (replace(limits, enable_timeout=math.inf), *others))},
+        {MACHINE: with_arguments(without_timeout)},
     ),
     Defect(
         "unexplained torque is never a fault",
