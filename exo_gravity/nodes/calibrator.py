@@ -27,7 +27,14 @@ from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers, Repeated, TiltSubscription, crowded
+from exo_gravity.nodes.ros.subscriptions import (
+    NEWEST_ONLY,
+    PeriodicThread,
+    PolledSubscription,
+    Publishers,
+    TiltSubscription,
+    second_publisher,
+)
 
 REPORT_PERIOD = 0.1  # s
 PLAN_PERIOD = 0.05  # s
@@ -53,13 +60,13 @@ class CalibratorNode(Node):
         self._publisher = self.create_publisher(JointState, "effort_commands", 1)
         self._command = JointState(name=self._names)  # one message, reused
         self._lock = threading.Lock()  # guards tilt and state: joint states arrive on another thread
-        self._joint_states = HotPath(self, JointState, "joint_states", self._on_joint_states, NEWEST)
+        self._joint_states = PolledSubscription(self, JointState, "joint_states", self._on_joint_states, NEWEST_ONLY)
         if self._uses_imu:
             self._sources |= TiltSubscription(self, self._tilt, self._lock, self._on_refused_tilt).senders
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_timer(REPORT_PERIOD, self._report)
         # Poses are chosen on a thread of their own: neither joint states nor tilts may wait for it.
-        self._planner = Repeated("plan", self._tour.plan, PLAN_PERIOD)
+        self._planner = PeriodicThread("plan", self._tour.plan, PLAN_PERIOD)
         self._joint_states.start()
         self._planner.start()
 
@@ -77,8 +84,8 @@ class CalibratorNode(Node):
     def _on_joint_states(self, message: JointState, info: dict[str, Any]) -> None:
         self._command.header.stamp = message.header.stamp
         try:
-            self._sources["joint_states"].is_another(info)
-            self._trouble = crowded(self._sources) or self._trouble
+            self._sources["joint_states"].note(info)
+            self._trouble = second_publisher(self._sources) or self._trouble
             effort = self._effort(by_name(message, "position", self._names), by_name(message, "velocity", self._names))
         except ParameterError as error:
             self._trouble, effort = f"joint_states: {error}", None

@@ -28,7 +28,14 @@ from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, Trun
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import DATA, PITCH_YAW, Callback, HotPath, Publishers, Repeated
+from exo_gravity.nodes.ros.subscriptions import (
+    DATA,
+    PITCH_YAW,
+    Callback,
+    PeriodicThread,
+    PolledSubscription,
+    Publishers,
+)
 
 # The fusion integrates every sample. A queue of depth 1 would lose samples whenever the node is delayed.
 DEPTH = 50
@@ -62,7 +69,7 @@ class ImuNode(Node):
         self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
         self._data = self.create_publisher(Imu, DATA, DEPTH)
         self._device = None if values["source"] == "topic" else ImuDevice(self, values, self._topic, self._on_imu)
-        self._samples = self._device or HotPath(
+        self._samples = self._device or PolledSubscription(
             self, Imu, self._topic, self._on_imu, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self.create_timer(WATCH_PERIOD, self._report)
@@ -80,7 +87,7 @@ class ImuNode(Node):
     def _on_imu(self, message: Imu, info: dict[str, Any]) -> None:
         self._arrived = time.monotonic()
         self._received += 1
-        self._driver.is_another(info)
+        self._driver.note(info)
         if self._driver.are_several:  # the estimator starts anew after the gap
             self._refused += 1
             return
@@ -145,7 +152,7 @@ class ImuNode(Node):
             self._diagnostics.report(OK, "publishing", values)
 
 
-class ImuDevice(Repeated):
+class ImuDevice(PeriodicThread):
     """Calls `callback(message, info)` for each sample of a device: on a thread after `start`, or in each `poll`."""
 
     def __init__(

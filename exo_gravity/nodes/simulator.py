@@ -32,7 +32,7 @@ from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.script import IDLE, Step, TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 
-TRUNK_SPEED = 0.5  # rad/s at which the trunk moves to a new tilt
+TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
 
 
 def script_of(path: str) -> TrialScript | None:
@@ -44,10 +44,12 @@ def script_of(path: str) -> TrialScript | None:
 
 
 class Simulator(Node):
-    """The ROS shell around `sim.SimulatedDevice`, which runs in its own thread.
+    """The ROS shell around `sim.SimulatedDevice`, which runs on a thread of its own.
 
-    That thread also publishes, while no motor has a reply to send. Publishing from another thread would hold the
+    That thread also publishes, while no motor has a reply to send. Another thread that publishes would hold the
     interpreter's lock when a command arrives, and a late reply looks like a silent motor.
+
+    failure: the exception that ended the thread, or None; `run` then ends the node.
     """
 
     def __init__(self) -> None:
@@ -55,10 +57,10 @@ class Simulator(Node):
         values = declare(self, SIMULATOR, free_prefix=OPTIONS)
         self._device = device_of(values)
         set_faults(self._device, values)
-        # The script that begins next, and how many s after the motors are on; None for one that is set live: at once.
-        self._next = deque[tuple[TrialScript, float | None]](maxlen=1)
+        # The script that starts next, and how many s after the motors are on; None for one that is set live: at once.
+        self._queued = deque[tuple[TrialScript, float | None]](maxlen=1)
         if script := script_of(values["trial"]):
-            self._next.append((script, values["trial_delay"]))
+            self._queued.append((script, values["trial_delay"]))
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._published_step: int | None = None
         self._diagnostics = Diagnostics(self)
@@ -69,7 +71,7 @@ class Simulator(Node):
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
         accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
-        self.failure: Exception | None = None  # ends the node, see run()
+        self.failure: Exception | None = None
         self._stopping = threading.Event()
         interface, channel, options = bus_of(self, values)
         buses = {name: open_bus(interface, name, own) for name, (_, own) in buses_of(channel, options).items()}
@@ -122,8 +124,8 @@ class Simulator(Node):
     def _follow_wearer(self) -> None:
         """Start the wearer when it is time, and publish each new step."""
         device = self._device
-        while self._next and (self._next[0][1] is None or all(motor.entered for motor in device.motors)):
-            script, delay = self._next.popleft()
+        while self._queued and (self._queued[0][1] is None or all(motor.entered for motor in device.motors)):
+            script, delay = self._queued.popleft()
             device.start(VirtualWearer(script), delay or 0.0)
             self._published_step = None
         number, steps = device.wearer.step, device.wearer.script.steps
@@ -156,7 +158,7 @@ class Simulator(Node):
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         set_faults(self._device, values)
         if "trial" in changed:
-            self._next.append((script or IDLE, None))
+            self._queued.append((script or IDLE, None))
 
 
 def main() -> None:

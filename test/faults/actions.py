@@ -1,4 +1,4 @@
-"""How faults are caused: signals to processes, faults of the simulated device, and foreign messages."""
+"""How faults are caused: signals to processes, faults of the simulated device, foreign messages and frames."""
 
 from __future__ import annotations
 
@@ -8,23 +8,35 @@ import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import can
 import yaml
-from geometry_msgs.msg import Vector3Stamped
+from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS
+
 from ..support.launched_nodes import executable
-from ..support.load import start_spin
+from ..support.load import start_frames, start_spin
 from .fault_case import Action
 from .rig import Rig
 
+Steps = list[dict[str, Any]]
+
 START_LIMIT = 15.0  # s for a process that must refuse its parameters
 FILE_SIZE_LIMIT = 50_000  # bytes
+FRAME_RATE = 3000  # random frames per second; with our own 2,000, as many as five Python processes on two cores receive
+MOTOR_2 = JointMotor(MOTORS["AK80-9"], 2, direction=-1)  # as in sim.yaml
+MOTOR_TURN = 0.698  # rad of joint 2 for one turn of its rotor
+J2 = [False, True, False, False]
+NONE = [False] * 4
 
 
 def in_turn(*actions: Action) -> Action:
@@ -81,6 +93,39 @@ def simulator(**values: Any) -> Action:
     return inject
 
 
+def compensator(values: Mapping[str, Any]) -> Action:
+    """Set parameters of the compensator together."""
+
+    def inject(rig: Rig) -> None:
+        named = {name.replace(".", "__"): value for name, value in values.items()}
+        result = rig.probe.set_parameters("compensator", atomically=True, **named)
+        assert result.successful, result.reason
+
+    return inject
+
+
+def wearer(rig: Rig, steps: Steps) -> None:
+    """Let the wearer do these steps of a trial script from now on."""
+    script = rig.write_script(f"wearer_{time.monotonic_ns()}", steps)
+    result = rig.probe.set_parameters("simulator", trial=str(script))
+    assert result.successful, result.reason
+
+
+def change_message(change: Callable[[JointState], object]) -> Action:
+    """Spoil each message of efforts: of a CommandedRig."""
+    return lambda rig: setattr(rig, "change_message", change)
+
+
+def reported(node: str, key: str, text: str) -> Action:
+    """Check that the node reports what begins with `text`."""
+
+    def check(rig: Rig) -> None:
+        found = rig.probe.diagnostic(node, key) or "nothing"
+        assert found.startswith(text), f"{key}: {found}"
+
+    return check
+
+
 def enable(on: bool) -> Action:
     return lambda rig: rig.probe.enable(on)
 
@@ -116,35 +161,26 @@ def states_at(position: list[float]) -> Callable[[Rig], JointState]:
     return make_message
 
 
-def tilt(pitch: float) -> Callable[[Rig], Vector3Stamped]:
-    def make_message(rig: Rig) -> Vector3Stamped:
-        message = Vector3Stamped()
-        message.header.stamp = rig.probe.node.get_clock().now().to_msg()
-        message.vector.y = pitch
-        return message
+def stamped(rig: Rig, message: Any) -> Any:
+    """Return the message with the present time as its stamp."""
+    message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+    return message
 
-    return make_message
+
+def tilt(pitch: float) -> Callable[[Rig], Vector3Stamped]:
+    return lambda rig: stamped(rig, Vector3Stamped(vector=Vector3(y=pitch)))
 
 
 def raw_imu(rig: Rig) -> Imu:
     """Return a sample of an IMU that lies on its side."""
-    message = Imu()
-    message.header.stamp = rig.probe.node.get_clock().now().to_msg()
+    message: Imu = stamped(rig, Imu(linear_acceleration=Vector3(x=9.8)))
     message.orientation_covariance[0] = -1.0
-    message.linear_acceleration.x = 9.8
     return message
 
 
 def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
     """Return what makes a message of /imu/data with the orientation (x, 0, 0, w)."""
-
-    def make(rig: Rig) -> Imu:
-        message = Imu()
-        message.header.stamp = rig.probe.node.get_clock().now().to_msg()
-        message.orientation.x, message.orientation.w = x, w
-        return message
-
-    return make
+    return lambda rig: stamped(rig, Imu(orientation=Quaternion(x=x, w=w)))
 
 
 def overload_processors(rig: Rig) -> None:
@@ -239,3 +275,41 @@ def record_on_a_full_disk(rig: Rig) -> None:
     time.sleep(4.0)
     recorder.terminate()
     recorder.wait(30.0)
+
+
+def random_frames(count: int, ids: Iterable[int]) -> Action:
+    """Send `count` frames of random content under random `ids`."""
+
+    def inject(rig: Rig) -> None:
+        sender = start_frames(rig.nodes[0].bus, count, FRAME_RATE, ids)
+        rig.probe.wait_until(lambda: sender.poll() is not None, 2 * count / FRAME_RATE + 30.0)
+        assert sender.returncode == 0
+
+    return inject
+
+
+def foreign_frames(data: bytes, rate: float = 1.0, seconds: float = 0.0, frame_id: int = MOTOR_2.command_id) -> Action:
+    """Send `data` to motor 2 as another host would: once, or `rate` a second for `seconds` s."""
+
+    def inject(rig: Rig) -> float:
+        is_extended = bool(frame_id & EXTENDED)
+        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=is_extended)
+        with can.Bus(**rig.nodes[0].bus) as bus:
+            wall, start = time.time(), time.monotonic()
+            for number in range(1 + int(rate * seconds)):
+                time.sleep(max(0.0, start + number / rate - time.monotonic()))
+                bus.send(message)
+        return wall
+
+    return inject
+
+
+# Faults of the simulated device, and what ends them.
+CUT_OFF, CONNECT = simulator(fault__cut_off=J2), simulator(fault__cut_off=NONE)
+# The device counts the time from the moment at which the motor loses its power.
+RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=J2)
+SHORT_RESTART = simulator(fault__unplugged_time=0.015, fault__unplugged=J2)
+RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=NONE)
+SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
+ERROR, NO_ERROR = simulator(fault__error=[0, 5, 0, 0]), simulator(fault__error=[0] * 4)
+JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for error in (MOTOR_TURN, 0.0))

@@ -13,8 +13,22 @@ from sensor_msgs.msg import Imu, JointState
 from exo_gravity.core.motors.specs import EXIT, SET_ZERO
 
 from .actions import (
+    CONNECT,
+    CUT_OFF,
+    END_SILENCE,
+    ERROR,
+    J2,
+    JUMP,
+    MOTOR_2,
+    NO_ERROR,
+    NO_JUMP,
+    RESTART,
+    RESTARTED,
+    SHORT_RESTART,
+    SILENCE,
     deactivate,
     enable,
+    foreign_frames,
     has_refused,
     in_turn,
     kill_bridge_with_frozen_watchdog,
@@ -22,6 +36,7 @@ from .actions import (
     overload_processors,
     pause,
     publish,
+    random_frames,
     raw_imu,
     record_on_a_full_disk,
     send_signal,
@@ -35,29 +50,10 @@ from .actions import (
     tilt,
     trunk_imu,
 )
-from .command_cases import CLOCK, EFFORT_COMMANDS
-from .device_faults import (
-    CONNECT,
-    CUT_OFF,
-    END_SILENCE,
-    ERROR,
-    J2,
-    JUMP,
-    NO_ERROR,
-    NO_JUMP,
-    RESTART,
-    RESTARTED,
-    SHORT_RESTART,
-    SILENCE,
-)
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
-from .frames import MOTOR_2, foreign_frames, random_frames
-from .monitor_cases import MONITOR
-from .operator_cases import OPERATOR
-from .operator_lease_cases import LEASES
-from .outer_loop_cases import OUTER_LOOP
-from .ownership_cases import OWNERSHIP
-from .ride_cases import RIDES
+from .bus_cases import OWNERSHIP, SUPPLY, TWO_BUSES, V3_BOARDS
+from .command_cases import CLOCK, EFFORT_COMMANDS, MONITOR, RIDES
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase
+from .outer_loop_cases import LEASES, OUTER_LOOP
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -72,14 +68,10 @@ from .rigs import (
     WallRig,
     WearerRig,
 )
-from .supply_cases import SUPPLY
-from .two_bus_cases import TWO_BUSES
-from .v3_cases import V3_BOARDS
-from .wearer_cases import ACTIVE_WEARER
+from .wearer_cases import ACTIVE_WEARER, LOAD_CHANGES
 
 STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
 TRUNK_IMU = "/imu/data"
-RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
 HELD = ("active",)
 OFF = ("disabled", "stopped", "inactive")
 KILL, STOP, CONTINUE, TERMINATE, INTERRUPT = (
@@ -254,5 +246,5 @@ ARMS = (
 # fmt: on
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*RIDES, *OWNERSHIP, *LEASES, *OPERATOR, *ACTIVE_WEARER, *SUPPLY, *MONITOR, *TWO_BUSES),
+    *(*RIDES, *OWNERSHIP, *LEASES, *LOAD_CHANGES, *ACTIVE_WEARER, *SUPPLY, *MONITOR, *TWO_BUSES),
 )

@@ -13,6 +13,7 @@ from .rig import Rig
 
 REACTION = 0.10  # s from a fault until damping acts on every motor,
 PROCESS_REACTION = 0.15  # or where another process must first notice that one has died or frozen
+RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its bridge and its watchdog
 
 Action = Callable[[Any], object]  # on a rig of the case's type
 Check = Callable[[np.ndarray], str]  # of the truth records since the fault: returns what is wrong, or ''

@@ -1,9 +1,9 @@
 """Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus.
 
-A wearer may move the arm as fast as he likes. While he touches it, its speed is his. Afterwards only the speed that a
-joint gains is judged: what it exceeds the least that it has had since. `driven` is the part of it that a motor causes,
-from the moment of release on: the largest such speed of a joint in the direction of its motor's torque. A motor that
-brakes causes none. Of the fall of an arm whose hand lets go, the first HAND_OFF s are the wearer's.
+Wearers may move the arm as fast as they like. While they touch it, its speed is theirs. Afterwards only the speed that
+a joint gains is judged: by how much it exceeds the least that it has had since. `driven` is the part of it that a motor
+causes, from the moment of release on: the largest such speed of a joint in the direction of its motor's torque. A motor
+that brakes causes none. When the hand lets go and the arm falls, the first HAND_OFF s are the wearer's.
 """
 
 from __future__ import annotations

@@ -16,12 +16,11 @@ from exo_gravity.core.safety.limits import READING
 
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
+from .actions import Steps, compensator, wearer
 from .judge import measure
-from .monitor_cases import COMPENSATOR
-from .operator_cases import RATED, compensator
-from .rigs import BothArmsRig, WearerRig
+from .rigs import COMPENSATOR, BothArmsRig, WearerRig
 from .stall_clock import StallClock
-from .wearer_cases import HOLD, MOVED, PUSH_DOWN, SHAKE, THROW, Steps, begin
+from .wearer_cases import HOLD, MOVED, PUSH_DOWN, RATED, SHAKE, THROW
 
 MINUTE = 60.0  # s
 STALL = READING.reply_timeout  # s
@@ -74,8 +73,8 @@ class SoakRig(BothArmsRig):
 
 
 CARRIED = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75.0, "robot.mass": COMPENSATOR["robot.mass"], **RATED}
-BACK: Steps = [{"move": list(SoakRig.pose), "over": over} for over in (1.5, 60.0)]  # where the wearer carries his arm
-# As the virtual wearer's 25 Nm permit while the motors do not carry him.
+BACK: Steps = [{"move": list(SoakRig.pose), "over": over} for over in (1.5, 60.0)]  # where the wearer carries their arm
+# As the virtual wearer's 25 Nm permit while the motors do not carry them.
 ACTS: dict[str, Steps] = {
     "lifts": [{"move": [0.0, 1.0, 0.3, 1.0], "over": 1.6}],
     "pushes down": PUSH_DOWN,
@@ -142,7 +141,7 @@ class LiveArm:
         rig.wait(self._dice.uniform(0.5, 5.0))
         act, steps = self._dice.choice(list(ACTS.items()))
         self.last = f"{free}, {act}, {held}"
-        begin(rig, [*steps, *BACK])
+        wearer(rig, [*steps, *BACK])
         self.seen[act] += 1
         meanwhile = self._dice.uniform(0.1, 2.0)
         rig.wait(meanwhile)
@@ -152,7 +151,7 @@ class LiveArm:
         rig.wait(2.0)
         probe = rig.probe
         probe.wait_until(lambda: probe.state != "active" or probe.diagnostic("compensator", "changing load") == "none")
-        begin(rig, [{"hold": 60.0}])
+        wearer(rig, [{"hold": 60.0}])
         rig.wait(1.5)
         if not rig.is_at_pose():
             return [f"not carried where the wearer let go: {np.round(rig.probe.joint_angles(), 2)}"]

@@ -22,6 +22,10 @@ DESCENT = 30.0  # s until the arm must be down
 BEFORE = 0.1  # s before the fault, from which on the torque is known
 LOG_LINES = 20
 
+FIGURES = (
+    *("reaction_ms", "limit_ms", "top_speed_rad_s", "driven_rad_s", "fastest_joint"),
+    *("torque_step_nm", "work_j", "off_s"),
+)
 Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or states why the case failed
 
 
@@ -45,7 +49,8 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
             _wait_until_down(rig)
     outcome = _outcome(rig)
     records = rig.truth.since(fault_time - BEFORE)
-    failures = _failures(case, rig, outcome, records, fault_time)
+    response = _response(case, rig, records, fault_time)
+    failures = _failures(case, rig, outcome, records, fault_time, response)
     if any("Traceback" in line for line in rig.log[first_line:]):
         failures.append("exception")
     if not rig.nodes[0].log:
@@ -55,7 +60,7 @@ def run_case(case: FaultCase, rig: Rig) -> Result:
             case.afterwards(rig)
         except AssertionError as error:
             failures.append(f"afterwards: {str(error).splitlines()[0]}")
-    return _result(case, outcome, _response(case, rig, records, fault_time), failures)
+    return _result(case, outcome, response, failures)
 
 
 def _observe(case: FaultCase, rig: Rig) -> None:
@@ -90,9 +95,11 @@ def _response(case: FaultCase, rig: Rig, records: np.ndarray, fault_time: float)
     return measure(records, fault_time, 1.0 / rig.rate, case.unreached, case.unpowered, case.steps_from)
 
 
-def _failures(case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, fault_time: float) -> list[str]:
+def _failures(
+    case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, fault_time: float, response: Response
+) -> list[str]:
     """Return what was unsafe."""
-    response, carried = _response(case, rig, records, fault_time), outcome in CARRYING
+    carried = outcome in CARRYING
     late = response.reaction is None or (case.limit is not None and response.reaction > case.limit)
     must_react = case.limit is not None and not case.must_stay_off and len(case.unreached) < 4
     failures = {
@@ -110,13 +117,14 @@ def _failures(case: FaultCase, rig: Rig, outcome: str, records: np.ndarray, faul
         f"truth stops for {response.gap:.1f} s": response.gap > MAX_GAP,
     }
     wrong = [failure for failure, failed in failures.items() if failed]
-    if len(records) and case.check(records[records["time"] >= fault_time]):
-        wrong.append(case.check(records[records["time"] >= fault_time]))
+    if len(records) and (problem := case.check(records[records["time"] >= fault_time])):
+        wrong.append(problem)
     if isinstance(rig, BothArmsRig):
         left = rig.left_truth.since(fault_time - BEFORE)
-        if not len(left) or measure(left, fault_time, 1.0 / rig.rate).top_speed > case.speed_limit:
+        other = measure(left, fault_time, 1.0 / rig.rate) if len(left) else Response()
+        if not len(left) or other.top_speed > case.speed_limit:
             wrong.append("left arm too fast")
-        if len(left) and measure(left, fault_time, 1.0 / rig.rate).excess > 0.0:
+        if other.excess > 0.0:
             wrong.append("torque step of the left arm")
     return wrong
 
@@ -141,19 +149,9 @@ def _result(case: FaultCase, outcome: str, response: Response, failures: list[st
 
 def not_run(case: FaultCase, error: BaseException) -> Result:
     """Return the result of a case that could not be run to its end."""
-    figures = (
-        "reaction_ms",
-        "limit_ms",
-        "top_speed_rad_s",
-        "driven_rad_s",
-        "fastest_joint",
-        "torque_step_nm",
-        "work_j",
-        "off_s",
-    )
     reason = (str(error) or type(error).__name__).splitlines()[0]
     unsafe = f"not run: {reason}"
-    return {"fault": case.name, "stage": case.stage, "result": "not run", **dict.fromkeys(figures), "unsafe": unsafe}
+    return {"fault": case.name, "stage": case.stage, "result": "not run", **dict.fromkeys(FIGURES), "unsafe": unsafe}
 
 
 class RigPool:

@@ -5,9 +5,8 @@ import pytest
 
 from exo_gravity.sim.truth import RECORD
 
-from .operator_lease_cases import LEASES
-from .outer_loop import EFFORTS
-from .outer_loop_cases import only_the_assistance_ends
+from .outer_loop_cases import LEASES, only_the_assistance_ends
+from .players import EFFORTS
 
 GRAVITY = (0.1, 3.3, 0.5, 0.2)  # Nm
 

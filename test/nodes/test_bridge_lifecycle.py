@@ -11,8 +11,9 @@ import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.safety import descent
 from exo_gravity.core.safety.drive import NOTHING, EffortCommand, State
-from exo_gravity.hardware.ownership import bus_lock, owned_bus
+from exo_gravity.hardware.ownership import owned_bus
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.nodes.can_bridge import node as can_bridge
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -28,7 +29,8 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
-    monkeypatch.setattr(bus_lock, "ATTEMPT_TIME", 0.1)
+    monkeypatch.setattr(owned_bus, "ATTEMPT_TIME", 0.1)
+    monkeypatch.setattr(descent, "REST_TIME", 0.2)
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     rig = SimulatedRig(friction=0.5, pose=NOTHING)  # more friction than the pushes of the switch-on check
     yield rig

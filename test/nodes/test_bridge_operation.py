@@ -30,10 +30,12 @@ from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from ..hardware.virtual_rig import Carried
 from ..support.waiting import wait_until
 
+NAMES = ("a", "b", "c", "elbow")
+
 
 def carrying(effort, cycles=0):
     """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
-    safety = SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004)
+    safety = SafetyMachine(Limits(NAMES), 0.004)
     safety.state = State.ACTIVE
     samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
     counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
@@ -53,7 +55,7 @@ def sent(node, monkeypatch):
 
     def sent(loop, count, answered=None):
         motors = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
-        arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(("a", "b", "c", "elbow")), 0.004)
+        arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(NAMES), 0.004)
         report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
         for n in range(count):
             report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
@@ -74,8 +76,7 @@ def test_a_motor_that_stays_above_its_rated_torque_is_named_with_load_and_power(
 
 
 def test_a_loop_below_its_rate_is_reported(sent):
-    reports = sent(lambda n: carrying(1.0, 20 * n), 30)
-    assert reports[-1][:2] == (WARN, "active, slower than 225 Hz")
+    assert sent(lambda n: carrying(1.0, 20 * n), 30)[-1][:2] == (WARN, "active, slower than 225 Hz")
 
 
 def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
@@ -108,7 +109,7 @@ def ask(node):
 
 def standing():
     """A control loop whose arm is off and at rest, and which runs a call at once. zeroed: times that zero was set."""
-    loop = SimpleNamespace(safety=SafetyMachine(Limits(("a", "b", "c", "elbow")), 0.004), zeroed=0)
+    loop = SimpleNamespace(safety=SafetyMachine(Limits(NAMES), 0.004), zeroed=0)
     loop.samples = (JointSample(0.0, 0.0, 0.0, 40, 0, math.inf),) * 4
 
     def call(function):
@@ -127,48 +128,38 @@ def standing():
 def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
     loop = standing()
     assert ask("enable", loop, True) == ""
-    assert ask("enable", loop, True) == "refused: the arm is checking"
+    assert ask("enable", loop, True).startswith("refused")
     loop.safety.trip(FaultCode.BUS_ERROR, "unplugged", 1.0)
-    assert ask("enable", loop, True) == "refused: the arm is fault (unplugged)"
-    assert ask("enable", loop, False) == ""
-    assert ask("clear_fault", loop) == ""
-    assert ask("clear_fault", loop) == "no fault to clear: the arm is disabled"
+    assert "unplugged" in ask("enable", loop, True)
+    assert ask("enable", loop, False) == ask("clear_fault", loop) == ""
+    assert ask("clear_fault", loop).startswith("no fault to clear")
     assert ask("enable", None, True) == "the node is not active"
 
 
-def test_one_request_resumes_after_a_fault_that_leaves_nothing_to_repair_or_is_refused_with_the_reason(
-    ask, monkeypatch
-):
+def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
     loop = standing()
-    assert ask("resume", loop) == "refused: the arm is disabled, must be in fault"
+    assert ask("resume", loop) == f"refused: {loop.safety.why_not_resumed}"
     loop.safety.enable(0.0)
-    loop.safety.trip(FaultCode.WATCHDOG_DEAD, "dead", 1.0)
-    assert ask("resume", loop).startswith("refused: watchdog_dead has a cause to look for")
-    loop.safety.clear(1.0)
-    loop.safety.enable(1.0)
     loop.safety.trip(FaultCode.COMMAND_STALE, "late", 1.0)
     assert ask("resume", loop).startswith("refused: zeros are no longer sure")
-    monkeypatch.setattr(SafetyMachine, "why_not_resumed", "")
+    monkeypatch.setattr(SafetyMachine, "why_not_resumed", "")  # as tested with the machine
     assert ask("resume", loop) == ""
     assert (loop.safety.state, loop.safety.fault) == (State.CHECKING, None)
 
 
 def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, monkeypatch):
     loop = standing()
-    assert (
-        ask("set_zero", loop, zero=0.1) == "zero = [0.1, 0.1, 0.1, 0.1]: must be all 0 when the motors store the zero"
-    )
+    assert "must be all 0" in ask("set_zero", loop, zero=0.1)
     assert ask("set_zero", loop) == ""
     loop.safety.enable(0.0)
-    refusal = "refused: the arm is {}; must be disabled and at rest, and all motors reply"
-    assert ask("set_zero", loop) == refusal.format("checking")
+    assert ask("set_zero", loop).startswith("refused: the arm is checking")
     loop.safety.disable(0.0)
     loop.samples = (*loop.samples[:3], loop.samples[3]._replace(time=-math.inf))
-    assert ask("set_zero", loop) == refusal.format("disabled")
+    assert ask("set_zero", loop).startswith("refused: the arm is disabled")
     assert loop.zeroed == 1
     monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
     loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))
-    assert ask("set_zero", loop).endswith("c at 0.000 rad, elbow at 0.500 rad")
+    assert "elbow at 0.500 rad" in ask("set_zero", loop)
 
 
 def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
@@ -182,36 +173,38 @@ def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
     assert not result.successful and "read-only parameter: use_sim_time" in result.reason
 
 
-def test_under_a_clock_that_stands_still_efforts_grow_old(node):
+@pytest.fixture
+def exchange(node):
+    """The bridge's end of the efforts, under a clock that stands still: every stamp is 0."""
     node.set_parameters([Parameter("use_sim_time", value=True)])  # and no /clock
-    limits, loop = Limits(("a", "b", "c", "elbow")), SimpleNamespace()
-    exchange = EffortExchange(node, limits, lambda: loop)
-    compensator = node.create_publisher(JointState, "effort_commands", 1)
-    for now in (100.0, 100.004, 100.3):
-        exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+    return EffortExchange(node, Limits(NAMES), lambda: SimpleNamespace())
+
+
+def await_efforts(exchange, send):
+    """Let `send` answer joint states until the exchange has an answer; return it."""
 
     def answer() -> None:
-        compensator.publish(JointState(name=limits.joint_names, effort=(0.0,) * 4))
-        exchange.get_efforts(time.monotonic() + 0.05)
-
-    wait_until(lambda: exchange.command.answered != -math.inf, answer, seen=lambda: exchange.refusal)
-    assert exchange.command.answered == 100.0
-
-
-@pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])
-def test_the_bridge_knows_efforts_of_a_late_tilt(node, held):
-    node.set_parameters([Parameter("use_sim_time", value=True)])  # every stamp is 0
-    limits, loop = Limits(("a", "b", "c", "elbow")), SimpleNamespace()
-    exchange, compensator = EffortExchange(node, limits, lambda: loop), JointStateInterface(node, limits.joint_names)
-    exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
-
-    def answer() -> None:
-        compensator.send(0.0, JointState(), Answer((0.0, 1.0, 2.0, 3.0), held=held))
+        send()
         exchange.get_efforts(time.monotonic() + 0.05)
 
     wait_until(lambda: exchange.command.effort is not None, answer, seen=lambda: exchange.refusal)
-    command = exchange.command
-    assert (tuple(command.effort), command.damped, command.held) == ((0.0, 1.0, 2.0, 3.0), False, bool(held))
+    return exchange.command
+
+
+def test_under_a_clock_that_stands_still_efforts_grow_old(node, exchange):
+    compensator = node.create_publisher(JointState, "effort_commands", 1)
+    for now in (100.0, 100.004, 100.3):
+        exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+    command = await_efforts(exchange, lambda: compensator.publish(JointState(name=NAMES, effort=(0.0,) * 4)))
+    assert command.answered == 100.0
+
+
+@pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])
+def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
+    compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
+    exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
+    command = await_efforts(exchange, lambda: compensator.send(0.0, JointState(), Answer(effort, held=held)))
+    assert (tuple(command.effort), command.damped, command.held) == (effort, False, bool(held))
 
 
 @pytest.fixture
@@ -237,10 +230,7 @@ def test_an_arm_whose_operator_is_gone_is_let_down_gently(operated):
     assert operated.safety.state is State.ACTIVE
     operated.run(0.5)
     assert operated.safety.state is State.LETTING_DOWN
-    assert operated.safety.fault == (
-        FaultCode.CONTROL_LOST,
-        "anna held control and has not renewed it for 1 s",
-    )
+    assert operated.safety.fault.code is FaultCode.CONTROL_LOST
     operated.arm.assert_let_down()
 
 

@@ -11,7 +11,7 @@ from rclpy.node import Node
 
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.ros import parameters as parameters_module
-from exo_gravity.nodes.ros.parameters import ANSWER_TIMEOUT, NodeParameters
+from exo_gravity.nodes.ros.parameters import RESPONSE_TIMEOUT, NodeParameters
 
 from ..support.waiting import wait_until
 
@@ -58,7 +58,7 @@ def test_a_name_without_services_is_not_present(node):
 
 def test_what_is_read_once_ignores_the_answers_after_the_first(node, executor, monkeypatch):
     other = other_node(node)
-    clock = itertools.count(0.0, ANSWER_TIMEOUT).__next__  # every update asks again
+    clock = itertools.count(0.0, RESPONSE_TIMEOUT).__next__  # every update asks again
     monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
     answers: list[object] = []
 

@@ -28,6 +28,7 @@ from exo_gravity import version
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.recorder.node import LiveLine
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 from ..support.waiting import PATIENCE, wait_until
@@ -135,67 +136,47 @@ def recorded(path, topic):
         return [(stamp, reader.deserialize(data, c.msgtype)) for c, stamp, data in reader.messages(chosen)]
 
 
-def test_ctrl_c_closes_the_recording_and_ends_the_node_with_0(session):
-    path, _, code, _ = session
-    assert code == 0 and (path / "metadata.yaml").exists()
-
-
 @pytest.mark.parametrize("topic", ["/right/joint_states", "/right/effort_commands", "/right/assist_efforts"])
-def test_every_message_of_an_arm_is_in_the_recording(session, topic):
+def test_every_message_of_an_arm_is_recorded_with_its_time_of_arrival(session, topic):
+    path, _, code, _ = session
+    assert code == 0 and (path / "metadata.yaml").exists()  # closed by Ctrl-C
     field = "position" if topic.endswith("states") else "effort"
-    assert [round(getattr(message, field)[0]) for _, message in recorded(session[0], topic)] == list(range(COUNT))
+    messages = recorded(path, topic)
+    assert [round(getattr(message, field)[0]) for _, message in messages] == list(range(COUNT))
+    for stamp, message in messages:
+        assert 0 < stamp - to_nanoseconds(message.header.stamp) < PATIENCE * 10**9
 
 
-def test_every_message_has_its_time_of_arrival(session):
-    for stamp, message in recorded(session[0], "/right/joint_states"):
-        sent = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        assert 0 < stamp - sent < PATIENCE * 10**9
-
-
-def test_a_best_effort_publisher_is_recorded_as_best_effort(session):
+def test_topics_are_recorded_as_they_are_published_and_others_are_not(session):
     with AnyReader([session[0]]) as reader:
         (imu,) = (c for c in reader.connections if c.topic == "/imu/data_raw")
-    assert imu.ext.offered_qos_profiles[0].reliability.name == "BEST_EFFORT" and imu.msgcount > 0
-
-
-def test_a_latched_message_from_before_the_recorder_started_is_recorded(session):
-    ((_, message),) = recorded(session[0], "/right/wearer_step")
-    assert json.loads(message.data)["action"] == "hold"
-
-
-def test_other_topics_are_not_recorded(session):
-    with AnyReader([session[0]]) as reader:
         assert "/right/chatter" not in reader.topics
-
-
-def test_a_type_has_the_hash_that_its_publisher_announces(session):
+    assert imu.ext.offered_qos_profiles[0].reliability.name == "BEST_EFFORT" and imu.msgcount > 0
+    ((_, latched),) = recorded(session[0], "/right/wearer_step")  # from before the recorder started
+    assert json.loads(latched.data)["action"] == "hold"
     metadata = yaml.safe_load((session[0] / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
-    topics = {
-        entry["topic_metadata"]["name"]: entry["topic_metadata"] for entry in metadata["topics_with_message_count"]
-    }
-    assert topics["/right/joint_states"]["type_description_hash"] == str(session[3])
+    topics = [entry["topic_metadata"] for entry in metadata["topics_with_message_count"]]
+    (states,) = (topic for topic in topics if topic["name"] == "/right/joint_states")
+    assert states["type_description_hash"] == str(session[3])  # which its publisher announces
 
 
-def test_the_initial_parameters_are_recorded_as_a_parameter_file(session):
-    parameters = yaml.safe_load(read_bag(session[0]).parameters["/right/bridge"])["/right/bridge"]["ros__parameters"]
-    assert parameters["robot.mass"] == [0.5, 0.6, 0.7, 0.8] and parameters["support"] == 0.0
-
-
-def test_a_parameter_change_is_recorded_as_an_event(session):
-    assert "/right/bridge: support = 0.5" in [event.text for event in read_bag(session[0]).events]
-
-
-def test_the_session_and_the_markers_are_messages_of_the_recording(session):
+def test_parameters_their_changes_session_and_markers_are_recorded(session):
     bag = read_bag(session[0])
+    parameters = yaml.safe_load(bag.parameters["/right/bridge"])["/right/bridge"]["ros__parameters"]
+    assert parameters["robot.mass"] == [0.5, 0.6, 0.7, 0.8] and parameters["support"] == 0.0
+    assert "/right/bridge: support = 0.5" in [event.text for event in bag.events]
     assert bag.session == Session("P01", "pilot", "second: visit", version())
     assert [marker.text for marker in bag.markers] == ["cramp"]
     assert 0.0 < bag.markers[0].time <= bag.recordings[0].time[-1] + 1.0
 
 
-def test_a_name_as_the_subjects_code_ends_the_recorder_with_2(tmp_path):
-    process = start(tmp_path / "bag", "-p", "subject:='Anna Meier'")
+@pytest.mark.parametrize(
+    ("parameters", "named"), [(("output:=bag", "subject:='Anna Meier'"), "must be a code"), ((), "output")]
+)
+def test_a_wrong_parameter_ends_the_recorder_with_2_and_is_named(tmp_path, parameters, named):
+    process = start(None, *(word for parameter in parameters for word in ("-p", parameter)), cwd=tmp_path)
     _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 2 and "must be a code" in errors and not (tmp_path / "bag").exists()
+    assert process.returncode == 2 and named in errors and not list(tmp_path.iterdir())
 
 
 def test_a_live_line_has_joints_step_and_faults(session):
@@ -203,12 +184,6 @@ def test_a_live_line_has_joints_step_and_faults(session):
     assert line["right"]["names"] == NAMES and line["right"]["position"] == [float(COUNT - 1)] * 4
     assert line["right"]["command"] == [float(COUNT - 1)] * 4 and line["right"]["step"]["action"] == "hold"
     assert line["faults"] == ["right/bridge: motor 2 is silent"]
-
-
-def test_without_an_output_the_node_names_the_missing_parameter_and_ends_with_2():
-    process = start(None)
-    _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 2 and "output" in errors
 
 
 def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, tmp_path):

@@ -43,13 +43,15 @@ class Viewer:
         self.close = self._thread.close
         self.sent = {side: self.node.create_publisher(JointState, f"/{side}/joint_states", 1) for side in READINGS}
         self.tilt = self.node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
-        self.description, self.states, self.problem = "", JointState(), ""
+        self.description, self.problem = String(), ""
+        self.states = JointState()
         self.whole: JointState | None = None  # the newest with the joints of both arms
         self.markers: dict[tuple[str, int], Marker] = {}
-        self.node.create_subscription(String, "/robot_description", self._on_description, LATCHED)
-        self.node.create_subscription(JointState, "/joint_states", self._on_states, 1)
-        self.node.create_subscription(MarkerArray, "/robot_model/markers", self._on_markers, 1)
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        subscribe = self.node.create_subscription
+        subscribe(String, "/robot_description", lambda message: setattr(self, "description", message), LATCHED)
+        subscribe(JointState, "/joint_states", self._on_states, 1)
+        subscribe(MarkerArray, "/robot_model/markers", self._on_markers, 1)
+        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.sides = set(READINGS)
         self.node.create_timer(0.05, self._send)
         self._thread.start()
@@ -63,9 +65,6 @@ class Viewer:
         tilt = Vector3Stamped()
         tilt.header.stamp, tilt.vector.y = stamp, 0.5
         self.tilt.publish(tilt)
-
-    def _on_description(self, message):
-        self.description = message.data
 
     def _on_states(self, message):
         self.states = message
@@ -108,7 +107,7 @@ def viewer():
 
 
 def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers(nodes, viewer):
-    viewer.wait_until(lambda: viewer.description == urdf_of(nodes.path) and viewer.whole)
+    viewer.wait_until(lambda: viewer.description.data == urdf_of(nodes.path) and viewer.whole)
     position = dict(zip(viewer.whole.name, viewer.whole.position, strict=True))
     effort = dict(zip(viewer.whole.name, viewer.whole.effort, strict=True))
     for side, theta in READINGS.items():

@@ -11,52 +11,39 @@ from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.nodes.ros.run import handle_signals
 
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
-NAMES = (RANGE, ROS_RANGE, "ROS_LOCALHOST_ONLY", "ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
-LOOPBACK = str(Path(network.__file__).with_name("fastdds.xml"))
+PEERS, PROFILES = "ROS_STATIC_PEERS", "FASTRTPS_DEFAULT_PROFILES_FILE"
+NAMES = (RANGE, ROS_RANGE, PEERS, PROFILES, "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER")
+LOOPBACK, WITH_PEERS = (str(Path(network.__file__).with_name(name)) for name in ("fastdds.xml", "fastdds_peers.xml"))
 SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
 
 
 @pytest.fixture(autouse=True)
 def environment(monkeypatch):
-    for name in (*NAMES, *SECURITY, "FASTRTPS_DEFAULT_PROFILES_FILE"):
+    for name in (*NAMES, *SECURITY):
         monkeypatch.setenv(name, "")  # so that what the test's subject sets goes after the test
         monkeypatch.delenv(name)
     return monkeypatch.setenv
 
 
-@pytest.mark.parametrize("exported", ["", "SUBNET"])
-def test_without_its_own_setting_a_node_communicates_on_this_machine_only(environment, exported):
-    environment(ROS_RANGE, exported)  # SUBNET: as ROS's setup.bash exports it
+@pytest.mark.parametrize(
+    ("settings", "reach", "profile", "named"),
+    [
+        ({}, "LOCALHOST", LOOPBACK, ""),
+        ({ROS_RANGE: "SUBNET"}, "LOCALHOST", LOOPBACK, ""),  # as ROS's setup.bash exports it
+        ({RANGE: "SUBNET"}, "SUBNET", None, "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET"),
+        ({PEERS: "10.0.0.2"}, "LOCALHOST", WITH_PEERS, "ROS_STATIC_PEERS=10.0.0.2"),
+        # as docs/security.md recommends for other programs
+        ({PEERS: "10.0.0.2", PROFILES: LOOPBACK}, "LOCALHOST", WITH_PEERS, "ROS_STATIC_PEERS=10.0.0.2"),
+        ({PEERS: "10.0.0.2", PROFILES: "own.xml"}, "LOCALHOST", "own.xml", "ROS_STATIC_PEERS=10.0.0.2"),
+    ],
+)
+def test_a_node_communicates_on_this_machine_only_unless_a_person_widens_it(
+    environment, settings, reach, profile, named
+):
+    for name, value in settings.items():
+        environment(name, value)
     keep_to_this_machine()
-    assert os.environ[ROS_RANGE] == "LOCALHOST"
-    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
-    assert open_to_others() == ""
-
-
-def test_its_own_setting_admits_other_hosts_and_is_named(environment):
-    environment(RANGE, "SUBNET")
-    keep_to_this_machine()
-    assert os.environ[ROS_RANGE] == "SUBNET"
-    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
-    assert open_to_others() == "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET"
-
-
-@pytest.mark.parametrize("exported", ["", LOOPBACK])
-def test_with_a_named_peer_a_node_does_not_keep_to_the_loopback_interface(environment, exported):
-    environment("ROS_STATIC_PEERS", "10.0.0.2")
-    if exported:  # as docs/security.md recommends for other programs
-        environment("FASTRTPS_DEFAULT_PROFILES_FILE", exported)
-    keep_to_this_machine()
-    assert os.environ[ROS_RANGE] == "LOCALHOST"
-    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds_peers.xml")
-    assert open_to_others() == "ROS_STATIC_PEERS=10.0.0.2"
-
-
-def test_with_a_named_peer_the_users_own_profile_is_kept(environment):
-    environment("ROS_STATIC_PEERS", "10.0.0.2")
-    environment("FASTRTPS_DEFAULT_PROFILES_FILE", "own.xml")
-    keep_to_this_machine()
-    assert os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] == "own.xml"
+    assert (os.environ[ROS_RANGE], os.environ.get(PROFILES), open_to_others()) == (reach, profile, named)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,6 @@ from ..support.ports import free_port
 
 POLICY = CONFIG / "sros2" / "policy.xml"
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
-READS = ("get_parameters", "list_parameters")  # the services by which parameters are read
 NODES = (
     "/imu", "/panel", "/recorder", "/robot_model",
     *(
@@ -38,14 +37,19 @@ NODES = (
         for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
     ),
 )  # fmt: skip
-NOTHING = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
+NO_RULES = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
+
+
+def reads(nodes):
+    """Return the services by which the parameters of these nodes are read."""
+    return {f"{node}/{service}" for node in nodes for service in ("get_parameters", "list_parameters")}
 
 
 def read_policy():
     """Return the policy as {enclave: {'publish': names, 'subscribe': ..., 'reply': ..., 'request': ...}}."""
     policy = {}
     for enclave in ElementTree.parse(POLICY).getroot().iter("enclave"):
-        rules = policy[enclave.get("path")] = {kind: set() for kind in NOTHING}
+        rules = policy[enclave.get("path")] = {kind: set() for kind in NO_RULES}
         for entry in enclave.find("profiles/profile"):
             for kind in entry.attrib:
                 rules[kind] |= {item.text for item in entry}
@@ -55,20 +59,14 @@ def read_policy():
 def graph_of(node, name):
     """Return the same for the running node `name`, as `node` observes it."""
     namespace, _, leaf = name.rpartition("/")
-    queries = (
-        node.get_publisher_names_and_types_by_node,
-        node.get_subscriber_names_and_types_by_node,
-        node.get_service_names_and_types_by_node,
-        node.get_client_names_and_types_by_node,
-    )
+    queries = [
+        getattr(node, f"get_{of}_names_and_types_by_node") for of in ("publisher", "subscriber", "service", "client")
+    ]
     try:
-        found = [
-            {item for item, _ in query(leaf, namespace or "/") if not item.startswith("/observer/")}
-            for query in queries
-        ]
+        found = [{item for item, _ in query(leaf, namespace or "/") if "/observer/" not in item} for query in queries]
     except NodeNameNonExistentError:
-        return NOTHING
-    return dict(zip(NOTHING, found, strict=True))
+        return NO_RULES
+    return dict(zip(NO_RULES, found, strict=True))
 
 
 def parameter_file(folder):
@@ -157,42 +155,23 @@ def session(tmp_path_factory, request):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("kind", ["publish", "subscribe", "reply"])
-def test_a_node_may_do_exactly_what_it_does(session, kind):
-    policy = read_policy()
+def test_a_node_may_do_exactly_what_it_does(session):
+    policy, (found, parameters_read) = read_policy(), session
+    arms = [f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator")]
+    requests = {node: found[node]["request"] for node in NODES if not node.endswith("compensator")}
+    requests["/recorder"] = reads(parameters_read)
     for node in NODES:
-        assert policy[node][kind] == session[0][node][kind], node
-
-
-@pytest.mark.thorough
-def test_these_nodes_call_no_services_of_other_nodes(session):
-    policy = read_policy()
-    for node in NODES:
+        for kind in ("publish", "subscribe", "reply"):
+            assert policy[node][kind] == found[node][kind], (node, kind)
+        assert policy[node]["request"] == requests.get(node, policy[node]["request"]), node
         if node.endswith(("can_bridge", "simulator", "loop", "imu")):
-            assert session[0][node]["request"] == set() == policy[node]["request"], node
+            assert not requests[node], node
+    assert requests["/robot_model"] == reads(arms)
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
 def test_a_compensator_may_read_the_parameters_of_its_own_bridge_for_the_budget(arm):
-    assert read_policy()[f"/{arm}/compensator"]["request"] == {f"/{arm}/can_bridge/{kind}" for kind in READS}
-
-
-@pytest.mark.thorough
-def test_the_recorder_may_call_exactly_the_services_that_it_calls(session):
-    requests = {f"{node}/{service}" for node in session[1] for service in READS}
-    assert read_policy()["/recorder"]["request"] == requests
-
-
-@pytest.mark.thorough
-def test_the_panel_may_call_exactly_the_services_that_it_calls(session):
-    assert read_policy()["/panel"]["request"] == session[0]["/panel"]["request"]
-
-
-@pytest.mark.thorough
-def test_robot_model_may_read_the_parameters_of_the_arms_and_call_nothing_else(session):
-    nodes = [f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator")]
-    requests = {f"{node}/{service}" for node in nodes for service in READS}
-    assert session[0]["/robot_model"]["request"] == requests == read_policy()["/robot_model"]["request"]
+    assert read_policy()[f"/{arm}/compensator"]["request"] == reads([f"/{arm}/can_bridge"])
 
 
 def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():

@@ -1,9 +1,11 @@
-"""All nodes as processes, over real DDS and a real CAN bus: the arm is carried, and is let down gently."""
+"""All nodes as processes, over real DDS and a real CAN bus: the arm is carried, and is let down whoever dies."""
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,11 +14,12 @@ import pytest
 import yaml
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.tools import train_anfis
+from exo_gravity.tools import launcher, train_anfis
 
 from ..support import CONFIG
-from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes
+from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
+from ..support.waiting import wait_until
 
 pytestmark = pytest.mark.real_time
 
@@ -50,9 +53,7 @@ def while_carried(probe: RosProbe, to_pose: Path, observe: Callable[[], Observed
             return observed
 
 
-def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_operator_alone(
-    launch, probe, to_pose, listen
-):
+def test_an_arm_stays_follows_live_changes_and_is_let_down_whichever_node_dies(launch, probe, to_pose, listen):
     # Under its own launcher, the compensator's death does not stop the other nodes.
     nodes = launch(without=("compensator",), timing=CALM)
     compensator = launch(without=("can_bridge", "simulator", "imu"), timing=CALM)
@@ -106,13 +107,35 @@ def test_an_arm_stays_follows_live_changes_and_after_a_fault_is_carried_by_its_o
     probe.wait_until(lambda: probe.state == "disabled")
     probe.get_carried()
 
-    # Ctrl-C to the bridge: the arm is let down, then the motors are switched off, then all nodes stop.
-    probe.joint_states.clear()
-    nodes.process("can_bridge").send_signal(signal.SIGINT)
-    probe.wait_until(lambda: nodes.have_ended)
-    assert nodes.ended_node == ("/right/can_bridge", 0)
-    assert fastest(probe) < 1.0
+    # Without the bridge and its watchdog, the launcher lets the arm down.
+    kill_bridge_and_watchdog(nodes)
+    wait_until(lambda: nodes.have_ended)
+    assert nodes.ended_node == ("/right/can_bridge", -signal.SIGKILL)
+    assert nodes.launcher.maybe_powered == []
+    assert any("the arm is down, its motors are off" in line for line in nodes.log)
     assert listener.motors_are_off()
+
+
+def kill_bridge_and_watchdog(nodes: LaunchedNodes) -> None:
+    bridge = nodes.pid("can_bridge")
+    (watchdog,) = children(bridge)
+    for process in (watchdog, bridge):
+        os.kill(process, signal.SIGKILL)
+
+
+@pytest.mark.thorough
+def test_the_launcher_states_that_motors_may_still_be_powered(launch, probe, monkeypatch):
+    monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", 5.0)
+    monkeypatch.setattr(launcher, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})
+    nodes = launch(without=("imu",), compensator=NO_IMU)
+    probe.wait_until_carried()
+    (watchdog,) = children(nodes.pid("can_bridge"))
+    assert probe.set_parameters("simulator", fault__bus_silent=True).successful
+    nodes.stopping.set()
+    wait_until(lambda: nodes.have_ended)
+    assert nodes.launcher.maybe_powered == ["/right/can_bridge"]
+    with suppress(ProcessLookupError):  # it ended once the launcher had asked for the bus
+        os.kill(watchdog, signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")

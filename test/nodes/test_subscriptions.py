@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message
 from std_msgs.msg import String
 
 from exo_gravity.hardware.network import keep_to_this_machine
-from exo_gravity.nodes.ros.subscriptions import NEWEST, HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY, PolledSubscription, Publishers
 
 from ..support.waiting import pause, wait_until
 
@@ -27,7 +27,7 @@ QUEUE = QoSProfile(depth=8)
 
 
 class Pair:
-    """A publisher and a hot path on a topic of their own.
+    """A publisher and a polled subscription on a topic of their own.
 
     received: (text, sequence number, thread) of each message. error: raised by the callback if set.
     """
@@ -38,7 +38,7 @@ class Pair:
         self.arrivals: list[int] = []  # ns since 1970
         self.error: Exception | None = None
         self.on_message: Callable[[], object] = lambda: None
-        self.hot = HotPath(node, String, self.topic, self._on_message, qos, **options)
+        self.subscription = PolledSubscription(node, String, self.topic, self._on_message, qos, **options)
         self.publisher = node.create_publisher(String, self.topic, 8)
         self.wait_until(lambda: self.publisher.get_subscription_count() == 1)
 
@@ -63,10 +63,10 @@ class Pair:
 
 @pytest.fixture
 def pair(executor) -> Iterator[Pair]:
-    """A publisher and a hot path."""
+    """A publisher and a polled subscription."""
     pair = Pair(executor.get_nodes()[0])
     yield pair
-    pair.hot.stop()
+    pair.subscription.stop()
 
 
 def spin(executor: SingleThreadedExecutor) -> None:
@@ -74,27 +74,22 @@ def spin(executor: SingleThreadedExecutor) -> None:
         executor.spin_once(timeout_sec=0.01)
 
 
-def test_messages_arrive_in_order_on_their_own_thread_without_an_executor(pair):
-    pair.hot.start()
+@pytest.mark.parametrize("has_thread", [True, False])
+def test_messages_are_passed_on_in_order_with_their_numbers_by_a_thread_or_a_poll(pair, has_thread):
     pair.send("a", "b", "c")
-    pair.wait_until(lambda: len(pair.received) == 3)
-    assert pair.texts() == ["a", "b", "c"]
-    assert {thread for _, _, thread in pair.received} == {pair.topic}
-
-
-def test_a_poll_takes_all_waiting_messages_and_their_sequence_numbers(pair):
-    pair.send("a", "b", "c")
-    pair.wait_until(lambda: len(pair.received) == 3, pair.hot.poll)
-    assert [number for _, number, _ in pair.received] == [1, 2, 3]
-    assert {thread for _, _, thread in pair.received} == {threading.current_thread().name}
+    if has_thread:
+        pair.subscription.start()
+    pair.wait_until(lambda: len(pair.received) == 3, pause if has_thread else pair.subscription.poll)
+    thread = pair.topic if has_thread else threading.current_thread().name
+    assert pair.received == [("a", 1, thread), ("b", 2, thread), ("c", 3, thread)]
 
 
 def test_a_poll_waits_for_a_message_until_its_timeout(pair):
-    pair.hot.poll(0.01)
+    pair.subscription.poll(0.01)
     assert pair.received == []
     sender = threading.Timer(0.05, pair.send, "a")
     sender.start()
-    pair.hot.poll(20.0)
+    pair.subscription.poll(20.0)
     assert pair.texts() == ["a"]
     sender.join()
 
@@ -102,31 +97,31 @@ def test_a_poll_waits_for_a_message_until_its_timeout(pair):
 def test_a_poll_ends_although_messages_arrive_faster_than_it_takes_them(pair):
     pair.on_message = lambda: [pair.send("more"), time.sleep(0.01)]
     pair.send("a")
-    pair.wait_until(lambda: pair.received, pair.hot.poll)
+    pair.wait_until(lambda: pair.received, pair.subscription.poll)
     assert pair.texts()[0] == "a" and len(pair.texts()) <= QUEUE.depth
 
 
 def test_of_a_flood_the_thread_takes_the_newest_message_once_in_each_pause(executor):
-    pair = Pair(executor.get_nodes()[0], NEWEST, pause=1.5)  # longer than this process may not be run
-    pair.hot.start()
+    pair = Pair(executor.get_nodes()[0], NEWEST_ONLY, pause=1.5)  # longer than this process may not be run
+    pair.subscription.start()
     pair.send("a")
     pair.wait_until(lambda: pair.received)
     pair.send(*(str(number) for number in range(200)))
     pair.wait_until(lambda: len(pair.received) == 2)
     assert pair.texts() == ["a", "199"]
-    pair.hot.stop()
+    pair.subscription.stop()
 
 
 def test_the_executor_does_not_take_the_messages(pair, executor):
     pair.send("a")
     spin(executor)
     assert pair.received == []
-    pair.wait_until(lambda: pair.received, pair.hot.poll)
+    pair.wait_until(lambda: pair.received, pair.subscription.poll)
 
 
 def test_after_stop_the_callback_is_not_called(pair, executor):
-    pair.hot.start()
-    pair.hot.stop()
+    pair.subscription.start()
+    pair.subscription.stop()
     pair.send("a")
     spin(executor)
     assert pair.received == []
@@ -134,17 +129,17 @@ def test_after_stop_the_callback_is_not_called(pair, executor):
 
 def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(pair):
     pair.error = ValueError("not like that")
-    pair.hot.start()
+    pair.subscription.start()
     pair.send("a", "b")
-    pair.wait_until(lambda: pair.hot.failure)
-    assert pair.hot.failure is pair.error
+    pair.wait_until(lambda: pair.subscription.failure)
+    assert pair.subscription.failure is pair.error
     assert pair.texts() == ["a"]
 
 
 def test_raw_messages_are_passed_on_in_bytes_with_their_time_of_arrival(executor):
     pair = Pair(executor.get_nodes()[0], raw=True)
     pair.send("a", "b")
-    pair.wait_until(lambda: len(pair.received) == 2, pair.hot.poll)
+    pair.wait_until(lambda: len(pair.received) == 2, pair.subscription.poll)
     assert [deserialize_message(data, String).data for data in pair.texts()] == ["a", "b"]
     assert 0 < pair.arrivals[0] <= pair.arrivals[1]
 
@@ -164,11 +159,11 @@ def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of
     numbers, others, missed
 ):
     publishers = Publishers()
-    changes = [publishers.is_another({"publication_sequence_number": number}) for number in numbers]
-    assert [n for n, is_another in enumerate(changes) if is_another] == others
+    changes = [publishers.note({"publication_sequence_number": number}) for number in numbers]
+    assert [n for n, has_changed in enumerate(changes) if has_changed] == others
     assert publishers.missed == missed
 
 
 def test_a_middleware_that_does_not_number_messages_is_refused_with_one_that_does():
     with pytest.raises(RuntimeError, match="rmw_fastrtps_cpp"):
-        Publishers().is_another({"publication_sequence_number": None})
+        Publishers().note({"publication_sequence_number": None})

@@ -22,7 +22,7 @@ from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, F
 from exo_gravity.core.safety.limits import JointSample, Limits
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
-from exo_gravity.nodes.ros.subscriptions import SEVERAL, HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import SHORT_QUEUE, PolledSubscription, Publishers
 
 REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
 Answer = Callable[[JointState], JointState | None]  # efforts for a joint state, of a compensator in this process
@@ -51,7 +51,9 @@ class EffortExchange:
         self._joint_states = JointState(name=list(limits.joint_names))  # one message, reused
         # Not reliable: an old effort sent again is useless, and acknowledging each one wakes a thread in both nodes
         # (measured: 2 % of a core).
-        self._efforts = HotPath(node, JointState, "effort_commands", self._on_efforts, SEVERAL, raw=answer is not None)
+        self._efforts = PolledSubscription(
+            node, JointState, "effort_commands", self._on_efforts, SHORT_QUEUE, raw=answer is not None
+        )
 
     def get_efforts(self, latest: float) -> EffortCommand:
         """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
@@ -82,7 +84,7 @@ class EffortExchange:
         loop = self._get_loop()
         if loop is None:
             return
-        if self._commander.is_another(info):
+        if self._commander.note(info):
             self.refusal = "a second publisher of effort_commands"
             self.command = EffortCommand(None, time.monotonic())  # fails the start gate
             if loop.safety.state in CARRYING:

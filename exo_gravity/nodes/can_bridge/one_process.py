@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.nodes.can_bridge import node
 from exo_gravity.nodes.compensator.node import CompensatorNode
-from exo_gravity.nodes.ros.subscriptions import STOP_CHECK_PERIOD, Repeated
+from exo_gravity.nodes.ros.subscriptions import STOP_CHECK_PERIOD, PeriodicThread
 
 
 class CompensatedBridge(node.CanBridge):
@@ -29,7 +29,7 @@ class CompensatedBridge(node.CanBridge):
         self._compensator = CompensatorNode(context)
         self._its_executor = executor = SingleThreadedExecutor(context=context)
         executor.add_node(self._compensator)
-        self._spinning = Repeated("compensator", lambda: executor.spin_once(STOP_CHECK_PERIOD), 0.0)
+        self._spinning = PeriodicThread("compensator", lambda: executor.spin_once(STOP_CHECK_PERIOD), 0.0)
         self._spinning.start()
         super().__init__(self._compensator.answer)
 

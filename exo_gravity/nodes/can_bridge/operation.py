@@ -26,7 +26,7 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
-from exo_gravity.nodes.ros.subscriptions import HotPath
+from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
@@ -152,7 +152,7 @@ class Operator:
         self._now = clock.monotonic
         self._log = node.get_logger()
         self._news = ""  # for the log, which a flood must not fill
-        self._requests = HotPath(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
+        self._requests = PolledSubscription(node, KeyValue, "~/control", self._on_request, QoSProfile(depth=REQUESTS))
         node.create_timer(WATCH_PERIOD, self.watch)
 
     def watch(self) -> None:

@@ -27,7 +27,7 @@ from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare
-from exo_gravity.nodes.ros.subscriptions import LATCHED, Repeated
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 TICK = 0.01  # s between two messages of a fade
@@ -150,7 +150,7 @@ class JointStateInterface:
         return self._command
 
 
-class MultiArrayInterface(Repeated):
+class MultiArrayInterface(PeriodicThread):
     """Sends Float64MultiArray in the order of `names`; fades to zero when there are no fresh, sound efforts.
 
     It watches the age of the joint states itself, on its own thread, because the receiver does not (`CommandFade`).

@@ -31,13 +31,13 @@ from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, 
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
-    NEWEST,
-    SEVERAL,
-    HotPath,
+    NEWEST_ONLY,
+    SHORT_QUEUE,
+    PeriodicThread,
+    PolledSubscription,
     Publishers,
-    Repeated,
     TiltSubscription,
-    crowded,
+    second_publisher,
 )
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
@@ -68,7 +68,7 @@ class CompensatorNode(Node):
         self._budget: BudgetWatch | None = None
         self._wearer: WearerWatch | None = None
         self._weighing: Weighing | None = None
-        self._threads: list[Repeated] = []
+        self._threads: list[PeriodicThread] = []
         if self._control.terms:
             self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
@@ -83,8 +83,8 @@ class CompensatorNode(Node):
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
-        quality = SEVERAL if is_called else NEWEST
-        self._joint_states = HotPath(self, JointState, topic, self._on_joint_states, quality, raw=is_called)
+        quality = SHORT_QUEUE if is_called else NEWEST_ONLY
+        self._joint_states = PolledSubscription(self, JointState, topic, self._on_joint_states, quality, raw=is_called)
         self._threads.append(self._joint_states)
         if values["use_imu"]:
             tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
@@ -104,7 +104,7 @@ class CompensatorNode(Node):
         self._budget = BudgetWatch(self, self._names)
         self._assist = terms.assist
         self._assistant = Publishers()
-        path = HotPath(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
+        path = PolledSubscription(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
         self._wearer = WearerWatch(self, self._names, self._control, self._lock)
         self._threads += [path, self._wearer]
         self.create_service(Trigger, "~/weigh", self._weigh)
@@ -146,7 +146,7 @@ class CompensatorNode(Node):
         return None
 
     def _on_joint_states(self, message: JointState | bytes, info: dict[str, Any]) -> None:
-        self._source.is_another(info)
+        self._source.note(info)
         if not isinstance(message, bytes):
             self._answer_to(message)
 
@@ -162,7 +162,7 @@ class CompensatorNode(Node):
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
             answer = Answer(None, self._refused(self._interface.topic, error))
-        if problem := crowded(self._sources):
+        if problem := second_publisher(self._sources):
             answer = Answer(None, problem)
         efforts = self._interface.send(now, message, answer)
         if self._wearer:
@@ -180,7 +180,7 @@ class CompensatorNode(Node):
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now = time.monotonic()
         age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
-        is_another = self._assistant.is_another(info)
+        is_another = self._assistant.note(info)
         with self._lock:
             self._assist.receive(now, message.name, message.effort, now - age, is_another)
 

@@ -32,7 +32,7 @@ from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.momentum import COVER, ContactWatch, MomentumObserver, WearerEstimate
 from exo_gravity.nodes.ros.messages import by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters
-from exo_gravity.nodes.ros.subscriptions import Repeated
+from exo_gravity.nodes.ros.subscriptions import PeriodicThread
 
 PERIOD = 0.01  # s
 FRESH = 0.1  # s, age of the trunk's motion that is used
@@ -44,7 +44,7 @@ Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (4,) kg 
 Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
 
 
-class WearerWatch(Repeated):
+class WearerWatch(PeriodicThread):
     """Publishes `wearer_efforts` and `wearer_efforts_std` for each new sample, 100 times a second, on its own thread.
 
     newest: time in monotonic s and message of the joints; felt: the same of a sample of the trunk's motion: specific

@@ -36,7 +36,7 @@ from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, HotPath, Publishers
+from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, PolledSubscription, Publishers
 
 TYPES = {  # of each topic that is recorded, or of its last part in an arm's namespace
     STATES: JointState, content.COMMANDS: JointState, content.ASSIST: JointState, content.STEPS: String,
@@ -81,7 +81,7 @@ class Recorder(Node):
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._losses = ""  # what was reported of them
-        self._topics: dict[str, HotPath] = {}
+        self._topics: dict[str, PolledSubscription] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
         self._nodes = OtherNodes(self, on_read=partial(self._guarded, "parameters", self._write_parameters), once=True)
@@ -175,7 +175,9 @@ class Recorder(Node):
         self._writer.add_topic(topic, typed[0].topic_type, offered_qos(reliable, latched, offered[0].depth or 1))
         publishers = Publishers()
         self._counted += [publishers] if msgtype in (JointState, Imu, Vector3Stamped) else []
-        self._topics[topic] = HotPath(self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True)
+        self._topics[topic] = PolledSubscription(
+            self, msgtype, topic, partial(self._on_message, topic, publishers), qos, raw=True
+        )
 
     def _on_message(self, topic: str, publishers: Publishers, data: bytes, info: dict[str, Any]) -> None:
         self._taken.append((topic, info["received_timestamp"], bytes(data)))
@@ -183,7 +185,7 @@ class Recorder(Node):
             self._last_states = time.monotonic()
         if self._live:
             self._live.note(topic, data)
-        publishers.is_another(info)
+        publishers.note(info)
 
     def _write_parameters(self, node: str, values: dict[str, Any]) -> None:
         # ROS's parameter files have no empty lists.

@@ -1,7 +1,11 @@
 """ROS messages <-> plain values: stamps, joints by name and never by index, and a node's status on /diagnostics.
 
-Levels of a status: OK works, WARN works within a limit or waits, ERROR does not work, STALE had input that no longer
-arrives.
+Levels of a status:
+
+    OK     works
+    WARN   works within a limit, or waits
+    ERROR  does not work
+    STALE  had input that no longer arrives
 """
 
 import math
@@ -20,7 +24,7 @@ OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level) for level in ("OK", "
 HELD_BY, NOBODY = "control held by", "nobody"  # key in can_bridge's status; value without an operator
 LATE_TILT = "late tilt"  # frame_id of efforts that are computed from one
 
-PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
+REPEAT_PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter
 
 
 def to_nanoseconds(stamp: Time) -> int:
@@ -31,8 +35,11 @@ def to_nanoseconds(stamp: Time) -> int:
 def by_name(message: JointState, field: str, names: Sequence[str], exact: bool = True) -> tuple[float, ...]:
     """Return `message`'s position, velocity or effort (n,) in the order of `names`.
 
-    Raises ParameterError unless the message has these names, each once, and one finite value for each; if `exact`, also
-    if it has others. An absent joint is an error, never 0.
+    field: 'position', 'velocity' or 'effort'.
+    exact: whether the message may have no other joints.
+
+    Raises ParameterError unless the message has these names, each once, and one finite value for each: an absent joint
+    is an error, never 0.
     """
     values, given = getattr(message, field), message.name
     if len(values) != len(given):
@@ -66,9 +73,14 @@ class Diagnostics:
         self._sent = -math.inf
 
     def report(self, level: bytes, message: str, values: Mapping[str, object] | None = None) -> None:
-        """Publish `level`, one of the four, `message` and `values` if they are due; log them if they changed."""
+        """Publish a status if it is due; log its level and message if they changed.
+
+        level: OK, WARN, ERROR or STALE.
+        message: for people.
+        values: for programs, by key.
+        """
         now, changed = time.monotonic(), (level, message) != self._last
-        if not changed and now - self._sent < PERIOD:
+        if not changed and now - self._sent < REPEAT_PERIOD:
             return
         self._sent = now
         status = DiagnosticStatus(

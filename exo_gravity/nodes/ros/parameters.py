@@ -17,15 +17,16 @@ from exo_gravity.core.params import Param, values_of
 
 T = TypeVar("T")
 
-ANSWER_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
+RESPONSE_TIMEOUT = 5.0  # s after which a request to a node that has died is repeated
 
 
 def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[str, Any]:
     """Declare the table's parameters on `node` and return their values by name.
 
-    The node must have been created with `automatically_declare_parameters_from_overrides=True`. Names that start with
-    `free_prefix` are left as given. Raises ParameterError for an impossible value, and for a name that is not in the
-    table.
+    node: created with `automatically_declare_parameters_from_overrides=True`.
+    free_prefix: names that start with it are left as given; '' for none.
+
+    Raises ParameterError for an impossible value, and for a name that is not in the table.
     """
     given = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
     values = values_of(table, given, free_prefix)
@@ -33,11 +34,11 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
         if node.has_parameter(param.name):
             node.undeclare_parameter(param.name)
         node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
-    _accept_what_is(node)
+    _accept_unchanged(node)
     return values
 
 
-def _accept_what_is(node: Node) -> None:
+def _accept_unchanged(node: Node) -> None:
     """Let a read-only parameter be set to the value that it has, so that `ros2 param load` reads a node's own dump."""
     set_parameters = node.set_parameters_atomically
 
@@ -56,7 +57,11 @@ def _accept_what_is(node: Node) -> None:
 def accept_changes(
     node: Node, table: Sequence[Param], read: Callable[[dict[str, Any]], T], apply: Callable[[T, set[str]], object]
 ) -> None:
-    """Call `apply(read(values), names set)` after each change of the table; a ParameterError of `read` refuses it."""
+    """Let the table's parameters be changed live.
+
+    read(values): what `apply` needs of all values by name; its ParameterError refuses the change.
+    apply(what `read` returned, names): called after a change of the parameters `names`.
+    """
     accepted: list[T] = []
 
     def check(changes: list[Parameter]) -> SetParametersResult:
@@ -73,7 +78,7 @@ def accept_changes(
 
 
 def bus_of(node: Node, values: dict[str, Any]) -> tuple[str, str, dict[str, Any]]:
-    """Return python-can's interface, the channel or channels, and the options that the node's parameters name."""
+    """Return python-can's interface, the channel or channels, and the options that the node's parameters give."""
     options = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix(OPTIONS).items()}
     return values["can.interface"], values["can.channel"], options
 
@@ -101,10 +106,14 @@ def plain(value: Any) -> Any:
 
 
 class NodeParameters:
-    """The parameters of another node, in `values` once they are known.
+    """The parameters of another node, read over its services.
 
-    name: its full name, or its name in `node`'s namespace. on_read: called with name and `values` on the executor's
-    thread each time that they were read. once: they are read once, and the executor then has no clients to wait for.
+    name: its full name, or its name in `node`'s namespace.
+    on_read(name, values): called on the executor's thread each time that they were read.
+    once: whether they are read only once; the executor then no longer waits for the clients.
+
+    values: by name; {} until they are known.
+    is_present: whether the node has its services. One that has died can stay in ROS's list of names.
     """
 
     def __init__(
@@ -115,7 +124,7 @@ class NodeParameters:
         once: bool = False,
     ) -> None:
         self.values: dict[str, Any] = {}
-        self.is_present = False  #: whether it has its services; a node that has died can stay in ROS's list of names
+        self.is_present = False
         self._node, self._name = node, name
         self._on_read, self._once = on_read, once
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
@@ -136,7 +145,7 @@ class NodeParameters:
         if not self.is_present:
             self._due = -math.inf  # it may return with other values
         elif now >= self._due:
-            self._due = now + ANSWER_TIMEOUT
+            self._due = now + RESPONSE_TIMEOUT
             self._list.call_async(ListParameters.Request()).add_done_callback(self._on_names)
 
     def _on_names(self, listed: Future) -> None:
@@ -160,9 +169,12 @@ class NodeParameters:
 
 
 class OtherNodes:
-    """The other nodes that were found, in `found` by full name, with their parameters.
+    """The other nodes in this ROS domain, with their parameters.
 
-    leaves: last parts of the names that are looked for; () for all. A node that has ended stays in `found`.
+    leaves: the last parts of the names that are looked for; () for all.
+    options: of each NodeParameters.
+
+    found: the nodes by full name; one that has ended stays.
     """
 
     def __init__(self, node: Node, leaves: Collection[str] = (), **options: Any) -> None:

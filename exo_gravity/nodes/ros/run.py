@@ -35,8 +35,10 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     priority: 1..20, requests nice value -priority, where permitted. Not SCHED_FIFO: four such nodes can fill a core,
     and Linux then stops them all for 50 ms in every second.
 
-    A node may have `close()`, which is called however the node ends; `failure`, an exception raised in one of its
-    threads; and `needed`: while it is true the node keeps running after its launcher has died.
+    A node may have
+    close(): called however the node ends;
+    failure: an exception raised in one of its threads, or None;
+    needed: while it is true, the node keeps running after its launcher has died.
     """
     keep_to_this_machine()
     ending: list[int] = []

@@ -2,8 +2,8 @@
 
 rclpy's executor rebuilds its wait set, services included, for every message. That is most of a message's cost
 (measured, there and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 % here; at 2,000 messages a second it is most
-of a core). A flood is shed before Python sees it: the middleware keeps `qos.depth` messages, and a thread rests for
-`pause` between two looks. `WaitSet` and `take_message` are inner interfaces of rclpy, which `wait_for_message` uses.
+of a core). A flood is shed before Python sees it: the middleware keeps `qos.depth` messages, and a thread sleeps for
+`pause` between two polls. `WaitSet` and `take_message` are internal to rclpy; its `wait_for_message` uses them, too.
 """
 
 import math
@@ -26,32 +26,35 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import NO_ROTATION, NOT_REPORTED, TiltInput
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-# For who reads between other work: the depth lets it notice a second publisher.
-SEVERAL = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
+NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+# For a reader that polls between other work: a deeper queue lets it notice a second publisher.
+SHORT_QUEUE = QoSProfile(depth=8, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # reliable
 STOP_CHECK_PERIOD = 0.1  # s
-PAUSE = 0.0004  # s, less than the shortest period of a control loop
+POLL_PAUSE = 0.0004  # s, less than the shortest period of a control loop
 MAX_PUBLISHERS = 4  # publishers of one topic that a node can distinguish
-DISTRUST = 0.2  # s for which a topic is not trusted after a second publisher was seen
+DISTRUST_TIME = 0.2  # s for which a topic is not trusted after a second publisher was seen
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 
 Callback = Callable[[Any, dict[str, Any]], None]
 
 
-class Unexecuted(ReentrantCallbackGroup):
+class OutsideExecutor(ReentrantCallbackGroup):
     """Keeps its subscriptions out of the executor's wait set."""
 
     def can_execute(self, entity: Any) -> bool:
-        """Return that no entity may be executed."""
+        """Return False: the executor handles none of them."""
         return False
 
 
-class Repeated:
-    """Calls `function` on a thread after `start`, with a rest of `pause` s after each call."""
+class PeriodicThread:
+    """A thread that calls `function` again and again after `start`, and sleeps for `pause` s after each call.
+
+    failure: the exception of `function` that ended the thread, or None.
+    """
 
     def __init__(self, name: str, function: Callable[[], None], pause: float) -> None:
-        self.failure: Exception | None = None  #: raised by the function; ends the thread
+        self.failure: Exception | None = None
         self._function, self._pause = function, pause
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -75,11 +78,11 @@ class Repeated:
             self.failure = error
 
 
-class HotPath(Repeated):
+class PolledSubscription(PeriodicThread):
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`.
 
-    pause: s for which the thread rests after each look; of what arrives meanwhile, it gets the last `qos.depth`. raw:
-    whether the messages are passed on as bytes.
+    pause: s for which the thread sleeps after each poll; of what arrives meanwhile it gets the last `qos.depth`.
+    raw: whether the callback gets the messages as bytes.
     """
 
     def __init__(
@@ -88,21 +91,21 @@ class HotPath(Repeated):
         msgtype: type,
         topic: str,
         callback: Callback,
-        qos: QoSProfile = NEWEST,
-        pause: float = PAUSE,
+        qos: QoSProfile = NEWEST_ONLY,
+        pause: float = POLL_PAUSE,
         raw: bool = False,
     ) -> None:
         super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
         self._callback, self._depth = callback, qos.depth
         self._subscription = node.create_subscription(
-            msgtype, topic, callback, qos, callback_group=Unexecuted(), raw=raw
+            msgtype, topic, callback, qos, callback_group=OutsideExecutor(), raw=raw
         )
         self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
 
-        It ends after as many as the queue holds, however many arrive meanwhile.
+        At most as many messages as the queue holds are taken, however many arrive meanwhile.
         """
         handle, msgtype, raw = self._subscription.handle, self._subscription.msg_type, self._subscription.raw
         if timeout > 0.0:
@@ -118,17 +121,17 @@ class HotPath(Repeated):
 
 
 class Latest:
-    """The newest message of `topic`, or what `use` makes of it. The topic is looked at only in `within`."""
+    """The newest message of `topic`, or what `use` makes of it. The topic is polled only in `within`."""
 
     def __init__(
         self, node: Node, msgtype: type, topic: str, use: Callable[[Any], Any] = lambda message: message
     ) -> None:
         self._use, self._content, self._arrived = use, None, -math.inf
-        self._path = HotPath(node, msgtype, topic, self._on_message)
+        self._subscription = PolledSubscription(node, msgtype, topic, self._on_message)
 
     def within(self, timeout: float) -> Any:
         """Return it; None if it is older than `timeout` s."""
-        self._path.poll()
+        self._subscription.poll()
         return self._content if time.monotonic() - self._arrived < timeout else None
 
     def _on_message(self, message: Any, _info: dict[str, Any]) -> None:
@@ -136,10 +139,11 @@ class Latest:
 
 
 class Publishers:
-    """The publishers of one topic. Each numbers its messages from 1, and rclpy passes the numbers on.
+    """Tells the publishers of one topic apart. Each numbers its messages from 1, and rclpy passes the numbers on.
 
-    So a second publisher shows at once, without discovery, which still lists a killed publisher for 20 s. missed:
-    messages that were published and not received.
+    So a second publisher shows at once. Discovery would still list a killed publisher for 20 s.
+
+    missed: how many messages were published and not received.
     """
 
     def __init__(self) -> None:
@@ -147,10 +151,14 @@ class Publishers:
         self._newest: deque[int] = deque(maxlen=MAX_PUBLISHERS)  # number of each publisher's last message
         self._changed = -math.inf  # monotonic s
 
-    def is_another(self, info: dict[str, Any]) -> bool:
-        """Return whether this message comes from a different publisher than the previous one: its number is no higher.
+    def note(self, info: dict[str, Any]) -> bool:
+        """Note a message; return whether its publisher is not that of the message before: its number is no higher.
 
-        It continues the nearest lower number, or is the first of a new publisher.
+        A message continues the nearest lower number, or is the first of a new publisher.
+
+        info: of the message, as rclpy passes it to a callback.
+
+        Raises RuntimeError if the middleware does not number messages.
         """
         number = info["publication_sequence_number"]
         if number is None:
@@ -160,28 +168,30 @@ class Publishers:
             self.missed += number - previous - 1
             self._newest.remove(previous)
         self._newest.append(number)
-        if is_another := bool(number <= last):
+        if has_changed := bool(number <= last):
             self._changed = time.monotonic()
-        return is_another
+        return has_changed
 
     @property
     def are_several(self) -> bool:
-        """Whether a message came from another publisher than the one before, within DISTRUST s."""
-        return time.monotonic() - self._changed < DISTRUST
+        """Whether, within DISTRUST_TIME, a message came from another publisher than the one before."""
+        return time.monotonic() - self._changed < DISTRUST_TIME
 
 
-def crowded(sources: Mapping[str, Publishers]) -> str:
-    """Return the sentence that a topic of `sources` has more than one publisher, '' if none has."""
+def second_publisher(sources: Mapping[str, Publishers]) -> str:
+    """Return which topic of `sources` has more than one publisher, as a sentence; '' if none has."""
     topics = [topic for topic, publishers in sources.items() if publishers.are_several]
     return f"more than one publisher of {topics[-1]}" if topics else ""
 
 
 class TiltSubscription:
-    """Passes the trunk's tilt on to `target`, under `lock`: `/imu/data`, and `/imu/pitch_yaw` of who sends that alone.
+    """Passes the trunk's tilt on to `target`: from `/imu/data`, or from `/imu/pitch_yaw` where only that is published.
 
-    on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_motion(now, specific force (3,)
-    m/s^2, angular velocity (3,) rad/s, age in s): a sample of the trunk's motion, in its axes, under `lock` too.
-    on_tilt(now): `target` has a message of `now`, in s. senders: the publishers by topic.
+    lock: held while `target`, on_motion and on_tilt are called.
+    on_refusal(topic, error): a message is impossible; the last tilt then grows old.
+    on_motion(now, force, rate, age): the trunk's motion, in its axes: s, m/s^2 (3,), rad/s (3,), s.
+    on_tilt(now): `target` has a message of `now`, s.
+    senders: the publishers by topic.
     """
 
     def __init__(
@@ -196,8 +206,8 @@ class TiltSubscription:
         self._node, self._target, self._lock = node, target, lock
         self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
         self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
-        node.create_subscription(Imu, DATA, self._on_data, NEWEST)
-        node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
+        node.create_subscription(Imu, DATA, self._on_data, NEWEST_ONLY)
+        node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST_ONLY)
 
     def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
         if message.orientation_covariance[0] == NOT_REPORTED:
@@ -221,7 +231,7 @@ class TiltSubscription:
 
     def _pass_on(self, topic: str, stamp: Time, info: dict[str, Any], use: Callable[[float, float], None]) -> None:
         """Call `use` with the present monotonic time in s, and the age of the stamp in s by the node's clock."""
-        self.senders[topic].is_another(info)
+        self.senders[topic].note(info)
         age = (self._node.get_clock().now().nanoseconds - to_nanoseconds(stamp)) * 1e-9
         try:
             with self._lock:

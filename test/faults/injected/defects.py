@@ -1,0 +1,314 @@
+"""Deliberate defects, each of which must turn a row of the fault matrix unsafe.
+
+A defect replaces methods, properties or constants of the running nodes as they start (sitecustomize.py). It names the
+behaviour that it breaks. Where the package changes, the targets below follow; one that no longer exists is an error.
+"""
+
+import copy
+import importlib
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
+TRUSTED = "core.safety.machine:SafetyMachine._is_trusted"  # zeros and signs
+ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDescent", "JointDescent.__init__"))
+DESCENT_GROWTH, DESCENT_DRIVEN = (f"core.safety.descent:{name}" for name in ("BRAKE_GROWTH", "DRIVEN_SPEED"))
+DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
+SUPPLY = "core.safety.monitors:SupplyMonitor.doubt"
+RIDE, RIDING = (f"core.safety.monitors:RideThrough.{name}" for name in ("step", "is_riding"))
+MONITOR, PATIENCE = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:PATIENCE"
+SHAPE = "core.safety.limits:Limits.shape"
+LEASE = "core.safety.lease:Lease.lost"
+COMPENSATOR = "core.compensation.compensator:Compensator.step"
+GUIDANCE = "core.compensation.guidance:GuidedChange.step"
+ASSIST_VALID, ASSIST = (f"core.compensation.terms.assist:AssistInput.{name}" for name in ("valid", "torque"))
+ASSIST_MEMORY = "_torque"  # of an AssistInput
+LOCK = "hardware.ownership.bus_lock:NAME"
+LISTEN = "hardware.can.motor_bus:MotorBus.listen"
+LET_DOWN = "hardware.ownership.owned_bus:let_down"
+PUBLISHERS = "nodes.ros.subscriptions:Publishers.note"
+WATCHDOG = "exo_gravity.hardware.ownership.watchdog"  # the module that the watchdog's process runs
+
+
+def find(target: str) -> tuple[Any, str, Any]:
+    """Return the module or class of a target, the attribute's name, and what it is; None for one of its instances'.
+
+    Raises AttributeError if there is none.
+    """
+    module, _, path = target.partition(":")
+    owner, (*parts, name) = importlib.import_module(f"exo_gravity.{module}"), path.split(".")
+    for part in parts:
+        owner = getattr(owner, part)
+    if not hasattr(owner, name) and parts and name in vars(owner)["__init__"].__code__.co_names:
+        return owner, name, None
+    return owner, name, getattr(owner, name)
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A defect, and the names of the rows of which at least one must see it.
+
+    patches: what replaces each target; called with what it replaces.
+    process: only a process whose command line has this text has the defect; '' for every one.
+    """
+
+    name: str
+    rows: tuple[str, ...]
+    patches: dict[str, Callable[[Any], Any]]
+    process: str = ""
+
+    def replacements(self) -> Iterator[tuple[Any, str, Any]]:
+        """Yield owner, name and replacement of each target. Raises AttributeError."""
+        for target, make in self.patches.items():
+            owner, name, original = find(target)
+            yield owner, name, make(original)
+
+    def inject(self) -> None:
+        """Inject the defect into this process, if it is one that is to have it. Raises AttributeError."""
+        if self.process in " ".join(sys.orig_argv):
+            for owner, name, replacement in tuple(self.replacements()):
+                setattr(owner, name, replacement)
+
+
+def returns(result: Any) -> Callable[[Any], Any]:
+    """Do nothing, and return `result`."""
+    return lambda _: lambda *args, **options: result
+
+
+def becomes(value: Any) -> Callable[[Any], Any]:
+    """Have this value."""
+    return lambda _: value
+
+
+def always(value: Any) -> Callable[[Any], Any]:
+    """Be an attribute that has this value, whatever is assigned."""
+    return lambda _: property(lambda self: value, lambda self, assigned: None)
+
+
+def after(change: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Return `change(result, self, *arguments)` in place of the method's result."""
+    return lambda method: lambda self, *args, **options: change(method(self, *args, **options), self, *args)
+
+
+def with_arguments(change: Callable[..., Any]) -> Callable[[Any], Any]:
+    """Call the method with what `change(*arguments)` returns."""
+    return lambda method: lambda self, *args, **options: method(self, *change(*args), **options)
+
+
+def latching(_: Any) -> property:
+    """Be an attribute that stays true once it is."""
+
+    def assign(self: Any, value: bool) -> None:
+        self.__dict__["latched"] = self.__dict__.get("latched", False) or value
+
+    return property(lambda self: self.__dict__["latched"], assign)
+
+
+def first_joint_only(applied: property) -> property:
+    """Damp no other joint."""
+
+    def damped(self: Any) -> Any:
+        effort, (damping, *others) = applied.fget(self)  # type: ignore[misc]
+        return effort, (damping, *[0.0] * len(others))
+
+    return property(damped)
+
+
+def off_after_a_fault(drive: Any, machine: Any, *_: Any) -> Any:
+    return drive._replace(powered=False) if machine.state == "letting down" and machine.fault else drive
+
+
+def without_enter(drive: Any, machine: Any, *_: Any) -> Any:
+    return drive._replace(enter=[False] * len(drive.effort)) if machine.state == "letting down" else drive
+
+
+def replies_with_torque(dt: float, joints: Any, *others: Any) -> Any:
+    """Take a reply without torque for none."""
+    return dt, [joint if abs(joint.effort) > 0.1 else joint._replace(time=-math.inf) for joint in joints], *others
+
+
+def without_timeout(limits: Any, *others: Any) -> Any:
+    patient = copy.copy(limits)
+    object.__setattr__(patient, "enable_timeout", math.inf)  # which a parameter may not be
+    return patient, *others
+
+
+def once(doubt: Callable[..., None]) -> Callable[..., None]:
+    """Doubt the motors only when the monitor is made."""
+    return lambda self, held: None if hasattr(self, "unsure") else doubt(self, held)
+
+
+def rides_on(fault: Any, ride: Any, *_: Any) -> None:
+    ride.is_riding = ride.is_riding or fault is not None
+
+
+def clamped(answer: Any, compensator: Any, *_: Any) -> Any:
+    if answer.effort is None:
+        return answer
+    pairs = zip(answer.effort, compensator.settings.max_effort, strict=True)
+    return answer._replace(effort=tuple(max(-most, min(most, torque)) for torque, most in pairs))
+
+
+def remembered(torque: Callable[..., Any]) -> Callable[..., Any]:
+    """Keep the torque while the efforts are not sound."""
+
+    def remember(self: Any, now: float) -> Any:
+        before = getattr(self, ASSIST_MEMORY)
+        result = torque(self, now)
+        if self.reason:
+            setattr(self, ASSIST_MEMORY, before)
+        return result
+
+    return remember
+
+
+def never_wanted(let_down: Callable[..., bool]) -> Callable[..., bool]:
+    return lambda arm, notes, log, is_wanted: let_down(arm, notes, log, lambda: False)
+
+
+FAULT, FROZEN = "motor 2 reports an error", "compensator frozen, the rest runs on"
+PRESSED = "compensator frozen while the wearer presses it down from the horizontal"
+WRONG_SIGN = "effort of joint 2 with the wrong sign"
+DEFECTS = (
+    Defect("damping on one motor only", (FAULT,), {f"{ARM_DESCENT}.applied": first_joint_only}),
+    Defect("EXIT at once on a fault", (FAULT,), {STEP: after(off_after_a_fault)}),
+    Defect(
+        "the torque does not fade",
+        (FAULT,),
+        {JOINT_DESCENT: with_arguments(lambda effort, damping, most: (0.0, damping, most))},
+    ),
+    Defect("the watchdog never acts", ("can_bridge killed",), {LET_DOWN: returns(True)}, process=WATCHDOG),
+    Defect(
+        "a motor that was switched off is not switched on again",
+        ("foreign EXIT to motor 2 while let down", "motor 2 restarts in 30 ms"),
+        {STEP: after(without_enter)},
+    ),
+    Defect(
+        "a second bridge takes the bus",
+        ("second can_bridge on the bus",),
+        {LOCK: becomes(f"\0exo_gravity_of_{os.getpid()}/"), LISTEN: returns(None)},
+    ),
+    Defect(
+        "the lock of a bus depends on the user's folder",
+        ("can_bridge of another session on the bus",),
+        {LOCK: becomes("\0" + os.environ.get("XDG_RUNTIME_DIR", "")[-20:]), LISTEN: returns(None)},
+    ),
+    Defect(
+        "a soft wall without damping",
+        ("elbow pushed into the soft wall",),
+        {SHAPE: after(lambda shaped, *_: (shaped[0], (0.0,) * len(shaped[1]), shaped[2]))},
+    ),
+    Defect("torque delivery is not checked", ("motor 2 restarts in 30 ms",), {DELIVERY: after(lambda *_: None)}),
+    Defect(
+        "a motor that replies no torque is taken for sound",
+        ("motor 2 restarts in 30 ms",),
+        {DELIVERY: with_arguments(replies_with_torque)},
+    ),
+    Defect(
+        "a second commander is ignored",
+        ("second publisher of efforts",),
+        {PUBLISHERS: after(lambda *_: False)},
+    ),
+    Defect("stale efforts are accepted", (FROZEN,), {RIDE: returns(None)}),
+    Defect("a ride that never ends", (FROZEN,), {RIDE: after(rides_on)}),
+    Defect("a ride without damping", ("compensator stopped for 0.1 s",), {RIDING: always(False)}),
+    Defect(
+        "zeros once checked are always trusted",
+        ("joint 2 jumps by a motor turn, then clear and enable",),
+        {TRUSTED: latching},
+    ),
+    Defect(
+        "motors are switched off while damping still holds the arm",
+        ("arm disabled",),
+        {f"{ARM_DESCENT}.is_down": lambda _: lambda self, *times: not any(self.applied[0])},
+    ),
+    Defect(
+        "the brake of the descent grows without a bound",
+        (PRESSED,),
+        {
+            DESCENT_GROWTH: becomes(math.inf),
+            JOINT_DESCENT: with_arguments(lambda effort, damping, most: (effort, damping, 18.0)),
+        },
+    ),
+    Defect(
+        "the descent drives a joint that the wearer pushed down",
+        (PRESSED,),
+        {DESCENT_DRIVEN: becomes(math.inf)},
+    ),
+    Defect(
+        "the last effort of an outer loop that ended stays",
+        ("outer loop killed",),
+        {ASSIST_VALID: always(math.inf)},
+    ),
+    Defect(
+        "the torque of an outer loop that has ended is remembered",
+        ("outer loop killed, the next one asks for 0 Nm",),
+        {ASSIST: remembered},
+    ),
+    Defect(
+        "a change of load that ignores the joint's speed",
+        ("Zero-G to One-G, 75 kg", "body mass 75 to 100"),
+        {GUIDANCE: with_arguments(lambda dt, velocity, *loads: (dt, velocity and [0.0] * len(velocity), *loads))},
+    ),
+    Defect(
+        "a clamp outside the guided change",
+        ("max_effort 9 to 0.5 Nm, Zero-G, 75 kg",),
+        {COMPENSATOR: after(clamped)},
+    ),
+    Defect("control that is not renewed is not lost", ("who holds control killed",), {LEASE: returns("")}),
+    Defect(
+        "the watchdog of silent motors never hands the bus over",
+        ("motors silent for long, then the next can_bridge",),
+        {LET_DOWN: never_wanted},
+        process=WATCHDOG,
+    ),
+    Defect(
+        "powered frames are sent while the supply is cut",
+        ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
+        {SUPPLY: once},
+    ),
+    Defect(
+        "an enable never expires",
+        ("enabled, and the supply cut for 4 s while checking",),
+        {MACHINE: with_arguments(without_timeout)},
+    ),
+    Defect(
+        "unexplained torque is never a fault",
+        (WRONG_SIGN, "efforts oscillate at 8 Hz"),
+        {MONITOR: after(lambda result, *_: (result[0], None))},
+    ),
+    Defect(
+        "unexplained torque is passed on, and takes ten times as long",
+        (WRONG_SIGN,),
+        {MONITOR: after(lambda result, self, dt, joints, effort, *_: (effort, result[1])), PATIENCE: becomes(0.15)},
+    ),
+)  # fmt: skip
+
+
+def by_name(name: str) -> Defect:
+    """Return the defect with this name. Raises LookupError."""
+    for defect in DEFECTS:
+        if defect.name == name:
+            return defect
+    raise LookupError(f"no defect {name!r}")
+
+
+def let_step_fail(path: str) -> None:
+    """Let the compensator's step fail once the file exists: with the text `sleep` it never returns, else it raises."""
+    owner, name, step = find(COMPENSATOR)
+    file = Path(path)
+
+    def failing(*reading: Any) -> Any:
+        if file.exists():
+            if file.read_text() == "sleep":
+                time.sleep(3600.0)
+            raise ZeroDivisionError("division by zero")
+        return step(*reading)
+
+    setattr(owner, name, failing)

@@ -1,0 +1,31 @@
+"""The deliberate defects of `make mutations` can be injected into this package, and name rows of the fault matrix."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from .cases import CASES
+from .injected import injected
+from .injected.defects import DEFECTS, Defect, find
+
+
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda defect: defect.name)
+def test_each_defect_replaces_something_and_has_rows_that_are_meant_to_see_it(
+    defect: Defect, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {target: find(target)[2] for target in defect.patches}
+    for owner, name, replacement in tuple(defect.replacements()):
+        monkeypatch.setattr(owner, name, replacement, raising=False)
+    assert all(find(target)[2] is not original for target, original in before.items())
+    assert set(defect.rows) <= {case.name for case in CASES}
+
+
+def test_a_process_that_cannot_have_its_defect_does_not_start() -> None:
+    with injected(EXO_TEST_DEFECT="no such defect"):
+        done = subprocess.run([sys.executable, "-c", "print('runs')"], capture_output=True, text=True)
+    assert done.returncode == 3 and "no defect 'no such defect'" in done.stderr and not done.stdout
+    assert "EXO_TEST_DEFECT" not in os.environ
