@@ -2,7 +2,8 @@
 
     /right/can_bridge  ->  the executable `can_bridge`, as node `can_bridge` in the namespace /right
 
-With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
+A compensator gets a `wearer` beside it, unless the file has a key for one or its arm has no wearer. With --one-process,
+can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
 
 It stops the bridges first and waits for them, because they need the other nodes while they let the arms down. If the
 launcher dies, the nodes stop by themselves: each watches its standard input, whose other end the launcher holds.
@@ -33,9 +34,10 @@ from subprocess import PIPE, STDOUT
 
 import yaml
 
+from exo_gravity.core.compensation.settings import URDF_LAW
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.lab.inputs.parameter_file import Loader, check_buses, load, packaged_config, stages
+from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, check_buses, load, packaged_config, stages
 from exo_gravity.tools.cli import require_ros
 
 NODES_PACKAGE = "exo_gravity.nodes."
@@ -55,7 +57,7 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
-OBSERVERS = ("/recorder", "/robot_model", "/panel")
+OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 LOG_FORMAT = "{severity} {message}"
@@ -96,6 +98,17 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
     return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
 
 
+def wearers(nodes: Nodes) -> list[str]:
+    """Return the nodes `wearer` to start beside the compensators of a file that has no key for them."""
+    found = []
+    for node, values in nodes.items():
+        namespace, _, name = node.rpartition("/")
+        is_worn = values.get("law") != URDF_LAW and values.get("command_interface") != "multi_array"
+        if name == "compensator" and is_worn and f"{namespace}/wearer" not in nodes:
+            found.append(f"{namespace}/wearer")
+    return found
+
+
 def in_namespace(params: Path, namespace: str) -> Path:
     """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
     if not namespace:
@@ -134,6 +147,7 @@ class Launcher:
         self._path = Path(params).resolve()
         nodes = {**{node: {} for node in more}, **load(self._path)}
         check_buses(nodes)
+        nodes |= {node: {} for node in wearers(nodes)}
         self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
         names = chosen(nodes, only)
         pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
@@ -143,6 +157,7 @@ class Launcher:
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
+        self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
 
     def start(self) -> None:
@@ -175,6 +190,13 @@ class Launcher:
         """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
         codes = ((node, self.exit_code(node)) for node in list(self._processes) if not node.endswith(OBSERVERS))
         return next(((node, code) for node, code in codes if code is not None), None)
+
+    def _tell_ended_observers(self) -> None:
+        for node in self._processes:
+            code = self.exit_code(node)
+            if node.endswith(OBSERVERS) and code is not None and node not in self._ended_observers:
+                self._ended_observers.add(node)
+                self._on_line(node, f"ended with exit code {code}; no arm depends on it, the other nodes run on")
 
     def stop(self) -> None:
         """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
@@ -225,6 +247,7 @@ class Launcher:
         try:
             self.start()
             while not stopping.wait(0.05):
+                self._tell_ended_observers()
                 dead = self.dead()
                 if dead:
                     return dead

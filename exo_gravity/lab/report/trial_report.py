@@ -22,8 +22,8 @@ WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
     "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
-    "wearer": "The wearer's torque at each joint, and his share of the torque that carries his arm, each with its 95 % "
-    "band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
+    "wearer": "The wearer's torque at each joint, and their share of the torque that carries their arm, each with its "
+    "95 % band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
 }
 
 

@@ -181,7 +181,8 @@ class TiltSubscription:
 
     on_refusal(topic, error): a message is impossible; the last tilt then grows old. on_motion(now, specific force (3,)
     m/s^2, angular velocity (3,) rad/s, age in s): a sample of the trunk's motion, in its axes, under `lock` too.
-    on_tilt(now): `target` has a message of `now`, in s. senders: the publishers by topic.
+    on_tilt(now): `target` has a message of `now`, in s. senders: the publishers by topic. is_polled: messages are taken
+    in `poll`, not by the executor.
     """
 
     def __init__(
@@ -192,12 +193,22 @@ class TiltSubscription:
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
         on_motion: Callable[..., object] = lambda *sample: None,
         on_tilt: Callable[[float], object] = lambda now: None,
+        is_polled: bool = False,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
         self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
         self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
-        node.create_subscription(Imu, DATA, self._on_data, NEWEST)
-        node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST)
+        self._polled: list[HotPath] = []
+        for msgtype, topic, callback in ((Imu, DATA, self._on_data), (Vector3Stamped, PITCH_YAW, self._on_pitch_yaw)):
+            if is_polled:
+                self._polled.append(HotPath(node, msgtype, topic, callback))
+            else:
+                node.create_subscription(msgtype, topic, callback, NEWEST)
+
+    def poll(self) -> None:
+        """Take the newest message of each topic, if it is new."""
+        for path in self._polled:
+            path.poll()
 
     def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
         if message.orientation_covariance[0] == NOT_REPORTED:
