@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -61,7 +62,7 @@ class Arm:
     def largest_step(self) -> float:
         """The largest change of a torque from one answer to the next so far, in Nm."""
         efforts = [answer.effort or STILL for answer in self.answers]
-        pairs = zip(efforts, efforts[1:], strict=False)
+        pairs = itertools.pairwise(efforts)
         return max(abs(b - a) for last, present in pairs for a, b in zip(last, present, strict=True))
 
 
@@ -101,7 +102,7 @@ def test_the_support_changes_once_in_a_guided_changes_time_however_often_the_req
         if arm.run(PERIOD * 7) != before:
             changes.append(arm.now)
     assert len(changes) > 3
-    assert all(later - first > REQUEST.pause - 0.1 for first, later in zip(changes, changes[1:], strict=False))
+    assert all(later - first > REQUEST.pause - 0.1 for first, later in itertools.pairwise(changes))
 
 
 @pytest.mark.parametrize(
