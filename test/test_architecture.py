@@ -27,7 +27,6 @@ EXCEPTIONS = {
     "exo_gravity/lab/calibration/live.py": {"tools"},
     "exo_gravity/lab/report/video.py": {"tools"},
     "exo_gravity/lab/trial/run.py": {"tools"},
-    "exo_gravity/core/compensation/weighing.py": {"lab"},
 }
 # The path of a torque: what a torque depends on. It imports nothing that looks at arms from outside.
 PATH_NODES = ("can_bridge", "compensator", "imu", "ros")
@@ -79,6 +78,22 @@ def test_a_module_imports_only_what_its_package_may() -> None:
         return ours(path, 1) - MAY_IMPORT[package(path)] - EXCEPTIONS.get(name(path), set())
 
     assert not breaches(forbidden, lambda path: package(path) in MAY_IMPORT)
+
+
+def test_the_path_of_a_torque_imports_only_the_path() -> None:
+    def beside(path: Path) -> set[str]:
+        modules = (module.split(".")[1:] for module in imported(path) if module.startswith("exo_gravity."))
+        return {
+            ".".join(parts)
+            for parts in modules
+            if parts[0] not in ("core", "hardware") and (parts[0] != "nodes" or parts[1] not in PATH_NODES)
+        }
+
+    def is_on_path(path: Path) -> bool:
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        return parts[0] in ("core", "hardware") or (parts[0] == "nodes" and parts[1] in PATH_NODES)
+
+    assert not breaches(beside, is_on_path)
 
 
 def test_core_imports_only_numpy_and_the_standard_library() -> None:

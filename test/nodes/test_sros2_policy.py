@@ -1,6 +1,6 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml, a recorder, robot_model, the panel, and an outer loop for each arm; the
+The nodes are those of config/sim_both.yaml with their wearers, a recorder, robot_model, the panel, and an outer loop for each arm; the
 bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
@@ -35,7 +35,7 @@ NODES = (
     "/imu", "/panel", "/recorder", "/robot_model",
     *(
         f"/{arm}/{node}"
-        for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
+        for arm in ("left", "right") for node in ("can_bridge", "compensator", "wearer", "simulator", "outer_loop")
     ),
 )  # fmt: skip
 NOTHING = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
@@ -112,7 +112,7 @@ def spin(executor, ending):
 
 def lasting_rules(rules_of):
     """Return the rules of each node, without the requests of clients that exist for a moment only."""
-    brief = ("/recorder", "/left/compensator", "/right/compensator")
+    brief = ("/recorder", "/left/wearer", "/right/wearer")
     return {node: {**rules_of(node), **({"request": set()} if node in brief else {})} for node in NODES}
 
 
@@ -168,13 +168,14 @@ def test_a_node_may_do_exactly_what_it_does(session, kind):
 def test_these_nodes_call_no_services_of_other_nodes(session):
     policy = read_policy()
     for node in NODES:
-        if node.endswith(("can_bridge", "simulator", "loop", "imu")):
+        if node.endswith(("can_bridge", "compensator", "simulator", "loop", "imu")):
             assert session[0][node]["request"] == set() == policy[node]["request"], node
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-def test_a_compensator_may_read_the_parameters_of_its_own_bridge_for_the_budget(arm):
-    assert read_policy()[f"/{arm}/compensator"]["request"] == {f"/{arm}/can_bridge/{kind}" for kind in READS}
+def test_a_wearer_may_read_the_parameters_of_its_own_compensator_and_bridge(arm):
+    nodes = ("compensator", "can_bridge")
+    assert read_policy()[f"/{arm}/wearer"]["request"] == {f"/{arm}/{node}/{kind}" for node in nodes for kind in READS}
 
 
 @pytest.mark.thorough
@@ -203,8 +204,11 @@ def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-@pytest.mark.parametrize(("topic", "node"), [("effort_commands", "compensator"), ("assist_efforts", "outer_loop")])
-def test_only_one_node_of_an_arm_may_publish_its_efforts(arm, topic, node):
+@pytest.mark.parametrize(
+    ("topic", "node"),
+    [("effort_commands", "compensator"), ("assist_efforts", "outer_loop"), ("support_request", "wearer")],
+)
+def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on(arm, topic, node):
     publishers = [name for name, rules in read_policy().items() if f"/{arm}/{topic}" in rules["publish"]]
     assert publishers == [f"/{arm}/{node}"]
 

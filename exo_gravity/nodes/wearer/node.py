@@ -221,4 +221,4 @@ class WearerNode(Node):
 
 def main() -> None:
     """Entry point of the executable `wearer`."""
-    raise SystemExit(run(WearerNode, priority=5))  # below the control loop, which takes no more of the processor for it
+    raise SystemExit(run(WearerNode, priority=5))  # below the control loop
