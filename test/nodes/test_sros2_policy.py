@@ -1,7 +1,7 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml with their wearers, a recorder, robot_model, the panel, and an outer loop for each arm; the
-bridges are not enabled.
+The nodes are those of config/sim_both.yaml with a wearer for each arm, a recorder, robot_model, the panel, and an outer
+loop for each arm; the bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 

@@ -74,7 +74,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
     for name, seconds in (("short", 2.0), ("long", 120.0)):
         script = {"name": name, "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": seconds}]}
         (folder / "scripts" / f"{name}.yaml").write_text(yaml.safe_dump(script))
-    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
+    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
     url = with_panel(nodes, trials=str(folder / "scripts"))
     nodes.start()
     probe = RosProbe()

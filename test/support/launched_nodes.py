@@ -99,18 +99,24 @@ class LaunchedNodes:
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.one_process = one_process
-        self.only = [*content, *(wearers(load(self.path)) if wearer else ())]
+        self.wearer = wearer
         self.log: list[str] = []
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """The full names of the nodes to start: a test may have added some to the file."""
+        nodes = load(self.path)
+        return [*nodes, *(wearers(nodes) if self.wearer else ())]
 
     def has_started(self) -> bool:
         """Return whether `start` was called."""
         return self._thread is not None
 
     def start(self) -> LaunchedNodes:
-        self.launcher = Launcher(self.path, self._on_line, self.only, one_process=self.one_process)
+        self.launcher = Launcher(self.path, self._on_line, self.names, one_process=self.one_process)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -169,7 +175,7 @@ class LauncherProcess(LaunchedNodes):
                 "--params",
                 str(self.path),
                 "--only",
-                *self.only,
+                *self.names,
                 *["--one-process"] * self.one_process,
             ],
             stdout=subprocess.PIPE,

@@ -45,7 +45,7 @@ class PlayedArms:
     contact: str = "none"  #: and of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: str = "off"  #: from which support to which it adapts
-    share: str = "unknown"  #: of his arm's weight that the wearer carries
+    share: str = "unknown"  #: of their arm's weight that the wearer carries
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report
@@ -98,13 +98,14 @@ class PlayedArms:
         values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
-        carried = {"mass carried (kg)": "1.854", "largest support": "0.068", "level": 0, "message": "compensating"}
-        carried |= {"changing load": self.changing, "weighing": self.weighing, "contact": self.contact}
-        carried["support adapts"] = self.adapts
-        carried["share of the wearer (%)"] = self.share
+        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating"}
+        carried |= {"changing load": self.changing, "weighing": self.weighing}
+        wearer = {"largest support": "0.068", "contact": self.contact, "support adapts": self.adapts}
+        wearer["share of the wearer (%)"] = self.share
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
-        return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}
+        statuses = {"bridge": bridge, "compensator": carried, "wearer": wearer, "simulator": self.simulator}
+        return {**statuses, "joints": joints}
 
 
 @dataclass

@@ -32,7 +32,7 @@ from exo_gravity.lab.observer.watch import WearerWatch
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import HotPath, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import HotPath, Repeated, TiltSubscription
 from exo_gravity.nodes.wearer.budget_watch import BudgetWatch
 
 COMPENSATOR = "compensator"
@@ -71,7 +71,10 @@ class Trunk:
 
 
 class WearerNode(Node):
-    """The ROS shell around a `WearerWatch`. Everything runs on the executor's thread."""
+    """The ROS shell around a `WearerWatch`.
+
+    The estimate has a thread of its own: rclpy's executor would take more of the processor than the arithmetic does.
+    """
 
     def __init__(self) -> None:
         super().__init__("wearer", automatically_declare_parameters_from_overrides=True)
@@ -98,12 +101,24 @@ class WearerNode(Node):
         self._joint_states: HotPath | None = None
         self._trunk: Trunk | None = None
         self._watch: WearerWatch | None = None
+        self._lock = threading.Lock()  # guards the watch
+        self._due = 0.0  # monotonic s
         self._newest: tuple[float, JointState | None] = (-math.inf, None)  # monotonic s of its arrival
         self._problem = "waiting for joint_states"  # with the newest sample
         self._last = -math.inf  # monotonic s of the newest sample
         self.create_timer(PARAMETER_PERIOD, self._follow_compensator)
-        self.create_timer(PERIOD, self._estimate)
         self.create_timer(REPORT_PERIOD, self._report)
+        self._thread = Repeated("estimate", self._tick, 0.0)
+        self._thread.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the estimate."""
+        return self._thread.failure
+
+    def close(self) -> None:
+        """End the thread."""
+        self._thread.stop()
 
     def _follow_compensator(self) -> None:
         """Read the compensator's parameters if they may have changed."""
@@ -142,24 +157,33 @@ class WearerNode(Node):
         if fixed != self._fixed:
             self._refusal = "the compensator has other joints or another trunk than before: restart this node"
             return
+        with self._lock:
+            self._watch.apply(settings)
         self._settings = settings
-        self._watch.apply(settings)
 
     def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
         age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
         self._newest = time.monotonic() - max(0.0, age), message
 
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._due = max(self._due + PERIOD, now)
+        time.sleep(self._due - now)
+        self._estimate()
+
     def _estimate(self) -> None:
         """Publish what the newest joint state tells, if it is new."""
-        if not self._settings or not self._watch or not self._joint_states or self._silence():
+        settings, watch = self._settings, self._watch
+        if not settings or not watch or not self._joint_states or self._silence():
             return
         self._joint_states.poll()
         taken, message = self._newest
         if message is None or taken <= self._last:
             return
         self._last = taken
-        joints, trunk = self._joints(message), self._trunk_at(taken)
-        estimate = self._watch.update(taken, joints, trunk)
+        joints, trunk = self._joints(message), self._trunk_at(taken, settings)
+        with self._lock:
+            estimate = watch.update(taken, joints, trunk)
         self._problem = ""
         if estimate:
             for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
@@ -179,9 +203,8 @@ class WearerNode(Node):
         except ParameterError:
             return None
 
-    def _trunk_at(self, now: float) -> tuple[Tilt, Floats3] | None:
-        assert self._settings
-        return self._trunk.at(now) if self._trunk else (Tilt.of(self._settings.side), ZERO)
+    def _trunk_at(self, now: float, settings: Settings) -> tuple[Tilt, Floats3] | None:
+        return self._trunk.at(now) if self._trunk else (Tilt.of(settings.side), ZERO)
 
     def _ask_for_support(self) -> None:
         """Renew the request, or change it at once."""
@@ -212,7 +235,8 @@ class WearerNode(Node):
         values: dict[str, object] = {"budget": self._budget.text, "largest support": self._budget.largest_support}
         is_known = self._settings and not self._silence()
         if self._watch and is_known:
-            values |= self._watch.values(now)
+            with self._lock:
+                values |= self._watch.values(now)
         else:
             values |= {"wearer (Nm)": "unknown", "share of the wearer (%)": "unknown", "contact": "none"}
             values["support adapts"] = "off"
