@@ -9,7 +9,7 @@ here = Path(__file__).parent
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
-nodes = ("can_bridge", "compensator", "panel", "recorder", "robot_model")
+nodes = ("can_bridge", "compensator", "panel", "recorder", "robot_model", "wearer")
 small_nodes = ("calibrator", "imu", "simulator")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf", "doctor")
 

@@ -45,10 +45,7 @@ ROOMS = {
         "urdf_arm",
     ),
 }
-EXCEPTIONS: dict[str, set[str]] = {
-    "core.compensation.weighing": {"lab.observer.momentum"},
-    "nodes.compensator.watches": {"lab.observer.adaptation", "lab.observer.momentum"},
-}
+EXCEPTIONS: dict[str, set[str]] = {}
 
 
 STUDIES_THAT_IMPORT_TESTS = {

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from exo_gravity.lab.observer.momentum import COVER, ContactWatch, WearerEstimate
-from exo_gravity.lab.observer.share import WINDOW, share_of
+from exo_gravity.core.numbers import COVER
+from exo_gravity.lab.observer.contact import ContactWatch
+from exo_gravity.lab.observer.momentum import WearerEstimate
+from exo_gravity.lab.observer.share import SHARE, share_of
 from exo_gravity.lab.report.html import FAINT, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 
 from ..device_study import Row
@@ -81,7 +83,7 @@ def picture(trial: Trial) -> Figure:
     upper.fill_between(time, low, high, color=JOINT_COLOURS[0], alpha=0.2, lw=0, label="its 95 % band")
     upper.plot(time, truth.torque[:, JOINT], color=INK, lw=0.9, ls=(0, (4, 2)), label="the simulated muscles")
     upper.set_ylabel("Shoulder abduction (Nm)")
-    found, true = share_of(curve, WINDOW), share_of(truth, WINDOW)
+    found, true = share_of(curve, SHARE.window), share_of(truth, SHARE.window)
     value, width = 100.0 * found.value, 100.0 * COVER * found.deviation
     lower.fill_between(time, value - width, value + width, color=JOINT_COLOURS[2], alpha=0.25, lw=0)
     lower.plot(time, value, color=JOINT_COLOURS[2], lw=1.2, label="share over 1 s, with its 95 % band")

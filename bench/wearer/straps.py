@@ -11,7 +11,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
-from exo_gravity.lab.observer.momentum import COVER
+from exo_gravity.core.numbers import COVER
 
 from ..device_study import options_of
 from .devices import Worn, draw

@@ -25,7 +25,7 @@ from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.observer.momentum import BANDWIDTH, REFERENCE, MomentumObserver
+from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
 from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
 from exo_gravity.lab.trial.recording import Recording
@@ -221,11 +221,11 @@ def baselines(settings: Settings, time: np.ndarray, joints: Any, tilt_at: Any) -
     tilts = [tilt_at(now) for now in time.tolist()]
     magnitude = np.array([tilt.magnitude for tilt in tilts])[:, None]
     static = magnitude * gravity_torque(arm, position, np.array([tilt.direction for tilt in tilts])) - effort
-    inertia = np.diag(MomentumObserver(settings)._links.matrix(REFERENCE))
-    residual, inner = static.copy(), BANDWIDTH * inertia * velocity[0] - static[0]
+    inertia = np.diag(MomentumObserver(settings)._links.matrix(OBSERVER.reference))
+    residual, inner = static.copy(), OBSERVER.bandwidth * inertia * velocity[0] - static[0]
     for n in range(1, len(time)):
-        share = 1.0 - math.exp(-BANDWIDTH * (time[n] - time[n - 1]))
-        mean = 0.5 * BANDWIDTH * inertia * (velocity[n] + velocity[n - 1])
+        share = 1.0 - math.exp(-OBSERVER.bandwidth * (time[n] - time[n - 1]))
+        mean = 0.5 * OBSERVER.bandwidth * inertia * (velocity[n] + velocity[n - 1])
         inner = inner + share * (mean - static[n - 1] - inner)
-        residual[n] = BANDWIDTH * inertia * velocity[n] - inner
+        residual[n] = OBSERVER.bandwidth * inertia * velocity[n] - inner
     return residual, static

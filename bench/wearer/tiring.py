@@ -15,6 +15,7 @@ import numpy as np
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.support import NAME
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.momentum import MomentumObserver
@@ -55,7 +56,7 @@ class Tiring(Muscles):
 
 
 class Adapting(Compensator):
-    """A compensator with an estimate of the wearer's torque, as in the node.
+    """A compensator with the requests of an estimate of the wearer's torque, as from the node `wearer`.
 
     read: called for the joints' efforts (4,) Nm; trunk: for what the trunk feels. supports: s, and the support.
     """
@@ -71,8 +72,9 @@ class Adapting(Compensator):
         """Return the answer that the bridge gets."""
         assert velocity and isinstance(self.settings, Settings)
         estimate = self._observer.update(now, (theta, velocity, self.read()), self.trunk())
-        if self._adaptation.update(now, (theta, velocity), estimate, self.settings):
-            self.raise_support(self._adaptation.support)
+        self._adaptation.update(now, (theta, velocity), estimate, self.settings)
+        if (requested := self._adaptation.requested) is not None:
+            self.support_request.receive(now, (NAME,), (requested,), now)
         self.supports.append((now, self.settings.support_now))
         return super().step(now, theta, velocity)
 

@@ -26,9 +26,10 @@ from subprocess import PIPE, STDOUT
 
 import yaml
 
+from exo_gravity.core.compensation.settings import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.lab.inputs.parameter_file import Loader, check_buses, load, stages
+from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, check_buses, load, stages
 
 NODES_PACKAGE = "exo_gravity.nodes."
 ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
@@ -47,7 +48,7 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
-OBSERVERS = ("/recorder", "/robot_model", "/panel")
+OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 LOG_FORMAT = "{severity} {message}"
 
@@ -87,6 +88,17 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
     return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
 
 
+def wearers(nodes: Nodes) -> list[str]:
+    """Return the nodes `wearer` to start beside the compensators of a file that has no key for them."""
+    found = []
+    for node, values in nodes.items():
+        namespace, _, name = node.rpartition("/")
+        is_worn = values.get("law") != URDF_LAW and values.get("command_interface") != "multi_array"
+        if name == "compensator" and is_worn and f"{namespace}/wearer" not in nodes:
+            found.append(f"{namespace}/wearer")
+    return found
+
+
 def in_namespace(params: Path, namespace: str) -> Path:
     """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
     if not namespace:
@@ -119,6 +131,7 @@ class Launcher:
         self._path = Path(params).resolve()
         nodes = {**{node: {} for node in more}, **load(self._path)}
         check_buses(nodes)
+        nodes |= {node: {} for node in wearers(nodes)}
         self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
         names = chosen(nodes, only)
         pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
@@ -128,6 +141,7 @@ class Launcher:
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
         self._on_line = on_line
+        self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
 
     def start(self) -> None:
@@ -160,6 +174,13 @@ class Launcher:
         """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
         codes = ((node, self.exit_code(node)) for node in list(self._processes) if not node.endswith(OBSERVERS))
         return next(((node, code) for node, code in codes if code is not None), None)
+
+    def _tell_ended_observers(self) -> None:
+        for node in self._processes:
+            code = self.exit_code(node)
+            if node.endswith(OBSERVERS) and code is not None and node not in self._ended_observers:
+                self._ended_observers.add(node)
+                self._on_line(node, f"ended with exit code {code}; no arm depends on it, the other nodes run on")
 
     def stop(self) -> None:
         """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
@@ -210,6 +231,7 @@ class Launcher:
         try:
             self.start()
             while not stopping.wait(0.05):
+                self._tell_ended_observers()
                 dead = self.dead()
                 if dead:
                     return dead

@@ -15,8 +15,10 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.lab.observer.momentum import BANDWIDTH, COVER, MomentumObserver
+from exo_gravity.core.numbers import COVER
+from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
 from exo_gravity.lab.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
+from exo_gravity.lab.observer.watch import WearerWatch
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
@@ -25,7 +27,8 @@ from ..core.test_gravity_oracles import random_arm
 from ..core.test_kinematics import NO_ROTORS, ROUNDING, with_rods
 
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
-EXACT = ModelError((0.0,) * 4, (0.0,) * 4, 0.0, 0.0)
+STILL = (0.0,) * 4
+EXACT = ModelError(STILL, STILL, 0.0, 0.0)
 COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)
 SETTINGS = Settings(
     "right", DEFAULT_LINKS, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), model_error=EXACT,
@@ -64,7 +67,7 @@ def still(effort, tilt=TILT, settings=SETTINGS, pose=POSE):
     """Return the estimate of an arm that stands at `pose` under the motors' `effort`."""
     observer = MomentumObserver(settings)
     for n in range(100):
-        estimate = observer.update(n * PERIOD, (pose, (0.0,) * 4, effort), tilt)
+        estimate = observer.update(n * PERIOD, (pose, STILL, effort), tilt)
     return estimate
 
 
@@ -131,16 +134,13 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values), axis=0))
 
 
-def test_the_estimate_follows_a_known_torque_on_a_moving_arm_in_mujoco():
-    error, deviation = errors(simulated(6.0, wearer))
+def test_the_estimate_follows_a_known_torque_on_a_moving_arm_in_mujoco_and_the_band_holds_it():
+    samples = list(simulated(6.0, wearer))
+    error, deviation = errors(samples)
     assert np.all(rms(error) < (0.1, 0.2, 0.1, 0.06))
-    assert np.mean(np.abs(error) < COVER * deviation) > 0.9
-
-
-def test_without_friction_in_the_settings_the_band_is_wide_enough():
-    unknown = replace(SETTINGS, terms=TermSettings())
-    error, deviation = errors(simulated(4.0, wearer), unknown)
-    assert np.mean(np.abs(error) < COVER * deviation) > 0.9
+    unknown_friction = errors(samples, replace(SETTINGS, terms=TermSettings()))
+    for off, band in ((error, deviation), unknown_friction):
+        assert np.mean(np.abs(off) < COVER * band) > 0.9
 
 
 def test_the_turning_of_the_base_is_accounted_for():
@@ -152,20 +152,15 @@ def test_the_turning_of_the_base_is_accounted_for():
     assert np.linalg.norm(whole) < 0.3 < 0.6 * np.linalg.norm(without)
 
 
-def test_a_torque_that_rises_steadily_is_followed_without_lag():
+def test_a_torque_that_rises_steadily_is_followed_without_lag_and_a_gap_starts_anew_from_a_still_arm():
     observer, needed = MomentumObserver(SETTINGS), gravity_torque(WHOLE, POSE, TILT.direction)
     for n in range(200):
         given = np.array((0.0, 2.0 * n * PERIOD, 0.0, 0.0))
-        estimate = observer.update(n * PERIOD, (POSE, (0.0,) * 4, (needed - given).tolist()), TILT)
+        estimate = observer.update(n * PERIOD, (POSE, STILL, (needed - given).tolist()), TILT)
     # The effort acts from its sample on: the estimate is of the sample before.
     assert estimate.torque[1] == pytest.approx(given[1], abs=2.5 * PERIOD)
-
-
-def test_after_a_gap_the_observer_starts_anew_from_a_still_arm():
-    observer, needed = MomentumObserver(SETTINGS), gravity_torque(WHOLE, POSE, TILT.direction)
-    observer.update(0.0, (POSE, (0.0,) * 4, (0.0,) * 4), TILT)
-    estimate = observer.update(1.0, (POSE, (0.0,) * 4, needed.tolist()), TILT)
-    assert estimate.torque == pytest.approx((0.0,) * 4, abs=1e-9)
+    later = observer.update(200 * PERIOD + OBSERVER.max_gap, (POSE, STILL, needed.tolist()), TILT)
+    assert later.torque == pytest.approx(STILL, abs=1e-9)
 
 
 def test_each_error_of_the_model_widens_the_band():
@@ -183,14 +178,9 @@ def curve(share, count=500, deviation=0.1):
     return WearerCurve(time, np.reshape(share, (-1, 1)) * weight, np.full((count, 4), deviation), weight)
 
 
-def test_the_share_is_that_of_the_weight_that_the_wearer_gives():
+def test_the_share_is_that_of_the_weight_that_the_wearer_gives_and_a_sliding_one_forgets():
     assert share_of(curve(0.35)).value == pytest.approx(0.35)
-    assert share_of(curve(0.35), 1.0).value == pytest.approx(np.full(500, 0.35))
-
-
-def test_the_sliding_share_forgets_what_was_more_than_a_second_ago():
-    steps = np.repeat((0.2, 0.8), 250)
-    sliding = share_of(curve(steps), 1.0).value
+    sliding = share_of(curve(np.repeat((0.2, 0.8), 250)), 1.0).value
     assert sliding[249] == pytest.approx(0.2) and 0.2 < sliding[300] < 0.8
     assert sliding[-1] == pytest.approx(0.8)
 
@@ -202,9 +192,8 @@ def test_a_longer_time_does_not_narrow_the_band_of_the_share():
 
 
 def test_a_hanging_arm_has_no_share():
-    hanging = curve(0.5)._replace(weight=np.full((500, 4), 0.1))
-    assert np.isnan(share_of(hanging).value)
-    assert np.isnan(share_of(while_between(curve(0.5), ())).value)
+    for hanging in (curve(0.5)._replace(weight=np.full((500, 4), 0.1)), while_between(curve(0.5), ())):
+        assert np.isnan(share_of(hanging).value)
 
 
 def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_are_left_out():
@@ -216,4 +205,30 @@ def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_ar
     assert np.diff(found.time[:50]) == pytest.approx(PERIOD)
     assert not np.any((found.time > 0.8) & (found.time < 0.998))
     assert found.torque == pytest.approx(0.0, abs=1e-9)
-    assert BANDWIDTH * PERIOD < 0.5  # the sampled low-pass is still one
+    assert OBSERVER.bandwidth * PERIOD < 0.5  # the sampled low-pass is still one
+
+
+def watched(settings=SETTINGS, effort=None):
+    """Return what a watch says after a second of a still arm whose motors give `effort`, and its last estimate."""
+    watch = WearerWatch(("a", "b", "c", "elbow"), SETTINGS)
+    watch.apply(settings)
+    joints = (POSE, STILL, effort) if effort is not None else None
+    estimates = [watch.update(n * PERIOD, joints, (TILT, (0.0, 0.0, 0.0))) for n in range(200)]
+    return watch.values(2.0), estimates[-1], watch
+
+
+def test_a_watch_tells_torques_beyond_their_band_the_share_and_nothing_that_is_old_or_unknown():
+    needed = gravity_torque(WHOLE, POSE, TILT.direction)
+    values, estimate, watch = watched(effort=(needed - (0.0, 4.0, 0.0, 0.0)).tolist())
+    assert values["wearer (Nm)"].startswith("b +4.0 +- ") and "elbow" not in values["wearer (Nm)"]
+    share = 4.0 * estimate.weight[1] / sum(w * w for w in estimate.weight)
+    assert values["share of the wearer (%)"].startswith(f"{100.0 * share:.0f} +- ")
+    assert (values["contact"], values["support adapts"]) == ("none", "off")
+    assert watch.values(4.0)["wearer (Nm)"] == watched()[0]["wearer (Nm)"] == "unknown"
+    assert watched(effort=needed.tolist())[0]["wearer (Nm)"] == "not distinguishable from zero"
+
+
+def test_a_watch_follows_the_load_in_the_settings():
+    loaded = replace(SETTINGS, payload_mass=1.0)
+    needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
+    assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)

@@ -102,7 +102,7 @@ def test_a_tilt_is_believed_by_its_stamp_and_gravitys_vector_goes_before_pitch_a
 
 
 def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_that_fits(launch, probe, feed):
-    nodes = launch(without=OTHER_NODES, compensator=NO_IMU)
+    nodes = launch(without=OTHER_NODES, compensator=NO_IMU, wearer=True)
     bridge = rclpy.create_node("can_bridge", namespace="/right", context=probe.context)
     for param in CAN_BRIDGE:
         bridge.declare_parameter(param.name, param.default)
@@ -110,13 +110,13 @@ def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_
     feed()
 
     def budget() -> str:
-        return probe.diagnostic("compensator", "budget") or ""
+        return probe.diagnostic("wearer", "budget") or ""
 
     probe.wait_until(lambda: budget() == "within rated torque everywhere")
     assert probe.set_parameters("compensator", atomically=True, mode="zero_g", wearer__body_mass=75).successful
     needs = "right_shoulder_abduction needs 19.6 Nm in its worst pose (rated 9, peak 18)"
     probe.wait_until(lambda: needs in budget())
-    assert f"the largest support that fits is {probe.diagnostic('compensator', 'largest support')}" in budget()
+    assert f"the largest support that fits is {probe.diagnostic('wearer', 'largest support')}" in budget()
     probe.wait_until(lambda: probe.status_contains("compensator", ", right_shoulder_flexion"))
     probe.wait_until(lambda: probe.effort_commands[-1].effort[2] == 3.0)
     probe.wait_until(lambda: [line for line in nodes.log if needs in line and "WARN" in line])

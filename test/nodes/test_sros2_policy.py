@@ -1,7 +1,7 @@
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
-The nodes are those of config/sim_both.yaml, a recorder, robot_model, the panel, and an outer loop for each arm; the
-bridges are not enabled.
+The nodes are those of config/sim_both.yaml with a wearer for each arm, a recorder, robot_model, the panel, and an outer
+loop for each arm; the bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
@@ -34,7 +34,7 @@ NODES = (
     "/imu", "/panel", "/recorder", "/robot_model",
     *(
         f"/{arm}/{node}"
-        for arm in ("left", "right") for node in ("can_bridge", "compensator", "simulator", "outer_loop")
+        for arm in ("left", "right") for node in ("can_bridge", "compensator", "wearer", "simulator", "outer_loop")
     ),
 )  # fmt: skip
 NO_RULES = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
@@ -110,7 +110,7 @@ def spin(executor, ending):
 
 def lasting_rules(rules_of):
     """Return the rules of each node, without the requests of clients that exist for a moment only."""
-    brief = ("/recorder", "/left/compensator", "/right/compensator")
+    brief = ("/recorder", "/left/wearer", "/right/wearer")
     return {node: {**rules_of(node), **({"request": set()} if node in brief else {})} for node in NODES}
 
 
@@ -164,14 +164,15 @@ def test_a_node_may_do_exactly_what_it_does(session):
         for kind in ("publish", "subscribe", "reply"):
             assert policy[node][kind] == found[node][kind], (node, kind)
         assert policy[node]["request"] == requests.get(node, policy[node]["request"]), node
-        if node.endswith(("can_bridge", "simulator", "loop", "imu")):
+        if node.endswith(("can_bridge", "compensator", "simulator", "loop", "imu")):
             assert not requests[node], node
     assert requests["/robot_model"] == reads(arms)
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-def test_a_compensator_may_read_the_parameters_of_its_own_bridge_for_the_budget(arm):
-    assert read_policy()[f"/{arm}/compensator"]["request"] == reads([f"/{arm}/can_bridge"])
+def test_a_wearer_may_read_the_parameters_of_its_own_compensator_and_bridge(arm):
+    nodes = (f"/{arm}/{node}" for node in ("compensator", "can_bridge"))
+    assert read_policy()[f"/{arm}/wearer"]["request"] == reads(nodes)
 
 
 def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
@@ -182,8 +183,11 @@ def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
 
 
 @pytest.mark.parametrize("arm", ["left", "right"])
-@pytest.mark.parametrize(("topic", "node"), [("effort_commands", "compensator"), ("assist_efforts", "outer_loop")])
-def test_only_one_node_of_an_arm_may_publish_its_efforts(arm, topic, node):
+@pytest.mark.parametrize(
+    ("topic", "node"),
+    [("effort_commands", "compensator"), ("assist_efforts", "outer_loop"), ("support_request", "wearer")],
+)
+def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on(arm, topic, node):
     publishers = [name for name, rules in read_policy().items() if f"/{arm}/{topic}" in rules["publish"]]
     assert publishers == [f"/{arm}/{node}"]
 

@@ -1,11 +1,13 @@
-"""The wearer's torque of a running compensator, which the test feeds with joint states."""
+"""The node `wearer` beside a compensator, which the test feeds with joint states and requests."""
 
 from __future__ import annotations
 
+import math
+import os
+import signal
 import threading
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import cast
 
 import numpy as np
 import pytest
@@ -16,9 +18,6 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.nodes.compensator.watches import WearerWatch
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.joint_state_feeder import PARTS, POSE
@@ -27,10 +26,13 @@ from ..support.launched_nodes import NO_IMU
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 LOAD = Wearer(75.0).on_links(ROBOT.length)
-STRONG = {"max_effort": [9.0, 18.0, 9.0, 9.0]}  # Nm
+WORN = {**NO_IMU, "max_effort": [9.0, 18.0, 9.0, 9.0], "wearer.body_mass": 75.0}
+ADAPTIVE = {**WORN, "mode": "zero_g", "support": 0.4, "support_adapts": True, "model_error.wearer": 0.03}
 NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
+CARRIED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
 WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's arm
+UNKNOWN, NONE = "unknown", "not distinguishable from zero"
 
 
 class StillArm:
@@ -66,13 +68,15 @@ def arm(probe) -> Iterator[StillArm]:
     still.close()
 
 
-def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_deviation(launch, probe, arm):
+def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_the_compensators_parameters(
+    launch, probe, arm
+):
     found: dict[str, list[JointState]] = {"": [], "_std": []}
     for part, messages in found.items():
         probe.node.create_subscription(JointState, f"/right/wearer_efforts{part}", messages.append, 100)
-    launch(without=OTHER_NODES, compensator={**NO_IMU, "wearer.body_mass": 75.0})
-    commands = probe.effort_commands
-    probe.wait_until(lambda: len(commands) > 50)
+    nodes = launch(without=OTHER_NODES, compensator=WORN, wearer=True)
+    torque, share = (partial(probe.diagnostic, "wearer", key) for key in ("wearer (Nm)", "share of the wearer (%)"))
+    probe.wait_until(lambda: probe.status_contains("wearer", "no positions, velocities and efforts"))
     assert not found[""]  # without the motors' efforts nothing is known of the wearer
     arm.effort = (NEEDED - GIVEN).tolist()
     probe.wait_until(lambda: len(found[""]) > 100 and len(found["_std"]) > 100)
@@ -82,29 +86,34 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_with_its_devia
     assert all(0.05 < value < 2.5 for value in deviation.effort)
     stamps = [[to_nanoseconds(message.header.stamp) for message in messages[:50]] for messages in found.values()]
     assert set(stamps[0]) & set(stamps[1])  # a torque and its deviation have the same stamp
-    probe.wait_until(
-        lambda: "right_shoulder_abduction +4.0 +-" in (probe.diagnostic("compensator", "wearer (Nm)") or "")
-    )
-    assert "elbow" not in (probe.diagnostic("compensator", "wearer (Nm)") or "")
-    share = f"{100.0 * (GIVEN @ WEIGHT) / (WEIGHT @ WEIGHT):.0f} +- "
-    probe.wait_until(lambda: (probe.diagnostic("compensator", "share of the wearer (%)") or "").startswith(share))
+    probe.wait_until(lambda: "right_shoulder_abduction +4.0 +-" in (torque() or "") and "elbow" not in torque())
+    expected = f"{100.0 * (GIVEN @ WEIGHT) / (WEIGHT @ WEIGHT):.0f} +- "
+    probe.wait_until(lambda: (share() or "").startswith(expected))
     arm.effort = NEEDED.tolist()
-    probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
-    probe.wait_until(lambda: (probe.diagnostic("compensator", "share of the wearer (%)") or "").startswith("0 +- "))
+    probe.wait_until(lambda: torque() == NONE and share().startswith("0 +- "))
+    assert probe.diagnostic("wearer", "contact") == "none"
 
+    def strike() -> None:
+        blow = 5.0 * (len(probe.joint_states) // 200 % 2)  # Nm; again, for a node that was late at the first one
+        arm.effort = np.add(NEEDED, (0.0, 0.0, 0.0, blow)).tolist()
 
-def test_a_blow_is_a_contact_in_diagnostics(launch, probe, arm):
-    launch(without=OTHER_NODES, compensator={**NO_IMU, "wearer.body_mass": 75.0})
-    arm.effort = NEEDED.tolist()
-    probe.wait_until(lambda: probe.diagnostic("compensator", "wearer (Nm)") == "not distinguishable from zero")
-    assert probe.diagnostic("compensator", "contact") == "none"
-    arm.effort = np.add(NEEDED, (0.0, 0.0, 0.0, 5.0)).tolist()
-    probe.wait_until(lambda: "right_elbow_flexion -" in (probe.diagnostic("compensator", "contact") or ""))
-    assert "1 in all" in probe.diagnostic("compensator", "contact")
+    probe.wait_until(lambda: strike() or "right_elbow_flexion" in (probe.diagnostic("wearer", "contact") or ""))
+    assert probe.set_parameters("compensator", payload__mass=2.0).successful
+    loaded = ROBOT.with_payload(2.0, (0.0, 0.0, 0.0)).with_wearer(LOAD.mass, LOAD.cog)
+    arm.effort = gravity_torque(loaded, POSE).tolist()
+    probe.wait_until(lambda: torque() == NONE)
+    # A compensator that hangs, or is gone: the middleware lists it for long.
+    os.kill(nodes.pid("compensator"), signal.SIGSTOP)
+    probe.wait_until(lambda: probe.status_contains("wearer", "waiting for right/compensator") and torque() == UNKNOWN)
+    told, seen = len(found[""]), len(probe.joint_states)
+    probe.wait_until(lambda: len(probe.joint_states) > seen + 200)
+    assert len(found[""]) == told
+    os.kill(nodes.pid("compensator"), signal.SIGCONT)
+    probe.wait_until(lambda: torque() == NONE and len(found[""]) > told)
 
 
 def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(launch, probe, arm):
-    launch(without=OTHER_NODES, compensator={**NO_IMU, **STRONG, "wearer.body_mass": 75.0, "support": 0.5})
+    launch(without=OTHER_NODES, compensator={**WORN, "support": 0.5})
     probe.wait_until(lambda: probe.effort_commands)
 
     def weigh() -> Trigger.Response:
@@ -125,29 +134,63 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     assert values["ros__parameters"]["payload"]["mass"] == 0.0
 
 
-def test_the_support_of_a_wearer_whose_arm_sinks_adapts_where_his_share_is_known(launch, probe, arm):
-    worn = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": 0.4, "support_adapts": True}
-    launch(without=OTHER_NODES, compensator={**NO_IMU, **STRONG, **worn, "model_error.wearer": 0.03})
-    carried = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
-    arm.effort = carried.tolist()
-    adapts = partial(probe.diagnostic, "compensator", "support adapts")
+def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_is_killed_while_the_arm_is_carried_on(
+    launch, probe, arm
+):
+    nodes = launch(without=OTHER_NODES, compensator=ADAPTIVE, wearer=True)
+    arm.effort = CARRIED.tolist()
+    adapts, in_use = partial(probe.diagnostic, "wearer", "support adapts"), partial(support_in_use, probe)
     probe.wait_until(lambda: adapts() == "40 %")
     arm.sinking = 0.0002
-    probe.wait_until(lambda: "40 -> " in (adapts() or ""))
+    probe.wait_until(lambda: "40 -> " in (adapts() or "") and in_use() > 0.4)
     arm.sinking = 0.0
-    assert float(probe.diagnostic("compensator", "mass carried (kg)")) > ROBOT.total_mass + 0.4 * sum(LOAD.mass) + 0.01
     assert probe.diagnostic("compensator", "support") == "0.4"
     assert probe.set_parameters("compensator", model_error__wearer=0.3).successful
     probe.wait_until(lambda: "40 -> " not in (adapts() or "") and "cannot rise: the wearer's share" in (adapts() or ""))
-    assert probe.set_parameters("compensator", support_adapts=False).successful
-    probe.wait_until(lambda: adapts() == "off")
+    assert probe.set_parameters("compensator", model_error__wearer=0.03).successful
+    arm.sinking = 0.0002
+    probe.wait_until(lambda: in_use() > 0.42)
+    nodes.process("wearer").kill()
+    probe.wait_until(lambda: in_use() == 0.4 and probe.diagnostic("compensator", "support request") == "none")
+    probe.wait_until(lambda: any("wearer: ended with exit code -9; no arm depends on it" in line for line in nodes.log))
+    count = len(probe.effort_commands)
+    probe.wait_until(lambda: len(probe.effort_commands) > count + 100)
+    assert probe.effort_commands[-1].effort and nodes.ended_node is None
 
 
-def test_an_estimate_that_fails_says_so_in_diagnostics(probe):
-    control = Compensator(Settings("right", ROBOT, use_imu=False))
-    watch = WearerWatch(probe.node, [f"right_{part}" for part in PARTS], control, threading.Lock())
-    watch.newest = 1.0, cast("JointState", "no message")
-    watch.start()
-    probe.wait_until(lambda: watch.failure is not None)
-    assert watch.values["wearer (Nm)"].startswith("failed: AttributeError: 'str' object has no attribute")
-    watch.stop()
+def support_in_use(probe) -> float:
+    return float(probe.diagnostic("compensator", "support in use") or 0.0)
+
+
+def test_a_wrong_or_second_sender_of_requests_raises_no_support(launch, probe, arm):
+    launch(without=OTHER_NODES, compensator=ADAPTIVE)
+    arm.effort = CARRIED.tolist()
+    probe.wait_until(lambda: probe.effort_commands and support_in_use(probe) == 0.4)
+    report, publish = partial(probe.diagnostic, "compensator", "support request"), Requests(probe.node).publish
+    for wrong in ({"share": math.nan}, {"share": 1.5}, {"name": "elbow"}, {"age": 3.0}, {"age": -3.0}):
+        text = "late by its stamp" if "age" in wrong else "must"
+        probe.wait_until(lambda wrong=wrong, text=text: publish(**wrong) or text in report())
+        assert support_in_use(probe) == 0.4
+        probe.wait_until(lambda: report() == "none")
+    probe.wait_until(lambda: publish(share=0.8) or support_in_use(probe) == 0.8)
+    second = Requests(probe.node).publish
+    probe.wait_until(lambda: publish(share=0.8) or second(share=0.9) or support_in_use(probe) == 0.4)
+    assert "more than one publisher" in report()
+
+
+class Requests:
+    """A sender of requests for support, at most 10 a second."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._sent = node, -math.inf
+        self._publisher = node.create_publisher(JointState, "/right/support_request", 1)
+
+    def publish(self, share: float = 0.7, name: str = "support", age: float = 0.0) -> None:
+        """Ask for `share` 0..1 as of `age` s ago."""
+        now = self._node.get_clock().now().nanoseconds
+        if now * 1e-9 - self._sent < 0.1:
+            return
+        self._sent = now * 1e-9
+        request = JointState(name=[name], position=[share])
+        request.header.stamp = Time(nanoseconds=now - round(age * 1e9)).to_msg()
+        self._publisher.publish(request)

@@ -72,7 +72,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
     (folder / "scripts").mkdir()
     script = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
     (folder / "scripts" / "long.yaml").write_text(yaml.safe_dump(script))
-    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0})
+    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
     url = with_panel(nodes, trials=str(folder / "scripts"))
     nodes.start()
     probe = RosProbe()

@@ -16,7 +16,8 @@ from typing import Any
 import yaml
 
 from exo_gravity.hardware.ownership.bus_lock import notes_file
-from exo_gravity.lab.processes import Launcher
+from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.processes import Launcher, wearers
 
 from . import CONFIG
 from .ports import own_ports
@@ -52,7 +53,8 @@ class LaunchedNodes:
     by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED`, `CALM` or `REAL`.
     changes: of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether
     simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. two_buses: whether motors 3 and
-    4 are on a bus of their own, with the next port. The attribute `ended_node` is what `Launcher.run` returned.
+    4 are on a bus of their own, with the next port. wearer: whether a `wearer` runs beside each compensator, as for
+    users: most tests spare its processor time. The attribute `ended_node` is what `Launcher.run` returned.
 
     Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
     """
@@ -67,6 +69,7 @@ class LaunchedNodes:
         truth: bool = False,
         one_process: bool = False,
         two_buses: bool = False,
+        wearer: bool = False,
         **changes: Parameters,
     ) -> None:
         port = port or next(PORTS)
@@ -96,17 +99,24 @@ class LaunchedNodes:
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.one_process = one_process
+        self.wearer = wearer
         self.log: list[str] = []
         self.stopping = threading.Event()
         self.ended_node: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """The full names of the nodes to start: a test may have added some to the file."""
+        nodes = load(self.path)
+        return [*nodes, *(wearers(nodes) if self.wearer else ())]
 
     def has_started(self) -> bool:
         """Return whether `start` was called."""
         return self._thread is not None
 
     def start(self) -> LaunchedNodes:
-        self.launcher = Launcher(self.path, on_line=self._on_line, one_process=self.one_process)
+        self.launcher = Launcher(self.path, self._on_line, self.names, one_process=self.one_process)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
         return self
@@ -160,7 +170,14 @@ class LauncherProcess(LaunchedNodes):
 
     def start(self) -> LauncherProcess:
         self.launcher_process = subprocess.Popen(
-            [executable("launcher"), "--params", str(self.path), *["--one-process"] * self.one_process],
+            [
+                executable("launcher"),
+                "--params",
+                str(self.path),
+                "--only",
+                *self.names,
+                *["--one-process"] * self.one_process,
+            ],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,

@@ -53,7 +53,7 @@ class PlayedArms:
     contact: str = "none"  #: and of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: str = "off"  #: from which support to which it adapts
-    share: str = "unknown"  #: of the weight of their arm that the wearer carries
+    share: str = "unknown"  #: of their arm's weight that the wearer carries
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
     #: what the simulators report
@@ -110,10 +110,10 @@ class PlayedArms:
         carried |= {"changing load": self.changing, "weighing": self.weighing}
         of_wearer = {"largest support": "0.068", "contact": self.contact, "support adapts": self.adapts}
         of_wearer["share of the wearer (%)"] = self.share
-        carried |= of_wearer
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
-        return {"bridge": bridge, "compensator": carried, "simulator": self.simulator, "joints": joints}
+        statuses = {"bridge": bridge, "compensator": carried, "wearer": of_wearer, "simulator": self.simulator}
+        return {**statuses, "joints": joints}
 
 
 @dataclass

@@ -16,7 +16,7 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.inputs.parameter_file import load, stages
-from exo_gravity.lab.processes import chosen, command_of, in_namespace, node_modules, stop_on_signals
+from exo_gravity.lab.processes import chosen, command_of, in_namespace, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import main, stop_with_owner
 
@@ -170,13 +170,14 @@ def launched(monkeypatch, capsys):
 
 def test_only_a_part_of_the_nodes_is_started(launched):
     assert list(launched("--only", "*/can_bridge", "/imu")[0]) == ["/imu", "/right/can_bridge"]
+    assert list(launched("--only", "*/compensator", "*/w*")[0]) == ["/right/compensator", "/right/wearer"]
 
 
 def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_names(launched):
     log = ("lab.right.compensator INFO compensating\n", "lab.right.can_bridge WARN late\n", "ERROR of a watchdog\n")
     one_process = ("--namespace", "lab", "--one-process")
     commands, lines = launched(*one_process, log=log)
-    assert list(commands) == ["/lab/imu", "/lab/right/can_bridge", "/lab/right/simulator"]
+    assert list(commands) == ["/lab/imu", "/lab/right/can_bridge", "/lab/right/simulator", "/lab/right/wearer"]
     words = commands["/lab/right/can_bridge"]
     first, second = words[: words.index("--")], words[words.index("--") + 1 :]
     assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[2]
@@ -195,6 +196,21 @@ NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/c
 
 def test_bridges_stop_first_and_recorders_last():
     assert stages(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
+
+
+@pytest.mark.parametrize(
+    ("nodes", "added"),
+    [
+        ({"/right/compensator": {}, "/left/compensator": {"law": "anfis"}}, ["/right/wearer", "/left/wearer"]),
+        ({"/compensator": {}, "/right/can_bridge": {}}, ["/wearer"]),
+        ({"/right/compensator": {}, "/right/wearer": {}}, []),
+        ({"/right/compensator": {"law": "urdf"}}, []),
+        ({"/right/compensator": {"command_interface": "multi_array"}}, []),
+    ],
+    ids=["both arms", "no namespace", "a key of its own", "another arm", "ros2_control"],
+)
+def test_a_compensator_of_our_own_arm_gets_a_wearer_unless_the_file_has_one(nodes, added):
+    assert wearers(nodes) == added
 
 
 @pytest.mark.parametrize(
@@ -226,4 +242,4 @@ def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launch
     commands, _ = launched("--namespace", "lab/", "--log-level", "warn")
     words = commands["/lab/right/compensator"]
     assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", "warn"} <= set(words)
-    assert list(load(words[words.index("--params-file") + 1])) == list(commands)
+    assert [*load(words[words.index("--params-file") + 1]), "/lab/right/wearer"] == list(commands)

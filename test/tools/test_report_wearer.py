@@ -47,7 +47,7 @@ def test_the_share_of_the_recording_is_found_and_said(share, tmp_path):
     assert part.whole.value == pytest.approx(share, abs=0.005)
     assert part.curve.time[0] >= 1.0 and part.curve.time[-1] <= 7.0  # while the arm was carried
     said = wearer_share.sentence(part)
-    assert f"{100 * share:.0f} % of his arm's weight" in said
+    assert f"{100 * share:.0f} % of their arm's weight" in said
     assert ("not distinguishable from zero" in said) == (share == 0.0)
     written = trial_report.write(report, tmp_path)
     assert "right_wearer.png" in [path.name for path in written]

@@ -1,4 +1,4 @@
-"""One arm on two computers: bridge, IMU and simulated device on the robot, compensator and recorder on the desk."""
+"""One arm on two computers: bridge, IMU and simulated device on the robot; compensator, wearer, recorder on a desk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ POSE = [0.1, 0.8, 0.7, 0.6]  # rad
 MOVE = 2.0  # s
 PARTS: dict[str, tuple[str, ...]] = {
     "robot": ("/imu", "/right/can_bridge", "/right/simulator", "/robot/recorder"),
-    "desk": ("/right/compensator", "/recorder"),
+    "desk": ("/right/compensator", "/right/wearer", "/recorder"),
 }
 PEERS = {"robot": ADDRESSES["desk"], "desk": ADDRESSES["robot"]}
 STOP_TIMEOUT = 60.0  # s

@@ -28,6 +28,7 @@ from exo_gravity.core.compensation.guidance import (
     limited,
 )
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
+from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Active, Terms
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 
@@ -83,6 +84,7 @@ class Compensator:
         self.terms = Terms(names, settings.terms, settings.moving) if isinstance(settings, Settings) else None
         #: of the trunk, or of the root link of another arm
         self.tilt = TiltInput(settings.side, settings.tilt_timeout)
+        self.support_request = SupportRequest()  #: used with `support_adapts` in zero_g
         self.motion = FeltMotion()  #: of the trunk, used with `inertial` while the tilt is fresh
         self._nothing = (0.0,) * len(settings.max_effort)
         self._effort = self._nothing  # the last answer's,
@@ -99,16 +101,14 @@ class Compensator:
         self._fallback_until = -math.inf
 
     def apply(self, settings: Settings | UrdfSettings) -> None:
-        """Use new settings of the same side from the next `step` on; the torque moves to them as a guided motion."""
-        self._pending, last = settings, self._pending or self.settings
-        if isinstance(settings, Settings) and isinstance(last, Settings) and last.raised_support:
-            self.raise_support(last.raised_support)
+        """Use new settings of the same side from the next `step` on; the torque moves to them as a guided motion.
 
-    def raise_support(self, support: float) -> None:
-        """Carry `support` (0..1) of the wearer's arm from the next `step` on, if that is more than the settings say."""
+        A support that was raised on request stays as it is, while it may.
+        """
         last = self._pending or self.settings
-        if isinstance(last, Settings) and last.mode == "zero_g" and last.support_adapts:
-            self._pending = replace(last, raised_support=support)
+        if isinstance(settings, Settings) and isinstance(last, Settings) and settings.is_adaptive:
+            settings = replace(settings, raised_support=last.raised_support)
+        self._pending = settings
 
     def weigh(self, scale: Scale) -> str:
         """Let `scale` carry the load in the hand from the next `step` on, until it is over; return why not, or ''."""
@@ -133,6 +133,7 @@ class Compensator:
             if not turn <= TILT.turn:
                 return Answer(None, held)
             held = f"{held}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
+        self._follow_request(now)
         before = None
         if self._pending is not None:
             before = self.settings, self.terms.now if self.terms else Active()
@@ -170,6 +171,15 @@ class Compensator:
         remainder = () if change.is_over else change.remainder
         damped = change.is_large or now < self._braked_until
         return Answer(self._effort, "", tuple(over), self._fallback, remainder, damped, held)
+
+    def _follow_request(self, now: float) -> None:
+        """Carry as much of the wearer's arm as is asked for."""
+        last = self._pending or self.settings
+        if not isinstance(last, Settings) or not last.is_adaptive:
+            return
+        support = self.support_request.support(now, last.support, last.support_now)
+        if support != last.support_now:
+            self._pending = replace(last, raised_support=support)
 
     @property
     def _active_scale(self) -> Scale | None:

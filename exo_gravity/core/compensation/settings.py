@@ -49,7 +49,7 @@ class Settings:
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
     support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
-    raised_support: float = 0.0  #: to which it has risen
+    raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = NO_TORQUE  #: (4,) kg, the wearer's segment on each link
     wearer_cog: Sequence[float] = NO_TORQUE  #: (4,) m from joint n, its centre of gravity
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
@@ -62,7 +62,7 @@ class Settings:
     use_imu: bool = True  #: False assumes an upright trunk
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
-    model_error: ModelError = field(default_factory=ModelError)  #: for the estimate of the wearer's torque
+    model_error: ModelError = field(default_factory=ModelError)  #: for the bands of what is estimated
     robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
     payload_mass: float = 0.0  #: kg in the hand
     payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in frame 4
@@ -102,6 +102,11 @@ class Settings:
         object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the support follows requests."""
+        return self.mode == "zero_g" and self.support_adapts
 
     @property
     def support_now(self) -> float:

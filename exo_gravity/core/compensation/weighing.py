@@ -5,7 +5,7 @@ directions of a sweep is what the settings do not carry, without the joints' fri
 the height that each joint gives the hand, m kg in the hand take the torque m g dz/dq; m is fitted to it.
 
 The result contains the error of the model, which weighing the empty hand in the same pose shows. Muscles look like a
-load: what the wearer carries himself is missing from the result, unless his torque is one that no load can cause.
+load: what the wearers carry themselves is missing from the result, unless their torque is one that no load can cause.
 """
 
 import math
@@ -20,7 +20,7 @@ from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import FOLLOWED, LEAD, Line, Station, Sweep, Tracker, average, followed
-from exo_gravity.lab.observer.momentum import COVER
+from exo_gravity.core.numbers import COVER
 
 TAKE_OVER = 4.0  # s
 CYCLES = 3  # there and back

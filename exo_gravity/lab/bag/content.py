@@ -18,7 +18,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
 # Of each arm, in its namespace
 STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
-WEARER = ("wearer_efforts", "wearer_efforts_std")
+WEARER = ("wearer_efforts", "wearer_efforts_std", "support_request")
 # Of all
 DIAGNOSTICS, PARAMETER_EVENTS, MARKERS, IMU = "/diagnostics", "/parameter_events", "/event_marker", "/imu/data"
 # Of the recorder, in the recording alone

@@ -1,1 +1,1 @@
-"""What the wearer does: the torque that neither the arm's model nor the motors account for."""
+"""What the wearer of an arm does: their torque, share of the arm, contacts, and how much support they need."""

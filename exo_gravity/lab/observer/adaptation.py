@@ -1,14 +1,15 @@
 """Support that adapts: it rises while the arm sinks, and then decays. Why so: docs/wearer_torque.md.
 
-With w (4,) Nm, the torque that carries the wearer's arm,
+With w (n,) Nm, the torque that carries the wearer's arm,
 
-    speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by MEAN
-    support' = - RISE * speed / FULL - (support - `support`) / MEMORY
+    speed = sum w . theta' / |w|                   rad/s, upwards, from the joints' angles, low-passed by `mean`
+    support' = - rise * speed / full - (support - set support) / memory
 
-within `support` and 1; the first term stays within -LIFT * RISE and RISE. So lifting takes back part of what sinking
-gave: at a support of at most 1, only a person can lift the arm. A motion faster than REACH is a movement, not sinking.
-Sinking counts only while the wearer's share lies between 0 and what is left to him. That excludes a hand that presses
-the arm down, and motors that are off. While the share is unknown, the support falls to `support`, by RISE per second.
+within the set support and 1; the first term stays within -lift * rise and rise. So lifting takes back part of what
+sinking gave: at a support of at most 1, only a person can lift the arm. A motion faster than `reach` is a movement, not
+sinking. Sinking counts only while the wearer's share lies between 0 and what is left to them. That excludes a hand that
+presses the arm down, and motors that are off. While the share is unknown, the support falls to the set one, by `rise`
+per second.
 
 Assistance as needed with forgetting: Wolbrecht, Chan, Reinkensmeyer and Bobrow, IEEE TNSRE 2008.
 """
@@ -16,33 +17,47 @@ Assistance as needed with forgetting: Wolbrecht, Chan, Reinkensmeyer and Bobrow,
 import math
 import operator
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.compensation.guidance import FADE_TIME
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.lab.observer.momentum import COVER, MAX_GAP, WearerEstimate
-from exo_gravity.lab.observer.share import LEAST_WEIGHT, RunningShare
+from exo_gravity.core.compensation.support import REQUEST
+from exo_gravity.core.numbers import COVER
+from exo_gravity.lab.observer.momentum import OBSERVER, WearerEstimate
+from exo_gravity.lab.observer.share import SHARE, RunningShare
 
-MEAN = 1.0  # s, time constant of the speed
-RISE, FULL = 0.04, 0.01  # of the wearer's arm per s, while it sinks at this speed in rad/s, or faster,
-LIFT = 0.5  # of that at most, while it is lifted
-MEMORY = 60.0  # s, time constant with which a raised support is forgotten
-REACH = 0.2  # rad/s of any joint
-WIDEST = 0.25  # of the wearer's arm: half the width of the share's 95 % band beyond which it says nothing
-LEAST_CHANGE = 0.005  # of the wearer's arm
+
+@dataclass(frozen=True)
+class AdaptationTuning:
+    """How fast the support rises and is forgotten, and what counts as sinking."""
+
+    mean: float = 1.0  #: s, time constant of the speed
+    rise: float = 0.04  #: of the wearer's arm per s, while it sinks as fast as `full`, or faster
+    full: float = 0.01  #: rad/s
+    lift: float = 0.5  #: of `rise` at most, while the arm is lifted
+    memory: float = 60.0  #: s, time constant with which a raised support is forgotten
+    reach: float = 0.2  #: rad/s of any joint: faster is a movement
+    #: of the wearer's arm: half the width of the share's 95 % band beyond which it says nothing
+    widest: float = 0.25
+
+
+ADAPTATION = AdaptationTuning()
 
 
 class SupportAdaptation:
-    """How much of the wearer's arm is to be carried, from one estimate of his torque to the next.
+    """How much of the wearer's arm is to be carried, from one estimate of their torque to the next.
 
-    support: 0..1. problem: why it cannot rise, or ''. share: the wearer's share as `RunningShare` returns it, known
-    without an adaptation, too.
+    support: 0..1, at present. requested: 0..1, the same as the compensator is asked for it, in steps that leave it time
+    for a guided change; None while nothing adapts. problem: why the support cannot rise, or ''. share: the wearer's
+    share as `RunningShare` returns it, known without an adaptation, too.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tuning: AdaptationTuning = ADAPTATION) -> None:
         self.support = 0.0
+        self.requested: float | None = None
         self.problem = ""
         self.share: tuple[float, float] | None = None
+        self._tuning = tuning
         self._running = RunningShare()
         self._time = self._due = -math.inf  # s
         self._theta: Sequence[float] | None = None
@@ -54,50 +69,57 @@ class SupportAdaptation:
         joints: Sequence[Sequence[float]] | None,
         estimate: WearerEstimate | None,
         settings: Settings,
-    ) -> bool:
-        """Take an estimate at `now` s; return whether the compensator is to carry `support` from now on.
+    ) -> None:
+        """Take an estimate at `now` s.
 
-        joints: angles (4,) rad and velocities (4,) rad/s. estimate: None if there is none. settings: in use.
+        joints: angles (n,) rad and velocities (n,) rad/s, None if they are not known.
+        estimate: None if there is none.
+        settings: the compensator's parameters.
         """
         dt, self._time = now - self._time, now
-        is_running = 0.0 < dt <= MAX_GAP
+        is_running = 0.0 < dt <= OBSERVER.max_gap
         if is_running and joints and estimate:
             self.share = self._running.update(dt, estimate)
         else:
             self._running, self.share = RunningShare(), None
             self._theta, self._speed = None, 0.0
-        if settings.mode != "zero_g" or not settings.support_adapts or not is_running:
+        if not settings.is_adaptive or dt > REQUEST.expires:
+            self.requested = None
+        in_force = max(settings.support, self.requested or 0.0)
+        if not settings.is_adaptive or not is_running:
             self._theta, self._speed = None, 0.0
-            self.support, self.problem = settings.support_now, ""
-            return False
+            self.support, self.problem = in_force, ""
+            return
         sunk = 0.0
         if joints and estimate:
-            sunk = self._sunk(dt, joints, estimate.weight, 1.0 - settings.support_now)
+            sunk = self._sunk(dt, joints, estimate.weight, 1.0 - in_force)
         else:
             self.problem = "the wearer's torque is not known"
-        fall = RISE if self.problem else (self.support - settings.support) / MEMORY
-        self.support = max(settings.support, min(1.0, self.support + dt * (RISE * sunk - fall)))
-        if now < self._due or abs(self.support - settings.support_now) < LEAST_CHANGE:
-            return False
-        self._due = now + FADE_TIME  # one guided change after the other
-        return True
+        rise = self._tuning.rise
+        fall = rise if self.problem else (self.support - settings.support) / self._tuning.memory
+        self.support = max(settings.support, min(1.0, self.support + dt * (rise * sunk - fall)))
+        self.requested = in_force
+        if now >= self._due and abs(self.support - in_force) >= REQUEST.least_change:
+            self.requested, self._due = self.support, now + REQUEST.pause
 
     def _sunk(self, dt: float, joints: Sequence[Sequence[float]], weight: Torque, asked: float) -> float:
-        """Return how fast the arm sinks as a share of FULL, at most 1, and at least -LIFT while it is lifted.
+        """Return how fast the arm sinks as a share of `full`, at most 1, and at least -`lift` while it is lifted.
 
-        asked: share of his arm that is left to the wearer.
+        asked: share of their arm that is left to the wearer.
         """
         theta, velocity = joints
+        tuning = self._tuning
         moved = map(operator.sub, theta, self._theta or theta)
-        self._theta, part = theta, dt / (MEAN + dt)
+        self._theta, part = theta, dt / (tuning.mean + dt)
         size = math.hypot(*weight)
-        rise = sum(map(operator.mul, weight, moved)) / max(size, LEAST_WEIGHT)
-        self._speed = 0.0 if max(map(abs, velocity)) > REACH else self._speed + part * (rise / dt - self._speed)
+        rise = sum(map(operator.mul, weight, moved)) / max(size, SHARE.least_weight)
+        is_moved = max(map(abs, velocity)) > tuning.reach
+        self._speed = 0.0 if is_moved else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
         if self.share is None:  # the arm hangs
             return 0.0
         share, band = self.share[0], COVER * self.share[1]
-        if band > WIDEST:
+        if band > tuning.widest:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
-        sunk = max(-LIFT, min(1.0, -self._speed / FULL))
+        sunk = max(-tuning.lift, min(1.0, -self._speed / tuning.full))
         return sunk if sunk < 0.0 or (not self.problem and -band < share < asked + band) else 0.0

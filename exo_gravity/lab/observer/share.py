@@ -1,6 +1,6 @@
-"""The wearer's torque over a recording, and his share of what carries his arm against gravity.
+"""The wearer's torque over a recording, and their share of what carries their arm against gravity.
 
-With his torque tau and the torque w that carries his arm, both (4,), over any span of time
+With their torque tau and the torque w that carries their arm, both (4,), over any span of time
 
     share = sum tau . w / sum w . w
 
@@ -12,6 +12,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +24,17 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
 
 PERIOD = 0.01  # s between two samples
-WINDOW = 1.0  # s of the sliding share
-LEAST_WEIGHT = 0.5  # Nm, root mean square over time of w's length: below, there is nothing to carry
+
+
+@dataclass(frozen=True)
+class ShareTuning:
+    """Over which time the share is taken, and of what."""
+
+    window: float = 1.0  #: s of the sliding share
+    least_weight: float = 0.5  #: Nm, root mean square over time of w's length: below, there is nothing to carry
+
+
+SHARE = ShareTuning()
 
 
 class WearerCurve(NamedTuple):
@@ -44,7 +54,7 @@ class Share(NamedTuple):
 
 
 class RunningShare:
-    """The share of the last `WINDOW` s, from one estimate to the next: an older one weighs exponentially less."""
+    """The share of the last `window` s, from one estimate to the next: an older one weighs exponentially less."""
 
     def __init__(self) -> None:
         self._given = self._carried = 0.0  # Nm^2, the means of the two sums,
@@ -52,12 +62,12 @@ class RunningShare:
 
     def update(self, dt: float, estimate: WearerEstimate) -> tuple[float, float] | None:
         """Take an estimate, `dt` s after the last; return the share and its standard deviation, None for no weight."""
-        part, weight = dt / (WINDOW + dt), estimate.weight
+        part, weight = dt / (SHARE.window + dt), estimate.weight
         self._given += part * (sum(map(operator.mul, weight, estimate.torque)) - self._given)
         self._carried += part * (sum(w * w for w in weight) - self._carried)
         columns = zip(self._errors, weight, estimate.deviation, strict=True)
         self._errors = tuple([old + part * (abs(w) * error - old) for old, w, error in columns])
-        if self._carried < LEAST_WEIGHT**2:
+        if self._carried < SHARE.least_weight**2:
             return None
         return self._given / self._carried, math.hypot(*self._errors) / self._carried
 
@@ -104,5 +114,5 @@ def share_of(curve: WearerCurve, window: float = math.inf) -> Share:
         total = np.vstack((np.zeros(products.shape[1]), products.cumsum(axis=0)))
         sums = total[1:] - total[np.searchsorted(curve.time, curve.time - window)]
     count, given, carried = np.moveaxis(sums[..., :3], -1, 0)
-    enough = np.where(carried > LEAST_WEIGHT**2 * count, carried, np.nan)
+    enough = np.where(carried > SHARE.least_weight**2 * count, carried, np.nan)
     return Share(given / enough, np.linalg.norm(sums[..., 3:], axis=-1) / enough)

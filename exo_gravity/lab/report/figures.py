@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.lab.observer.momentum import COVER
+from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
 from exo_gravity.lab.report.table import joint_labels, per_minute
 from exo_gravity.lab.report.wearer_share import WearerPart

@@ -1,4 +1,4 @@
-"""The wearer's torque and share in a report, by the same observer that runs in the compensator.
+"""The wearer's torque and share in a report, by the same observer that runs in the node `wearer`.
 
 It needs the compensator's parameters and, if that used an IMU, `/imu/data`. Parameters that were changed during the
 recording are those of its start.
@@ -14,10 +14,10 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
-from exo_gravity.lab.observer.momentum import COVER
-from exo_gravity.lab.observer.share import WINDOW, Share, WearerCurve, observed, share_of, while_between
+from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, observed, share_of, while_between
 from exo_gravity.lab.trial.recording import Recording
 
 
@@ -37,7 +37,7 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     values = recorded_of(bag.parameters, recording.name, "compensator")
     settings = settings_of({**values, "law": "exact"}) if values else None
     if settings is None or not any(settings.wearer_mass):
-        return None  # without a wearer in the model, his arm's weight would count as his torque
+        return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
     if settings.use_imu and not times:
         raise DataError("the recording has no /imu/data")
@@ -50,7 +50,7 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
 
     curve = observed(settings, recording.time, (recording.position, recording.velocity, recording.effort), trunk_at)
     curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
-    return WearerPart(curve, share_of(curve, WINDOW), share_of(curve)) if len(curve.time) else None
+    return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve)) if len(curve.time) else None
 
 
 def sentence(part: WearerPart) -> str:
@@ -59,6 +59,6 @@ def sentence(part: WearerPart) -> str:
     if not np.isfinite(share.value):
         return "The wearer's arm hung all the time: there was nothing to carry."
     band = COVER * float(share.deviation)
-    value = f"{100.0 * float(share.value):.0f} % of his arm's weight (95 % band ±{100.0 * band:.0f})"
-    doubt = "" if abs(share.value) > band else ": not distinguishable from zero"
-    return f"The wearer carried {value}{doubt}."
+    value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
+    caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
+    return f"The wearer carried {value}{caveat}."

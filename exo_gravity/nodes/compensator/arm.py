@@ -71,6 +71,8 @@ def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[s
         "law in use": "exact" if answer.fallback else s.law,
         "mode": s.mode,
         "support": s.support,
+        "support in use": row([s.support_now]),
+        "support request": control.support_request.report(time.monotonic()),
         "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
         "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
         "robot moments (kg m)": row(moments_of(s.robot)),

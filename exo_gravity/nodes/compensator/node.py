@@ -20,13 +20,13 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation.compensator import Answer, Compensator
 from exo_gravity.core.compensation.settings import Settings, UrdfSettings
+from exo_gravity.core.compensation.support import TOPIC as SUPPORT_REQUEST
 from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.compensation.weighing import Weighing, refusal
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
-from exo_gravity.nodes.compensator.watches import BudgetWatch, WearerWatch
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
@@ -42,7 +42,8 @@ from exo_gravity.nodes.ros.subscriptions import (
 
 SILENCE = 0.5  # s without joint states until diagnostics report it
 REPORT_PERIOD = 0.5  # s
-ASSIST_PAUSE = 0.002  # s between two looks, so that an outer loop that floods its topic does not slow the answers down
+# s between two looks, so that a sender that floods its topic does not slow the answers down
+ASSIST_PAUSE, REQUEST_PAUSE = 0.002, 0.1
 MAX_CHANGES = 16  # answers whose reason is new, waiting for the report
 
 
@@ -65,8 +66,6 @@ class CompensatorNode(Node):
         self._names = values["joint_names"]
         settings = read(values)
         self._control = Compensator(settings, self._names)
-        self._budget: BudgetWatch | None = None
-        self._wearer: WearerWatch | None = None
         self._weighing: Weighing | None = None
         self._threads: list[PeriodicThread] = []
         if self._control.terms:
@@ -90,7 +89,7 @@ class CompensatorNode(Node):
             tilt = TiltSubscription(self, self._control.tilt, self._lock, self._refused, self._on_motion)
             self._sources |= tilt.senders
         accept_changes(self, table, read, self._apply)
-        # Only the executor's thread reports: diagnostics and budget are not for two threads.
+        # Only the executor's thread reports: diagnostics are not for two threads.
         self._changed = self.create_guard_condition(self._report_changes)
         self.create_timer(REPORT_PERIOD, self._report_current)
         self.get_logger().info(sentence(settings))
@@ -100,13 +99,15 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add what only the exoskeleton's own arm has: budget, assistance, the wearer's torque, weighing."""
-        self._budget = BudgetWatch(self, self._names)
+        """Add what only the exoskeleton's own arm has: assistance, support on request, weighing."""
         self._assist = terms.assist
-        self._assistant = Publishers()
-        path = PolledSubscription(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE)
-        self._wearer = WearerWatch(self, self._names, self._control, self._lock)
-        self._threads += [path, self._wearer]
+        self._assistant, self._requester = Publishers(), Publishers()
+        self._threads += [
+            PolledSubscription(self, JointState, "assist_efforts", self._on_assist_efforts, pause=ASSIST_PAUSE),
+            PolledSubscription(
+                self, JointState, SUPPORT_REQUEST, self._on_support_request, SHORT_QUEUE, pause=REQUEST_PAUSE
+            ),
+        ]
         self.create_service(Trigger, "~/weigh", self._weigh)
 
     def _open_interface(self, values: Mapping[str, Any], is_called: bool) -> JointStateInterface | MultiArrayInterface:
@@ -121,11 +122,8 @@ class CompensatorNode(Node):
 
     @property
     def failure(self) -> Exception | None:
-        """The exception that ended the thread of the joint states, of the assistance, or of a fade.
-
-        The estimate of the wearer's torque may end alone: no arm comes down for it.
-        """
-        return next((each.failure for each in self._threads if each.failure and each is not self._wearer), None)
+        """The exception that ended the thread of the joint states, of another topic, or of a fade."""
+        return next((each.failure for each in self._threads if each.failure), None)
 
     def close(self) -> None:
         """End the threads."""
@@ -165,8 +163,6 @@ class CompensatorNode(Node):
         if problem := second_publisher(self._sources):
             answer = Answer(None, problem)
         efforts = self._interface.send(now, message, answer)
-        if self._wearer:
-            self._wearer.newest = now, message
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
         changed = answer.reason != self._answer.reason or bool(answer.held) != bool(self._answer.held)
@@ -178,15 +174,23 @@ class CompensatorNode(Node):
         return efforts
 
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
-        now = time.monotonic()
-        age = (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
+        now, stamp = self._times_of(message)
         is_another = self._assistant.note(info)
         with self._lock:
-            self._assist.receive(now, message.name, message.effort, now - age, is_another)
+            self._assist.receive(now, message.name, message.effort, stamp, is_another)
+
+    def _on_support_request(self, message: JointState, info: dict[str, Any]) -> None:
+        now, stamp = self._times_of(message)
+        is_another = self._requester.note(info)
+        with self._lock:
+            self._control.support_request.receive(now, message.name, message.position, stamp, is_another)
+
+    def _times_of(self, message: JointState) -> tuple[float, float]:
+        """Return the present time and that of the message's stamp, both in monotonic s."""
+        now = time.monotonic()
+        return now, now - (self.get_clock().now().nanoseconds - to_nanoseconds(message.header.stamp)) * 1e-9
 
     def _on_motion(self, *sample: Any) -> None:
-        if self._wearer:
-            self._wearer.felt = sample
         if self._control.settings.inertial:  # each sample takes a fit, under the lock
             self._control.motion.add(*sample)
 
@@ -224,9 +228,7 @@ class CompensatorNode(Node):
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **report(self._control, answer, self._names),
-            **({"budget": self._budget.text, "largest support": self._budget.largest_support} if self._budget else {}),
-            **(self._wearer.values if self._wearer else {}),
-            **({"weighing": self._weighing.text if self._weighing else "none"} if self._wearer else {}),
+            **({"weighing": self._weighing.text if self._weighing else "none"} if self._control.terms else {}),
             "last refused message": self._refusal,
         }
 
@@ -239,12 +241,6 @@ class CompensatorNode(Node):
             self._report(self._changes.popleft())
 
     def _report_current(self) -> None:
-        settings = self._control.settings
-        if self._budget and isinstance(settings, Settings):
-            self._budget.update(settings)
-        if self._wearer and self._wearer.failure and isinstance(settings, Settings) and settings.raised_support:
-            with self._lock:
-                self._control.raise_support(0.0)
         self._report_changes()
         self._report(self._answer)
 

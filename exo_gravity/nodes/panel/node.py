@@ -53,9 +53,10 @@ class Timing:
 TIMING = Timing()
 
 
-BRIDGE, COMPENSATOR = "can_bridge", "compensator"
+BRIDGE, COMPENSATOR, WEARER = "can_bridge", "compensator", "wearer"
 SIMULATOR = "simulator"
-SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", SIMULATOR: "simulator"}  # what the page calls the status of each
+# What the page calls the status of each
+SHOWN = {BRIDGE: "bridge", COMPENSATOR: "compensator", WEARER: "wearer", SIMULATOR: "simulator"}
 SET = "set_parameters_atomically"
 ASKED = {  # service and request for each request of a page; None for the parameters that it names
     "let_down": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=False)),

@@ -192,6 +192,7 @@ class TiltSubscription:
     on_motion(now, force, rate, age): the trunk's motion, in its axes: s, m/s^2 (3,), rad/s (3,), s.
     on_tilt(now): `target` has a message of `now`, s.
     senders: the publishers by topic.
+    is_polled: messages are taken in `poll`, not by the executor.
     """
 
     def __init__(
@@ -202,12 +203,22 @@ class TiltSubscription:
         on_refusal: Callable[[str, ParameterError], object] = lambda topic, error: None,
         on_motion: Callable[..., object] = lambda *sample: None,
         on_tilt: Callable[[float], object] = lambda now: None,
+        is_polled: bool = False,
     ) -> None:
         self._node, self._target, self._lock = node, target, lock
         self._on_refusal, self._on_motion, self._on_tilt = on_refusal, on_motion, on_tilt
         self.senders = {topic: Publishers() for topic in (DATA, PITCH_YAW)}
-        node.create_subscription(Imu, DATA, self._on_data, NEWEST_ONLY)
-        node.create_subscription(Vector3Stamped, PITCH_YAW, self._on_pitch_yaw, NEWEST_ONLY)
+        self._polled: list[PolledSubscription] = []
+        for msgtype, topic, callback in ((Imu, DATA, self._on_data), (Vector3Stamped, PITCH_YAW, self._on_pitch_yaw)):
+            if is_polled:
+                self._polled.append(PolledSubscription(node, msgtype, topic, callback))
+            else:
+                node.create_subscription(msgtype, topic, callback, NEWEST_ONLY)
+
+    def poll(self) -> None:
+        """Take the newest message of each topic, if it is new."""
+        for path in self._polled:
+            path.poll()
 
     def _on_data(self, message: Imu, info: dict[str, Any]) -> None:
         if message.orientation_covariance[0] == NOT_REPORTED:

@@ -153,10 +153,11 @@ export class ArmCard {
     write(this.find(".detail"), bridge?.message ? t("detail", bridge.message) : "");
     const other = alive ? state.compensator : null;
     write(this.find(".compensator"), other ? (other.level ? t("compensator_detail", other.message) : t("carried", number(finite(other["mass carried (kg)"]), 2))) : alive ? t("compensator_silent") : "");
-    this.limit = finite(other?.["largest support"]);
-    this.adapts = other?.["support adapts"] ?? "off";
-    this.showShare(other?.["share of the wearer (%)"]);
-    this.showLoad(other, operates, name === "active");
+    const wearer = alive ? state.wearer : null;
+    this.limit = finite(wearer?.["largest support"]);
+    this.adapts = wearer?.["support adapts"] ?? "off";
+    this.showShare(wearer?.["share of the wearer (%)"]);
+    this.showLoad(other, wearer, operates, name === "active");
     this.root.classList.toggle("stale", !alive);
     this.find(".enable").disabled = !operates || name !== "disabled";
     this.find(".clear").disabled = !operates || name !== "fault";
@@ -172,7 +173,7 @@ export class ArmCard {
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
   }
 
-  // How much of his arm's weight the wearer carries, to be read from two metres: the bar, and its 95 % band.
+  // How much of their arm's weight the wearer carries, to be read from two metres: the bar, and its 95 % band.
   showShare(text) {
     const [value, width] = text?.match(/^(-?\d+) \+- (\d+)$/)?.slice(1).map(Number) ?? [];
     const known = value !== undefined;
@@ -189,7 +190,7 @@ export class ArmCard {
   }
 
   // The load in the hand, the result of the last weighing, and the last contact.
-  showLoad(compensator, operates, active) {
+  showLoad(compensator, wearer, operates, active) {
     const text = compensator?.weighing ?? "none";
     const found = text.match(/.* \+- ([\d.]+) kg .*payload\.mass = ([\d.]+)/);
     this.weighed = found ? Number(found[2]) : NaN;
@@ -199,7 +200,7 @@ export class ArmCard {
     write(this.find(".carry"), found ? t("carry_load", number(this.weighed, 2), number(Number(found[1]), 2)) : "");
     write(this.find(".payload"), t("payload_now", number(this.payload, 2)));
     write(this.find(".weighing"), text === "none" ? "" : text);
-    const contact = compensator?.contact ?? "none";
+    const contact = wearer?.contact ?? "none";
     write(this.find(".contact"), contact === "none" ? "" : t("contact", contact));
   }
 

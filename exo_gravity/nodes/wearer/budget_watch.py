@@ -1,0 +1,79 @@
+"""The torque budget of what an arm carries at present: whether its motors can hold it in every pose.
+
+It takes about 0.2 s of arithmetic, on a thread of its own, so that the estimate of the wearer's torque goes on.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from rclpy.node import Node
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
+from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.nodes.ros.parameters import NodeParameters
+
+WITHIN = "within rated torque everywhere"
+BRIDGE_PARAMETERS = {"motor", "torque_scale", "position_min", "position_max"}
+Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (n,) kg and centre of gravity (n,) m
+Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
+
+
+class BudgetWatch:
+    """Checks the newest settings, one budget at a time. Call `update` regularly.
+
+    Motors and joint limits are parameters of `can_bridge`, which are read once.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.text = "unknown: waiting for can_bridge's parameters"  #: the result for the settings checked last
+        #: share 0..1 of the wearer's arm within rated torque everywhere, 0 if none is, 'none' without a wearer
+        self.largest_support = "unknown"
+        self._logger = node.get_logger()
+        self._bridge = NodeParameters(node, "can_bridge", once=True)
+        self._request: Request | None = None
+        self._job: Future[tuple[str, str]] | None = None
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
+
+    def update(self, names: Sequence[str], settings: Settings) -> None:
+        """Collect a finished budget, or start one for `settings` if they are new. Never blocks.
+
+        names: of the joints (n,).
+        """
+        self._bridge.update()
+        if self._job is not None:
+            if self._job.done():
+                (self.text, self.largest_support), self._job = self._job.result(), None
+                if self.text != WITHIN:
+                    self._logger.warning(f"{self.text}; efforts stay clamped to max_effort")
+        elif self._bridge.values.keys() >= BRIDGE_PARAMETERS:
+            request = request_of(settings)
+            if request != self._request:
+                self._request = request
+                self._job = self._pool.submit(compute, names, request, self._bridge.values)
+
+
+def request_of(s: Settings) -> Request:
+    """Return what the motors must be able to hold with these settings."""
+    support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
+    tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
+    return s.loaded, (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
+
+
+def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[str, str]:
+    """Return `text` and `largest_support` of `BudgetWatch`.
+
+    names: of the joints (n,).
+    bridge: its parameter values.
+    """
+    robot, load, support, tilt = request
+    try:
+        bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
+        rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
+        joints = budget(robot, load, support, bounds, rated, peak)
+    except ParameterError as error:
+        return f"unknown: can_bridge has {error}", "unknown"
+    return overload(names, joints) or WITHIN, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else "none"

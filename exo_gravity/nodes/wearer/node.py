@@ -1,0 +1,248 @@
+"""wearer: estimates what the wearer of an arm does, beside the path of the torque.
+
+It reads `joint_states`, the trunk's motion and the compensator's parameters, 100 times a second, and publishes
+
+    wearer_efforts      sensor_msgs/JointState: the torque that the wearer adds at each joint, Nm
+    wearer_efforts_std  sensor_msgs/JointState: one standard deviation of it, Nm
+    support_request     sensor_msgs/JointState: the support that it asks the compensator for, with `support_adapts`
+
+No arm comes down if it ends or is late: without a fresh request the compensator returns to its parameter `support`.
+While the compensator is silent, or its parameters are not known, nothing is published, and /diagnostics says why.
+"""
+
+import math
+import threading
+import time
+from typing import Any
+
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings, settings_of
+from exo_gravity.core.compensation.support import NAME, TOPIC
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trunk.inputs import FELT, TiltInput
+from exo_gravity.lab.observer.share import PERIOD
+from exo_gravity.lab.observer.watch import WearerWatch
+from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
+from exo_gravity.nodes.ros.parameters import NodeParameters, declare
+from exo_gravity.nodes.ros.run import run
+from exo_gravity.nodes.ros.subscriptions import PeriodicThread, PolledSubscription, TiltSubscription
+from exo_gravity.nodes.wearer.budget_watch import BudgetWatch
+
+COMPENSATOR = "compensator"
+PARAMETER_PERIOD = 0.1  # s between two looks whether the compensator's parameters are to be read
+REPORT_PERIOD = 0.5  # s
+REQUEST_PERIOD = 0.2  # s
+SILENCE = 0.5  # s without joint states, after which they are waited for
+# s without the compensator's diagnostics, which come twice a second: the middleware lists a killed node for 20 s
+COMPENSATOR_SILENCE = 2.0
+FRESH = 0.1  # s, age of the trunk's motion that is used
+
+
+class Trunk:
+    """The trunk's tilt and motion, from the topics of the IMU. settings: of its arm's compensator."""
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        self._side = settings.side
+        self._tilt = TiltInput(settings.side, settings.tilt_timeout)
+        self._felt_at, self._force, self._rate = -math.inf, ZERO, ZERO  # monotonic s, m/s^2, rad/s
+        on_motion = self._on_motion
+        self._subscription = TiltSubscription(node, self._tilt, threading.Lock(), on_motion=on_motion, is_polled=True)
+
+    def at(self, now: float) -> tuple[Tilt, Floats3] | None:
+        """Return the tilt of what the trunk feels as gravity, and its angular velocity; None if none is fresh.
+
+        now: monotonic s. The angular velocity is in the arm's base frame, (3,) rad/s.
+        """
+        self._subscription.poll()
+        if now - self._felt_at < FRESH and FELT.range[0] < math.hypot(*self._force) < FELT.range[1]:
+            tilt = Tilt.of_felt(self._side, [-component for component in self._force], STANDARD_GRAVITY)
+            return tilt, turning_in_base(self._side, self._rate)
+        return None if self._tilt.problem(now) else (self._tilt.at(now), ZERO)
+
+    def _on_motion(self, now: float, force: Floats3, rate: Floats3, _age: float) -> None:
+        self._felt_at, self._force, self._rate = now, force, rate
+
+
+class WearerNode(Node):
+    """The ROS shell around a `WearerWatch`.
+
+    The estimate has a thread of its own: rclpy's executor would take more of the processor than the arithmetic does.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("wearer", automatically_declare_parameters_from_overrides=True)
+        declare(self, ())
+        name = f"{self.get_namespace().rstrip('/')}/{COMPENSATOR}"
+        self._compensator = NodeParameters(self, name, self._on_parameters)
+        self._status_name = name.lstrip("/")
+        self._answers = 0  # of the compensator, since its start
+        self._statuses = Statuses(self)
+        self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
+        self._budget = BudgetWatch(self)
+        self._diagnostics = Diagnostics(self)
+        self._efforts, self._deviations = (
+            self.create_publisher(JointState, f"wearer_efforts{part}", 1) for part in ("", "_std")
+        )
+        self._requests = self.create_publisher(JointState, TOPIC, 1)
+        self._request_due, self._requested = -math.inf, 0.0  # s, and the last one
+        # Of the compensator: its parameters, what never changes of them, and why they cannot be used.
+        self._settings: Settings | None = None
+        self._fixed: tuple[object, ...] = ()
+        self._refusal = ""
+        # What is read and told, once the parameters are known.
+        self._names: list[str] = []
+        self._joint_states: PolledSubscription | None = None
+        self._trunk: Trunk | None = None
+        self._watch: WearerWatch | None = None
+        self._lock = threading.Lock()  # guards the watch
+        self._due = 0.0  # monotonic s
+        self._newest: tuple[float, JointState | None] = (-math.inf, None)  # monotonic s of its arrival
+        self._problem = "waiting for joint_states"  # with the newest sample
+        self._last = -math.inf  # monotonic s of the newest sample
+        self.create_timer(PARAMETER_PERIOD, self._follow_compensator)
+        self.create_timer(REPORT_PERIOD, self._report)
+        self._thread = PeriodicThread("estimate", self._tick, 0.0)
+        self._thread.start()
+
+    @property
+    def failure(self) -> Exception | None:
+        """The exception that ended the thread of the estimate."""
+        return self._thread.failure
+
+    def close(self) -> None:
+        """End the thread."""
+        self._thread.stop()
+
+    def _follow_compensator(self) -> None:
+        """Read the compensator's parameters if they may have changed."""
+        answers = int(self._statuses.within(COMPENSATOR_SILENCE, self._status_name).get("answers", 0))
+        if answers < self._answers:  # silent, or restarted: it may have other parameters
+            self._compensator.refresh()
+        self._answers = answers
+        self._compensator.update()
+        if self._settings:
+            self._budget.update(self._names, self._settings)
+
+    def _on_parameter_event(self, event: ParameterEvent) -> None:
+        if event.node.lstrip("/") == self._status_name:
+            self._compensator.refresh()
+
+    def _on_parameters(self, _name: str, values: dict[str, Any]) -> None:
+        """Use the compensator's parameters, or note why they cannot be used."""
+        self._settings, self._refusal = None, ""
+        if values["law"] == URDF_LAW:
+            self._refusal = f"law {URDF_LAW}: there is no wearer to estimate"
+            return
+        try:
+            settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is told in any case
+        except ParameterError as error:
+            self._refusal = f"the compensator has {error}"
+            return
+        topic = "joint_states"
+        if values.get("command_interface") == "multi_array":
+            topic = values["multi_array.joint_states"]
+        fixed = (values["joint_names"], settings.side, settings.use_imu, topic)
+        if self._watch is None:
+            self._fixed, self._names = fixed, values["joint_names"]
+            self._joint_states = PolledSubscription(self, JointState, topic, self._on_joint_state)
+            self._trunk = Trunk(self, settings) if settings.use_imu else None
+            self._watch = WearerWatch(self._names, settings)
+        if fixed != self._fixed:
+            self._refusal = "the compensator has other joints or another trunk than before: restart this node"
+            return
+        with self._lock:
+            self._watch.apply(settings)
+        self._settings = settings
+
+    def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
+        age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
+        self._newest = time.monotonic() - max(0.0, age), message
+
+    def _tick(self) -> None:
+        now = time.monotonic()
+        self._due = max(self._due + PERIOD, now)
+        time.sleep(self._due - now)
+        self._estimate()
+
+    def _estimate(self) -> None:
+        """Publish what the newest joint state tells, if it is new."""
+        settings, watch = self._settings, self._watch
+        if not settings or not watch or not self._joint_states or self._silence():
+            return
+        self._joint_states.poll()
+        taken, message = self._newest
+        if message is None or taken <= self._last:
+            return
+        self._last = taken
+        joints, trunk = self._joints(message), self._trunk_at(taken, settings)
+        with self._lock:
+            estimate = watch.update(taken, joints, trunk)
+        self._problem = ""
+        if estimate:
+            for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
+                told = JointState(name=self._names, effort=values)
+                told.header.stamp = message.header.stamp
+                publisher.publish(told)
+        elif trunk is None:
+            self._problem = "no fresh tilt of the trunk"
+        else:
+            self._problem = "joint_states have no positions, velocities and efforts of these joints"
+        self._ask_for_support()
+
+    def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
+        """Return positions, velocities and efforts (n,); None if one is missing."""
+        try:
+            return [by_name(message, field, self._names, exact=False) for field in ("position", "velocity", "effort")]
+        except ParameterError:
+            return None
+
+    def _trunk_at(self, now: float, settings: Settings) -> tuple[Tilt, Floats3] | None:
+        return self._trunk.at(now) if self._trunk else (Tilt.of(settings.side), ZERO)
+
+    def _ask_for_support(self) -> None:
+        """Renew the request, or change it at once."""
+        requested, now = self._watch.adaptation.requested if self._watch else None, time.monotonic()
+        if requested is None or (now < self._request_due and requested == self._requested):
+            return
+        self._request_due, self._requested = now + REQUEST_PERIOD, requested
+        request = JointState(name=[NAME], position=[requested])
+        request.header.stamp = self.get_clock().now().to_msg()
+        self._requests.publish(request)
+
+    def _silence(self) -> str:
+        """Return who is silent, '' if the compensator is not."""
+        is_heard = self._statuses.within(COMPENSATOR_SILENCE, self._status_name)
+        return "" if is_heard else f"waiting for {self._status_name}"
+
+    def _headline(self, now: float) -> tuple[bytes, str]:
+        if problem := self._silence() or self._refusal:
+            return WARN, problem
+        if not self._settings:
+            return WARN, f"waiting for the parameters of {self._status_name}"
+        if now - self._last > SILENCE:
+            return (STALE if math.isfinite(self._last) else WARN), "waiting for joint_states"
+        return (WARN, self._problem) if self._problem else (OK, "estimating the wearer's torque")
+
+    def _report(self) -> None:
+        now = time.monotonic()
+        values: dict[str, object] = {"budget": self._budget.text, "largest support": self._budget.largest_support}
+        is_known = self._settings and not self._silence()
+        if self._watch and is_known:
+            with self._lock:
+                values |= self._watch.values(now)
+        else:
+            values |= {"wearer (Nm)": "unknown", "share of the wearer (%)": "unknown", "contact": "none"}
+            values["support adapts"] = "off"
+        self._diagnostics.report(*self._headline(now), values)
+
+
+def main() -> None:
+    """Entry point of the executable `wearer`."""
+    raise SystemExit(run(WearerNode, priority=5))  # below the control loop
