@@ -114,13 +114,12 @@ def budget(
     bounds: np.ndarray,
     rated: Vector,
     peak: Vector,
-    pause: Callable[[], None] = lambda: None,
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
     load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. bounds:
-    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. pause: called about 500 times, before each chunk
-    of about a millisecond of computation. Raises ParameterError if the load does not fit the robot.
+    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if the load does not fit the
+    robot.
     """
     full = robot.with_wearer(*load)
 
@@ -128,7 +127,6 @@ def budget(
         """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""
         chunks = []
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
-            pause()
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
         return own, with_all - own

@@ -55,6 +55,10 @@ class Trunk:
         on_motion = self._on_motion
         self._subscription = TiltSubscription(node, self._tilt, threading.Lock(), on_motion=on_motion, is_polled=True)
 
+    def apply(self, settings: Settings) -> None:
+        """Use the compensator's new settings."""
+        self._tilt.timeout = settings.tilt_timeout
+
     def at(self, now: float) -> tuple[Tilt, Floats3] | None:
         """Return the tilt of what the trunk feels as gravity, and its angular velocity; None if none is fresh.
 
@@ -136,14 +140,13 @@ class WearerNode(Node):
 
     def _on_parameters(self, _name: str, values: dict[str, Any]) -> None:
         """Use the compensator's parameters, or note why they cannot be used."""
-        self._settings, self._refusal = None, ""
         if values["law"] == URDF_LAW:
-            self._refusal = f"law {URDF_LAW}: there is no wearer to estimate"
+            self._settings, self._refusal = None, f"law {URDF_LAW}: there is no wearer to estimate"
             return
         try:
             settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is told in any case
         except ParameterError as error:
-            self._refusal = f"the compensator has {error}"
+            self._settings, self._refusal = None, f"the compensator has {error}"
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -155,11 +158,14 @@ class WearerNode(Node):
             self._trunk = Trunk(self, settings) if settings.use_imu else None
             self._watch = WearerWatch(self._names, settings)
         if fixed != self._fixed:
-            self._refusal = "the compensator has other joints or another trunk than before: restart this node"
+            refusal = "the compensator has other joints or another trunk than before: restart this node"
+            self._settings, self._refusal = None, refusal
             return
         with self._lock:
             self._watch.apply(settings)
-        self._settings = settings
+        if self._trunk:
+            self._trunk.apply(settings)
+        self._settings, self._refusal = settings, ""
 
     def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
         age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
