@@ -27,7 +27,6 @@ EXCEPTIONS = {
     "exo_gravity/lab/calibration/live.py": {"tools"},
     "exo_gravity/lab/report/video.py": {"tools"},
     "exo_gravity/lab/trial/run.py": {"tools"},
-    "exo_gravity/core/compensation/weighing.py": {"lab"},
 }
 # The path of a torque: what a torque depends on. It imports nothing that looks at arms from outside.
 PATH_NODES = ("can_bridge", "compensator", "imu", "ros")

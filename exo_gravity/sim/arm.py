@@ -3,7 +3,7 @@
 Standard Denavit-Hartenberg, Table 1 of the paper: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
 (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity of
 link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
-these and not from the laws of `core.model.gravity`, so that it can contradict them.
+these and not from the laws of `core.arm.gravity`, so that it can contradict them.
 
 In the axes of an accelerated base, gravity is g - a: turned and scaled. If the base also turns, the Euler, centrifugal
 and Coriolis forces act on each link. They are not small: a sway of 2 degrees at 1 Hz accelerates a forearm 0.4 m from

@@ -125,7 +125,7 @@ def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
 def test_terms_are_set_live_and_need_velocities(rig):
     rig.velocity = (0.15, -0.15, 0.0, 0.0)  # a change of load waits for slow joints
     rig.wait_until(lambda: rig.adds(STILL))
-    assert rig.set(friction__identified=[0.2, 0.4, 0.2, 0.2, 0.0, 0.0, 0.0, 0.0], friction__share=0.5) == ["", ""]
+    assert rig.set(friction__coulomb=[0.2, 0.4, 0.2, 0.2], friction__share=0.5) == ["", ""]
     rig.wait_until(lambda: rig.adds((0.1, -0.2, 0.0, 0.0)))
     rig.wait_until(lambda: rig.values["terms"] == "friction")
     rig.velocity = ()

@@ -31,7 +31,8 @@ WEARER = {
     "wearer.body_mass": 75.0,
     "wearer.sex": "female",
     "wearer.segment_length": [0.3, 0.25, 0.08],
-    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+    "limits.lower": [-0.5, -0.2, -0.2, 0.0],
+    "limits.upper": [0.5, 1.5, 1.5, 2.0],
 }
 
 

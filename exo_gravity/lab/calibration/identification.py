@@ -2,7 +2,7 @@
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,
 
-    effort = torque(moments + load) / scale + offset          torque: `core.model.gravity.regressor` times the moments
+    effort = torque(moments + load) / scale + offset          torque: `core.arm.gravity.regressor` times the moments
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import LAWS, Torque, regressor
+from exo_gravity.core.arm.gravity import Torque, exact_torque, regressor
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
+from exo_gravity.core.compensation.tracking import MOTION, Line, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL_WIDTH, Limits
@@ -33,7 +33,7 @@ WAYPOINTS = 8  # of the way to a pose, at which the motors must hold the arm too
 FIRST_EDGE = 0.1  # rad in addition, at the first pose
 EDGE = 0.02  # rad between a sweep's end and the soft wall
 TIME_SHARE = 1.5  # of the time left for each pose, that the next one may take
-SWEEP_SPEEDS = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  # rad/s, at which friction is measured
+SWEEP_SPEEDS = (0.02, 0.05, 0.1, 0.18, MOTION.speed)  # rad/s, at which friction is measured
 SWEEP_TIME = 1.2  # s of such a sweep's half at steady speed
 SWEEP_AMPLITUDE = (0.05, 0.3)  # rad
 NOISE = 0.03  # Nm in any pose
@@ -45,7 +45,7 @@ GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30,
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m. moments: (8,) kg m, as in `core.model.gravity`, with the load. tilt: of the trunk or the stand.
+    length: (4,) m. moments: (8,) kg m, as in `core.arm.gravity`, with the load. tilt: of the trunk or the stand.
     """
 
     def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
@@ -65,7 +65,7 @@ class TorqueGuess:
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
-        law = LAWS["exact"]
+        law = exact_torque
         return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -133,11 +133,11 @@ class Itinerary:
     def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         home, way = (
-            np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
+            np.array([Line(pose, candidate).duration + MOTION.lead for candidate in self._candidates])
             for pose in (np.array(self._home.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
-        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
+        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + MOTION.lead)
         fits = way + sweeps <= budget * (TIME_SHARE if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
@@ -148,7 +148,7 @@ class Itinerary:
         known. friction: (4,) Nm, against which the arm is moved.
         """
         shares = np.linspace(0.0, 1.0, WAYPOINTS + 1)[1:, None, None]
-        sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
+        sweep = MOTION.amplitude * np.array((-1.0, 1.0))[:, None, None]
         start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
         mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
         most = SHARE * np.array(self._limits.max_effort) - [own or USUAL_FRICTION for own in friction]
@@ -157,7 +157,7 @@ class Itinerary:
         return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
 
 
-def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
+def hanging(limits: Limits, speed: float = 0.1, amplitude: float = MOTION.amplitude) -> Station:
     """Return the hanging arm, off the soft walls by FIRST_EDGE: friction is not known there at first."""
     low, high = measurable(limits, amplitude)
     return Station(tuple(np.clip(limits.home, low + FIRST_EDGE, high - FIRST_EDGE).tolist()), speed, amplitude)
@@ -175,7 +175,7 @@ def candidates(limits: Limits) -> np.ndarray:
 
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
-    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CANDIDATES, JOINT_COUNT))
+    poses = np.random.default_rng(1).uniform(*measurable(limits, MOTION.amplitude), (CANDIDATES, JOINT_COUNT))
     down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
     return np.asarray(poses[down.min(axis=1) >= -MOST_UPWARDS])
 

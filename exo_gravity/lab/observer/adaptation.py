@@ -18,7 +18,7 @@ import operator
 from collections.abc import Sequence
 
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.compensation.guidance import FADE_TIME
+from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.lab.observer.momentum import COVER, MAX_GAP, WearerEstimate
 from exo_gravity.lab.observer.share import LEAST_WEIGHT, RunningShare
@@ -79,7 +79,7 @@ class SupportAdaptation:
         self.support = max(settings.support, min(1.0, self.support + dt * (RISE * sunk - fall)))
         if now < self._due or abs(self.support - settings.support_now) < LEAST_CHANGE:
             return False
-        self._due = now + FADE_TIME  # one guided change after the other
+        self._due = now + GUIDANCE.fade_time  # one guided change after the other
         return True
 
     def _sunk(self, dt: float, joints: Sequence[Sequence[float]], weight: Torque, asked: float) -> float:

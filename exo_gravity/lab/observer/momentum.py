@@ -19,15 +19,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
 from exo_gravity.core.arm.kinematics import ROTORS, LinkInertia, links_of
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import sliding
+from exo_gravity.core.numbers import COVER
 
 BANDWIDTH = 15.0  # rad/s of each of the two low-passes
-COVER = 1.96  # standard deviations of the 95 % band
 MAX_GAP = 0.2  # s between two samples, after which the observer starts anew
 # Nm, of a joint whose friction was not identified: typical of backdrivable planetary gears
 TYPICAL_COULOMB = (0.2, 0.4, 0.2, 0.2)
@@ -65,7 +65,7 @@ class MomentumObserver:
         s = settings
         self._error = s.model_error
         self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
-        self._wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, s.robot.gain, s.robot.gravity)
+        self._wearer = ArmModel(s.loaded.length, s.wearer_cog, s.wearer_mass, s.loaded.gain, s.loaded.gravity)
         own, worn = links_of(s.loaded), links_of(self._wearer)
         rows = zip(own.weights, worn.weights, strict=True)
         self._links = LinkInertia(tuple([tuple(map(operator.add, *row)) for row in rows]), ROTORS)
@@ -88,7 +88,7 @@ class MomentumObserver:
         feels as gravity, with its magnitude. turning: the trunk's angular velocity in the arm's base frame, (3,) rad/s.
         """
         theta, velocity, effort = joints
-        columns = [LAWS["exact"](self._whole, theta, axis) for axis in AXES]
+        columns = [exact_torque(self._whole, theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
@@ -112,7 +112,7 @@ class MomentumObserver:
             self._outer, self._slow, self._felt = tuple(once), momentum, felt
         self._input, self._momentum = tuple(unexplained), momentum
         lag = list(map(operator.sub, once, self._outer))
-        worn = LAWS["exact"](self._wearer, theta, tilt)
+        worn = exact_torque(self._wearer, theta, tilt)
         shaken = MOTION_SHARE * math.dist(felt, self._felt)
         largest = [math.hypot(*column) for column in zip(*columns, strict=True)]  # gravity in any direction
         deviation = [

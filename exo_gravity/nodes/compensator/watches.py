@@ -96,7 +96,7 @@ class WearerWatch(Repeated):
     def _adaptation_text(self) -> str:
         """Return from which support to which it adapts."""
         s = self._control.settings
-        if not isinstance(s, Settings) or s.mode != "zero_g" or not s.support_adapts:
+        if s.mode != "zero_g" or not s.support_adapts:
             return "off"
         problem = "the estimate failed" if self.failure else self._adaptation.problem
         ends = dict.fromkeys(f"{100.0 * support:.0f}" for support in (s.support, s.support_now))
@@ -108,7 +108,7 @@ class WearerWatch(Repeated):
         time.sleep(self._due - now)
         taken, message = self.newest
         settings = self._control.settings
-        if message is None or not isinstance(settings, Settings) or taken <= self._last:
+        if message is None or taken <= self._last:
             return
         self._last = taken
         trunk, joints = self._trunk(settings, taken), self._joints(message)

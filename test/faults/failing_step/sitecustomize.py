@@ -9,12 +9,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.compensator import Compensation, Compensator
 
 if path := os.environ.get("EXO_TEST_FAILURE"):
     file, step = Path(path), Compensator.step
 
-    def failing_step(compensator: Compensator, *reading: Any) -> Answer:
+    def failing_step(compensator: Compensator, *reading: Any) -> Compensation:
         """Fail if the file exists, else step."""
         if file.exists():
             if file.read_text() == "sleep":
