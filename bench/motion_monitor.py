@@ -326,7 +326,7 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
     """Yield sound compensators: name, compensator, and `largest_moment` and `largest_addition` (4,) that suit it."""
     full, half = settings_of(BODY_MASS), settings_of(BODY_MASS, support=0.5)
     added = TermSettings(
-        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 0.02)),
+        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)),
         inertia=Inertia(0.6),
         spring=Spring((2.0, 4.0, 2.0, 1.0)),
         assist=Assist((2.0, 4.0, 2.0, 2.0)),

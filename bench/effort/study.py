@@ -69,7 +69,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
         "damping": TermSettings(damping=Damping([SOFT * inertia / (2.0 * DELAY) for inertia in least])),
         "spring": TermSettings(spring=Spring(soft, MIDDLE)),
         "coupling": TermSettings(coupling=Coupling((0.0, 0.0, -0.4 * min(soft), 0.5 * min(soft)))),
-        "limits": TermSettings(limits=SoftLimits((-0.5, 1.5, 0.3, 1.6, 0.0, 1.6, 0.2, 2.5), soft)),
+        "limits": TermSettings(limits=SoftLimits((-0.5, 0.3, 0.0, 0.2), (1.5, 1.6, 1.6, 2.5), soft)),
     }
     zero = replace(base, mode="zero_g", support=1.0)
     return {

@@ -136,7 +136,7 @@ def draw(seed: int) -> Worn:
     )
     settings = replace(
         full, max_effort=[min(MOST, motor.peak_effort) for motor in motors],
-        terms=TermSettings(friction=Friction(0.0, (*(coulomb * wrong[0]), *(viscous * wrong[1])))),
+        terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
     )  # fmt: skip
     return Worn(seed, side, config, scale, settings, motors, left, ways)
 

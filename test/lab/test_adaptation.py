@@ -11,7 +11,7 @@ import pytest
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import FADE_TIME
+from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.observer.adaptation import MEMORY, RISE, SupportAdaptation
@@ -65,7 +65,8 @@ def test_the_support_rises_while_the_arm_sinks_and_no_faster_than_one_guided_cha
     assert arm.move(0.0, 5.0) == pytest.approx(0.4, abs=0.02)
     assert arm.move(-0.05, 5.0) == pytest.approx(0.4 + 5.0 * RISE, abs=0.04)
     assert all(
-        later - earlier >= FADE_TIME - 1e-9 for earlier, later in zip(arm.changes, arm.changes[1:], strict=False)
+        later - earlier >= GUIDANCE.fade_time - 1e-9
+        for earlier, later in zip(arm.changes, arm.changes[1:], strict=False)
     )
     assert 2 <= len(arm.changes) <= 4
     arm.share = 0.05

@@ -54,7 +54,7 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
     taken, arm = observations(outlier=outlier), configured_arm()
     result = identify(taken, arm.robot.length)
     found = CalibrationResult(
-        (Change("/right/compensator", "robot.moments", result.moments.tolist(), "kg m, <±0.001>"),),
+        (Change("/right/compensator", "robot.first_moment", result.moments[:4].tolist(), "kg m, <±0.001>"),),
         ("M4 is 20 % larger than in the file.",),
         (),
         arm,
@@ -102,7 +102,7 @@ def test_the_page_says_what_was_found_and_what_does_not_show() -> None:
     page = page_of(found, "gravity", "old.yaml", DAY)
     assert '<h1>calibrate gravity, right arm</h1><p class="when">2026-11-22, from old.yaml</p>' in page
     assert "<b>Calibrated.</b>" in page
-    assert "robot.moments" in page and "kg m, &lt;±0.001&gt;" in page
+    assert "robot.first_moment" in page and "kg m, &lt;±0.001&gt;" in page
     assert "M4 is 20 % larger than in the file." in page
     assert page.count("data:image/png;base64,") == 1
     assert found.identified is not None
@@ -123,7 +123,7 @@ def test_a_pose_that_was_left_out_is_not_counted() -> None:
 def test_a_refusal_is_on_the_page_without_new_values() -> None:
     page = page_of(outcome(refusals=("pose 3 slipped",), identified=None), "gravity", "old.yaml", DAY)
     assert "Not calibrated; no file was written.</b><ul><li>pose 3 slipped</li>" in page
-    assert "robot.moments" not in page and "<img" not in page
+    assert "robot.first_moment" not in page and "<img" not in page
 
 
 def test_friction_is_drawn_over_speed() -> None:
