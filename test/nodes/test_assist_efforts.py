@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ class Rig(CompensatorRig):
 def running() -> Iterator[Rig]:
     """A node that changes its load sooner than a wearer may feel, which test_compensator.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guidance, "FADE_TIME", 0.2)
+        patch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, fade_time=0.2))
         rig = Rig()
         yield rig
         rig.close()

@@ -147,7 +147,7 @@ def test_without_terms_nothing_is_added():
 def test_what_the_terms_before_a_change_would_give_stays_known():
     driven = Driven(TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4)))
     expected = driven.run(0.1)
-    before = driven.terms.now
+    before = driven.terms.in_force
     driven.terms.apply(TermSettings(), DEFAULT_LINKS)
     assert driven.run(0.002) == ZERO
     assert driven.terms.torque_of(before) == pytest.approx(expected)
