@@ -113,14 +113,18 @@ class Compensator:
 
         velocity: (n,) rad/s, None if not known: then the terms add nothing, and changes take longer.
         """
-        if problem := self._problem_of(theta):
-            return Compensation.withdrawn(problem)
-        held, problem = self._tilt_at(now, theta)
-        if problem:
-            return Compensation.withdrawn(problem)
-        reading = Reading(now, theta, velocity)
-        before = self._take_pending()
-        self._withdraw_lost_load(reading)
+        if len(theta) != len(self._effort) or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
+            expected = f"{len(self._effort)} numbers within {MAX_ANGLE:g} rad"
+            return Compensation.withdrawn(f"joint angles {list(theta)} are not {expected}")
+        held = late = self.tilt.problem(now) if self.settings.use_imu else ""
+        if late:
+            turn = self.tilt.unknown_turn(now)
+            if not turn <= MAX_TURN:
+                return Compensation.withdrawn(late)
+            held = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
+        before = self._replace_load(self._pending) if self._pending else None
+        if self.settings.payload_mass and velocity:
+            self._withdraw_lost_load(now, theta, velocity)
         was_replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
@@ -129,7 +133,10 @@ class Compensator:
         torque = gravity
         if self.terms and velocity:
             torque = tuple(map(operator.add, gravity, self.terms.torque(now, theta, velocity)))
-        torque, ended = self._weighed(dt, reading, torque)
+        weighing = self._active_weighing if velocity else None
+        if weighing and velocity:
+            torque = weighing.torque(dt, theta, velocity, self.tilt.at(now), torque)
+        ended = weighing if weighing and weighing.is_over else None
         torque = clamped(torque, s.max_effort)
         if not 0.0 <= dt <= RAMP.pause:
             self._restart(now)
@@ -137,53 +144,30 @@ class Compensator:
         elif ended and ended.is_thrown:
             self._damped_until = now + GUIDANCE.watch  # a guided change would be too slow
         elif before or ended or bool(self._fallback) != was_replaced:
-            self._begin_change(before, torque, reading)  # without `before`: a replaced law may not apply here
+            self._begin_change(before, torque, Reading(now, theta, velocity))
         change = self._change
         if not change.is_over:
-            torque = change.step(dt, velocity, self._torque_of_origins(self._origins, torque, reading), torque)
+            start = self._torque_of_origins(self._origins, torque, Reading(now, theta, velocity))
+            torque = change.step(dt, velocity, start, torque)
         self._torque, self._last_time = torque, now
         ramp = min(1.0, (now - self._ramp_start) / RAMP.time)
         most_change = s.max_effort_rate * min(dt, RAMP.longest_step)
         pairs = zip(torque, self._effort, strict=True)
         self._effort = tuple([limited(ramp * wanted, last, math.inf, most_change) for wanted, last in pairs])
-        return Compensation(
-            self._effort,
-            reason="",
-            clamped=tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most]),
-            fallback=self._fallback,
-            remainder=() if change.is_over else change.remainder,
-            damped=change.is_large or now < self._damped_until,
-            held=held,
-        )
-
-    def _problem_of(self, theta: Sequence[float]) -> str:
-        """Return what is wrong with the joint angles, or ''."""
-        count = len(self._effort)
-        if len(theta) == count and all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
-            return ""
-        return f"joint angles {list(theta)} are not {count} numbers within {MAX_ANGLE:g} rad"
-
-    def _tilt_at(self, now: float, theta: Sequence[float]) -> tuple[str, str]:
-        """Return why the last tilt is held on, and why it cannot be; '' each if not."""
-        late = self.tilt.problem(now) if self.settings.use_imu else ""
-        if not late:
-            return "", ""
-        turn = self.tilt.unknown_turn(now)
-        if not turn <= MAX_TURN:
-            return "", late
-        return f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm", ""
+        over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
+        remainder = () if change.is_over else change.remainder
+        damped = change.is_large or now < self._damped_until
+        return Compensation(self._effort, "", over, self._fallback, remainder, damped, held)
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
         torques = [self.settings.torque(theta, axis, exact=True)[0] for axis in AXES]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
-    def _take_pending(self) -> Load | None:
-        """Use settings that were applied since the last step; return what was carried before them, or None."""
-        if self._pending is None:
-            return None
+    def _replace_load(self, settings: Settings) -> Load:
+        """Use new settings; return what was carried before them."""
         before = Load(self.settings, self.terms.in_force if self.terms else None)
-        self._use(self._pending)
+        self._use(settings)
         return before
 
     def _use(self, settings: Settings) -> None:
@@ -196,19 +180,17 @@ class Compensator:
         if self.terms is not None:
             self.terms.apply(settings.terms, settings.moving)
 
-    def _withdraw_lost_load(self, reading: Reading) -> None:
+    def _withdraw_lost_load(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> None:
         """Withdraw the torque of a load that has left the hand, without a guided change: that would be too slow."""
-        s, velocity = self.settings, reading.velocity
-        if not s.payload_mass or not velocity:
-            return
-        per_mass = exact_torque(s.unit_load, reading.theta, self.tilt.at(reading.time))  # m that each joint lifts it
+        s = self.settings
+        per_mass = exact_torque(s.unit_load, theta, self.tilt.at(now))  # m that each joint lifts it, per rad
         if self.applied:  # motors that do not carry the load cannot throw the arm
             needed = s.payload_mass * s.arm.gravity * sum(height * height for height in per_mass)
             if sum(map(operator.mul, per_mass, self.applied)) < DROP.least_carried * needed:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
-        if self._drop_watch.step(reading.time - self._last_time, speed, s.payload_mass):
-            self.dropped, self._damped_until = s.payload_mass, reading.time + GUIDANCE.watch
+        if self._drop_watch.step(now - self._last_time, speed, s.payload_mass):
+            self.dropped, self._damped_until = s.payload_mass, now + GUIDANCE.watch
             self._use(replace(s, payload_mass=0.0))
             self._change.stop()
 
@@ -237,14 +219,6 @@ class Compensator:
     def _active_weighing(self) -> Weighing | None:
         return self.weighing if self.weighing and not self.weighing.is_over else None
 
-    def _weighed(self, dt: float, reading: Reading, torque: Torque) -> tuple[Torque, Weighing | None]:
-        """Return `torque` with what a weighing adds to it, and the weighing if it ended with this."""
-        weighing, (now, theta, velocity) = self._active_weighing, reading
-        if not (weighing and velocity):
-            return torque, None
-        torque = weighing.torque(dt, theta, velocity, self.tilt.at(now), torque)
-        return torque, weighing if weighing.is_over else None
-
     def _restart(self, now: float) -> None:
         """Ramp the torque in from zero, as at the start."""
         self._change.stop()
@@ -253,7 +227,8 @@ class Compensator:
     def _begin_change(self, before: Load | None, torque: Torque, reading: Reading) -> None:
         """Begin a change to `torque` (n,) Nm, from `before` or from where a joint's unfinished change began.
 
-        Of the two, each joint takes the one that explains its present torque better.
+        Of the two, each joint takes the one that explains its present torque better. There is no `before` where the
+        exact law replaces the chosen one, which may not apply here.
         """
         ways: list[list[Load | None]] = [] if self._change.is_over else [self._origins]
         ways.append([before] * len(torque))

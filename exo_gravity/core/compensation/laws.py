@@ -41,21 +41,17 @@ class GravityModel(Protocol):
         ...
 
 
-def _everywhere(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
-    return ""
-
-
 @dataclass(frozen=True)
 class ArmLaw:
     """A law of the exoskeleton's own arm: a formula, and where it does not apply."""
 
     arm: ArmModel
     formula: Callable[[ArmModel, Sequence[float], Tilt], Torque]
-    limits: Callable[[ArmModel, Sequence[float], Tilt], str] = _everywhere
+    limits: Callable[[ArmModel, Sequence[float], Tilt], str] | None = None  #: why not here, or ''; None: everywhere
 
     def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
         """Return why the formula does not apply here, or ''; theta: (4,) rad."""
-        return self.limits(self.arm, theta, tilt)
+        return self.limits(self.arm, theta, tilt) if self.limits else ""
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (4,) in Nm at `theta` (4,) rad."""
