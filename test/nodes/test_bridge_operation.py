@@ -206,7 +206,9 @@ def test_the_bridge_knows_efforts_of_a_late_tilt(node, held):
     exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
 
     def answer() -> None:
-        compensator.send(0.0, JointState(), Compensation((0.0, 1.0, 2.0, 3.0), held=held))
+        compensator.send(
+            0.0, JointState(), Compensation.withdrawn("")._replace(effort=(0.0, 1.0, 2.0, 3.0), reason="", held=held)
+        )
         exchange.get_efforts(time.monotonic() + 0.05)
 
     wait_until(lambda: exchange.command.effort is not None, answer, seen=lambda: exchange.refusal)
