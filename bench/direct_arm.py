@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from exo_gravity.core.arm.gravity import LAWS, Torque
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -32,11 +32,11 @@ class DirectArm:
         address = self.interface, self.channel, self.options
         self._on_bus = ArmOnBus(address, arm.motors, arm.limits, 1.0 / arm.can_bridge["rate"])
         settings = arm.settings()
-        self._model, self._law, self._tilt = settings.arm, LAWS[settings.law], Tilt.of(settings.side)
+        self._law, self._tilt = settings.chosen, Tilt.of(settings.side)
 
     def law(self, theta: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm for joint angles (4,) in rad."""
-        return self._law(self._model, theta, self._tilt)
+        return self._law.torque(theta, self._tilt)
 
     def open(self) -> MotorBus:
         """Open the bus."""

@@ -24,11 +24,11 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
-from exo_gravity.core.compensation.terms.terms import MAX_EFFORT, TermSettings
+from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -235,7 +235,7 @@ class Changed(Compensator):
             self.apply(self._wrong)
         self._is_wrong = True
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
         self.on_step()
         answer = super().step(now, theta, velocity)
@@ -254,7 +254,7 @@ class Lively(Compensator):
         super().__init__(settings)
         self._others, self._next = itertools.cycle((settings, *others)), 20.0
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
         if now >= self._next:
             self._next = now + 20.0
@@ -326,13 +326,13 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
     """Yield sound compensators: name, compensator, and `largest_moment` and `largest_addition` (4,) that suit it."""
     full, half = settings_of(BODY_MASS), settings_of(BODY_MASS, support=0.5)
     added = TermSettings(
-        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 0.02)),
+        friction=Friction(0.8, (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)),
         inertia=Inertia(0.6),
         spring=Spring((2.0, 4.0, 2.0, 1.0)),
         assist=Assist((2.0, 4.0, 2.0, 2.0)),
     )
     moment, everything = full.arm.first_moment, Lively(replace(full, terms=added, inertial=True), ())
-    addition = tuple(map(operator.add, MAX_EFFORT, added.assist.max_effort))
+    addition = tuple(map(operator.add, SUM.effort, added.assist.max_effort))
     yield "One-G", Compensator(settings_of()), settings_of().arm.first_moment, NOTHING
     yield "Zero-G, 75 kg", Compensator(full), moment, NOTHING
     yield "with changes of load", Lively(full, (half, settings_of())), moment, NOTHING

@@ -30,7 +30,8 @@ OFF: dict[str, Any] = {
     "damping.viscosity": NONE,
     "spring.stiffness": NONE,
     "coupling.stiffness": NONE,
-    "limits.range": [-3.15, 3.15] * 4,
+    "limits.lower": [-3.15] * 4,
+    "limits.upper": [3.15] * 4,
     "assist.max_effort": NONE,
 }
 ON: dict[str, Any] = {
@@ -39,7 +40,8 @@ ON: dict[str, Any] = {
     "damping.viscosity": FAINT,
     "spring.stiffness": FAINT,
     "coupling.stiffness": FAINT,
-    "limits.range": [-3.149, 3.149] * 4,
+    "limits.lower": [-3.149] * 4,
+    "limits.upper": [3.149] * 4,
     "assist.max_effort": [1.0] * 4,
 }
 

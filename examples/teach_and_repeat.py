@@ -55,7 +55,7 @@ path += [number for row, pose in enumerate(poses[::5]) for number in (APPROACH +
 
 spring = Spring(stiffness=(3.5, 9.0, 6.0, 3.3), pose=path)
 COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.0, 0.0, 0.0, 0.0)  # as identified: else the spring must overcome it
-friction = Friction(share=0.8, identified=(*COULOMB, *VISCOUS))
+friction = Friction(share=0.8, coulomb=COULOMB, viscous=VISCOUS)
 compensator.apply(replace(settings, terms=TermSettings(spring=spring, friction=friction)))
 for _ in range(round(APPROACH / PERIOD)):
     cycle()

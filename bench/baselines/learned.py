@@ -28,7 +28,7 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neural_network import MLPRegressor
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.arm.gravity import LAWS, gravity_torque
+from exo_gravity.core.arm.gravity import exact_torque, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.lab.anfis_training import rms
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
@@ -110,7 +110,7 @@ class Workspace:
         """Return the torque (1, 4) of one pose, computed as the compensator does."""
         *theta, pitch, roll = (self.middle + inputs[0] * self.half).tolist()
         tilt = Tilt.of(self._configured.side, pitch, roll)
-        return np.array([LAWS["exact"](self._configured.robot, theta, tilt)])
+        return np.array([exact_torque(self._configured.robot, theta, tilt)])
 
     def inside(self, count: int, seed: int) -> np.ndarray:
         """Return `count` random inputs (n, 6) within the training box."""

@@ -59,8 +59,8 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
 
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
-    known = Friction(identified=(*coulomb, *viscous))
-    least = least_inertia(links_of(base.robot_by_mass or base.robot))
+    known = Friction(coulomb=coulomb, viscous=viscous)
+    least = least_inertia(links_of(base.robot_by_mass or base.loaded))
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),
@@ -69,7 +69,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
         "damping": TermSettings(damping=Damping([SOFT * inertia / (2.0 * DELAY) for inertia in least])),
         "spring": TermSettings(spring=Spring(soft, MIDDLE)),
         "coupling": TermSettings(coupling=Coupling((0.0, 0.0, -0.4 * min(soft), 0.5 * min(soft)))),
-        "limits": TermSettings(limits=SoftLimits((-0.5, 1.5, 0.3, 1.6, 0.0, 1.6, 0.2, 2.5), soft)),
+        "limits": TermSettings(limits=SoftLimits((-0.5, 0.3, 0.0, 0.2), (1.5, 1.6, 1.6, 2.5), soft)),
     }
     zero = replace(base, mode="zero_g", support=1.0)
     return {
@@ -95,7 +95,7 @@ class Study:
         nodes = load(params or packaged_config("sim.yaml"))
         arm = read_arm(nodes, "/right")
         base = arm.settings()
-        worn = Wearer(BODY_MASS).on_links(base.robot.length)
+        worn = Wearer(BODY_MASS).on_links(base.loaded.length)
         base = replace(base, wearer_mass=worn.mass.tolist(), wearer_cog=worn.cog.tolist())
         base = replace(base, use_imu=False, max_effort=[motor.peak_effort for motor in arm.motors])
         simulator = dict(node_values(nodes, "/right/simulator", SIMULATOR))
@@ -118,7 +118,7 @@ class Study:
         grid = np.array(list(product((0.0,), *(np.linspace(low, high, count) for low, high, count in bounds))))
         config, wearer = device_of(self.simulator).arm.config, self.settings[ONE_G]
         assert wearer is not None
-        own = ArmModel(wearer.robot.length, wearer.wearer_cog, wearer.wearer_mass)
+        own = ArmModel(wearer.loaded.length, wearer.wearer_cog, wearer.wearer_mass)
         most = np.abs(gravity_torque(own, grid)).max(axis=0)
         true = config.links.with_wearer(config.wearer_mass, config.wearer_cog)
         for name, settings in self.settings.items():

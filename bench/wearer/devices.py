@@ -21,7 +21,7 @@ from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque, moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.settings import Settings, settings_of
+from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -118,7 +118,7 @@ def draw(seed: int) -> Worn:
         one._replace(effort=one.effort + rng.normal(0.0, BREATHING, 4), direction=turned(one.direction, -left))
         for one in relaxed
     ]
-    arm = replace(nominal, robot=settings_of(found).robot, compensator=found)
+    arm = replace(nominal, robot=robot_of(found), compensator=found)
     found |= {change.name: change.value for change in wearer_from(arm, relaxed).changes}
     pose = relaxed[EQUILIBRIUM]
     tabled = gravity_torque(ArmModel(LENGTH, load.cog, load.mass), pose.theta, pose.direction)
@@ -136,7 +136,7 @@ def draw(seed: int) -> Worn:
     )
     settings = replace(
         full, max_effort=[min(MOST, motor.peak_effort) for motor in motors],
-        terms=TermSettings(friction=Friction(0.0, (*(coulomb * wrong[0]), *(viscous * wrong[1])))),
+        terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
     )  # fmt: skip
     return Worn(seed, side, config, scale, settings, motors, left, ways)
 

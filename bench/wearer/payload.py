@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.safety.limits import Limits
@@ -45,11 +45,10 @@ class Balance(Compensator):
         self.texts: list[str] = []
         self._weighing: Weighing | None = None
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
         if self.trial and self.times and now >= self.trial._start - DELAY + self.times[0]:
             self.times.pop(0)
-            assert isinstance(self.settings, Settings)
             weighing = Weighing(self.settings, JOINTS, RATE, self._weighing.empty if self._weighing else None)
             problem = refusal(self.settings, (), RATE) or self.weigh(weighing)
             assert not problem, problem

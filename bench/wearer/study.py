@@ -22,7 +22,7 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
@@ -97,7 +97,7 @@ class Therapist(Compensator):
         super().__init__(self.own)
         self._times, self._next = times, 0.0
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
         if now >= self._next:
             self._next = now + 2.0
@@ -217,7 +217,7 @@ def only(curve: WearerCurve, keep: np.ndarray) -> WearerCurve:
 def baselines(settings: Settings, time: np.ndarray, joints: Any, tilt_at: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the first-order observer's torque (n, 4), and gravity minus the motors'."""
     position, velocity, effort = joints
-    arm = settings.robot.with_wearer(settings.wearer_mass, settings.wearer_cog)
+    arm = settings.loaded.with_wearer(settings.wearer_mass, settings.wearer_cog)
     tilts = [tilt_at(now) for now in time.tolist()]
     magnitude = np.array([tilt.magnitude for tilt in tilts])[:, None]
     static = magnitude * gravity_torque(arm, position, np.array([tilt.direction for tilt in tilts])) - effort

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import NAME
 from exo_gravity.core.safety.limits import Limits
@@ -68,9 +68,9 @@ class Adapting(Compensator):
         self.supports: list[tuple[float, float]] = []
         self._observer, self._adaptation = MomentumObserver(settings), SupportAdaptation()
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
-        assert velocity and isinstance(self.settings, Settings)
+        assert velocity
         estimate = self._observer.update(now, (theta, velocity, self.read()), self.trunk())
         self._adaptation.update(now, (theta, velocity), estimate, self.settings)
         if (requested := self._adaptation.requested) is not None:

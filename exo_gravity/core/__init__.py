@@ -1,9 +1,10 @@
 """The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument)."""
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.arm.gravity import LAWS, gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.arm.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.compensation.laws import LAWS
 
 __all__ = [
     "LAWS",

@@ -10,7 +10,7 @@ from exo_gravity.core.errors import ParameterError
 Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the components of a vector
 
 JOINT_COUNT = 4
-COVER = 1.96  # standard deviations of the 95 % band
+COVER = 1.96  # standard deviations of a 95 % band
 
 
 def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:

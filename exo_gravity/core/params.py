@@ -5,7 +5,7 @@ parameter that a frozen dataclass uses is declared there (`owned`), with the rul
 takes it from there (`param_of`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -17,48 +17,12 @@ from exo_gravity.core.errors import ParameterError
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
 ROS_QOS_PREFIX = "qos_overrides."
 KINDS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
-# Parameters that are gone, by the node that had them, and what replaces each.
-GONE: dict[str, str] = {
-    # can_bridge
-    "max_effort_rate": "always 50 Nm/s; the compensator's own max_effort_rate may be lower",
-    "max_temperature": "always 80 degC",
-    "ramp_time": "always 1 s",
-    "fade_time": "always 2 s",
-    "damping": "always 5 Nm s/rad, the most that the motors can",
-    "home": "always 0: joint angles are measured from the hanging arm, see the parameter zero",
-    "home_tolerance": "always 0.5 rad for an AK60-6 and 0.34 rad for an AK80-9, less than half a turn of the rotor",
-    "max_velocity": "always 5, 5, 5, 6 rad/s",
-    "reply_timeout": "always 0.05 s, or 7 cycles if that is longer",
-    "torque_per_ampere": "always rated torque by rated current, as in the motors' data sheets",
-    "status_rate": "V3 boards are to send 500 status frames a second, 200 on a bus below 500 kbit/s",
-    # compensator
-    "max_total_mass": "always 10 kg",
-    "transition_time": "always 1 s; change `support` in small steps for a slower change",
-    "wearer.table": "always de_leva; give wearer.mass and wearer.cog for other masses",
-    "terms.max_effort": "always 2, 4, 2, 2 Nm",
-    "terms.max_effort_rate": "always 50 Nm/s",
-    "terms.ramp_time": "always 1 s",
-    "inertia.rotor": "always that of the AK60-6 and AK80-9",
-    "spring.max_effort": "always 1, 2, 1, 1 Nm",
-    "spring.path_file": "spring.pose, which also takes a path: rows of the time in s and four angles",
-    "coupling.leader": "coupling.stiffness, with an entry for each joint",
-    "coupling.follower": "coupling.stiffness, whose largest entry is the follower's",
-    "coupling.ratio": "coupling.stiffness: [0, -1, 2, 0] pulls joint 3 to half the angle of joint 2",
-    "coupling.offset": "always 0 rad",
-    "coupling.max_effort": "always 1 Nm",
-    "limits.stiffness": "limits.range; the stiffness is 10 Nm/rad, or 0.8 of what is stable if that is less",
-    "limits.lower": "limits.range, lower and upper edge of each joint in turn",
-    "limits.upper": "limits.range, lower and upper edge of each joint in turn",
-    "limits.max_effort": "always 1, 2, 1, 1 Nm",
-    "assist.max_effort_rate": "always 10 Nm/s",
-    "friction.coulomb": "the first four entries of friction.identified",
-    "friction.viscous": "the last four entries of friction.identified",
-    "inertial": "inertial.shoulder_from_imu, which switches it on",
-    "shoulder_from_imu": "inertial.shoulder_from_imu, which also compensates the trunk's acceleration",
-    "robot.first_moment": "the first four entries of robot.moments",
-    "robot.off_axis": "the last four entries of robot.moments",
-    "multi_array.fade_time": "always 2 s",
-    "lock_memory": "thread_priority, which also locks the memory where it is above 0",
+# Parameters that were valid at a47959f4 and are gone: what to write for such a value, by the names in force.
+GONE: dict[str, Callable[[list[Any]], dict[str, Any]]] = {
+    "robot.moments": lambda value: {"robot.first_moment": value[:4], "robot.off_axis": value[4:]},
+    "friction.identified": lambda value: {"friction.coulomb": value[:4], "friction.viscous": value[4:]},
+    "limits.range": lambda value: {"limits.lower": value[0::2], "limits.upper": value[1::2]},
+    "inertial.shoulder_from_imu": lambda value: {"inertial": any(value), "shoulder_from_imu": value},
 }
 
 
@@ -71,7 +35,7 @@ class Param:
     description: str
     bounds: tuple[float, float] | None = None  #: lowest and highest value, also for each number in a list
     unit: str = ""
-    choices: tuple[str, ...] = ()
+    choices: Collection[str] = ()
     fixed: bool = False  #: read-only while the node runs
     required: bool = False  #: the user must give a non-empty value
     expert: bool = False  #: only an expert changes it; the documents list it apart, and the panel does not show it
@@ -157,6 +121,13 @@ def check_owned(instance: Any) -> None:
         object.__setattr__(instance, param.name, tuple(checked) if isinstance(checked, list) else checked)
 
 
+def in_force(name: str, value: Any) -> dict[str, Any]:
+    """Return a parameter that may be of `GONE` by the names in force: what to write for it, by name."""
+    if name not in GONE:
+        return {name: value}
+    return GONE[name](list(value) if isinstance(value, Sequence) else [])
+
+
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:
     """Return the value of every parameter of the table by name: the given value, or the default.
 
@@ -167,8 +138,10 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
     prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)
     for name, value in given.items():
         if name not in names and name not in ROS_PARAMETERS and not name.startswith(prefixes):
-            gone = f"left out, because it is gone: {GONE[name]}" if name in GONE else ""
-            raise ParameterError(name, value, gone or f"one of {', '.join(sorted(names))}")
+            if name in GONE:
+                written = ", ".join(f"{new}: {plain}" for new, plain in in_force(name, value).items())
+                raise ParameterError(name, value, f"written in other parameters: {written}")
+            raise ParameterError(name, value, f"one of {', '.join(sorted(names))}")
     return {param.name: param.check(given.get(param.name, param.default)) for param in table}
 
 

@@ -18,9 +18,9 @@ TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous join
 class UrdfArm:
     """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
 
-    A `GravityModel`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where it has none;
-    mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its links have no
-    mass, Pinocchio is missing, or a joint is missing or does not turn.
+    A `GravityModel` of `core.compensation.laws`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where
+    it has none; mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its
+    links have no mass, Pinocchio is missing, or a joint is missing or does not turn.
     """
 
     def __init__(self, text: str, joint_names: Sequence[str]) -> None:

@@ -29,7 +29,7 @@ PANEL = (
 LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support", "payload.mass")
 SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 # What belongs to a subject: in the wearer's file, and set by the page together with the wearer's data.
-OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.range")}
+OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.lower", "limits.upper")}
 
 Values = Mapping[str, Any]
 FIELDS = ("position", "velocity", "effort")

@@ -1,6 +1,6 @@
 """A trunk IMU: the motion of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
 
-The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.model.tilt`; heading is irrelevant). The accelerometer
+The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.arm.tilt`; heading is irrelevant). The accelerometer
 measures specific force, the acceleration of its location less gravity: at rest +g upward (REP-145).
 """
 

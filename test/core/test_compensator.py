@@ -9,7 +9,7 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.guidance import FADE_TIME, MAX_FADE_RATE, GuidedChange
+from exo_gravity.core.compensation.guidance import GUIDANCE, GuidedChange
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
@@ -136,12 +136,12 @@ def test_a_change_of_mode_reaches_the_arm_without_a_step():
     run.cycle(1.5)
     run.efforts.clear()
     run.compensator.apply(settings_with(mode="zero_g"))
-    run.cycle(FADE_TIME / 2)
+    run.cycle(GUIDANCE.fade_time / 2)
     one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
     np.testing.assert_allclose(run.efforts[-1], (one + two) / 2, rtol=0.01)
-    run.cycle(FADE_TIME / 2 + PERIOD)
+    run.cycle(GUIDANCE.fade_time / 2 + PERIOD)
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
-    assert run.largest_step <= np.abs(two - one).max() * PERIOD / FADE_TIME * 1.001
+    assert run.largest_step <= np.abs(two - one).max() * PERIOD / GUIDANCE.fade_time * 1.001
 
 
 def test_a_sweep_of_settings_is_followed_without_a_step():
@@ -151,10 +151,10 @@ def test_a_sweep_of_settings_is_followed_without_a_step():
     for support in np.linspace(0.0, 1.0, 101):
         run.compensator.apply(settings_with(mode="zero_g", support=support))
         run.cycle(0.02)
-    run.cycle(FADE_TIME)
+    run.cycle(GUIDANCE.fade_time)
     one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
-    assert run.largest_step <= np.abs(two - one).max() / FADE_TIME * PERIOD * 1.1
+    assert run.largest_step <= np.abs(two - one).max() / GUIDANCE.fade_time * PERIOD * 1.1
 
 
 SPRING = TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4))
@@ -165,12 +165,12 @@ def test_springs_and_limits_are_switched_on_and_off_without_a_step_also_during_a
     run.cycle(1.5)
     run.efforts.clear()
     changes = ({"terms": SPRING}, {"max_effort": (0.5,) * 4}, {}, {"mode": "zero_g", "terms": SPRING}, {})
-    for seconds in (FADE_TIME + 1.0, 0.6):
+    for seconds in (GUIDANCE.fade_time + 1.0, 0.6):
         for change in changes:
             run.compensator.apply(settings_with(**change))
             run.cycle(seconds)
-    assert run.largest_step <= MAX_FADE_RATE * PERIOD * 1.001
-    assert run.cycle(FADE_TIME + 1.0).effort == pytest.approx(gravity_torque(ROBOT, THETA))
+    assert run.largest_step <= GUIDANCE.max_rate * PERIOD * 1.001
+    assert run.cycle(GUIDANCE.fade_time + 1.0).effort == pytest.approx(gravity_torque(ROBOT, THETA))
 
 
 def test_a_joint_that_the_change_drives_gets_its_old_torque_back_until_it_is_calm():
@@ -178,13 +178,13 @@ def test_a_joint_that_the_change_drives_gets_its_old_torque_back_until_it_is_cal
     run.cycle(1.5)
     before = run.efforts[-1]
     run.compensator.apply(settings_with())
-    run.cycle(FADE_TIME / 2)
+    run.cycle(GUIDANCE.fade_time / 2)
     falling = (0.0, -1.0, 0.0, 0.0)
     answer = run.cycle(1.0, velocity=falling)
     assert answer.effort[1] == pytest.approx(before[1])  # and no more, however long it falls
     assert answer.remainder[1] == pytest.approx(before[1] - gravity_torque(ROBOT, THETA)[1])
     assert abs(answer.effort[3]) < abs(before[3])
-    assert run.cycle(FADE_TIME + 1.1).remainder == ()
+    assert run.cycle(GUIDANCE.fade_time + 1.1).remainder == ()
     assert run.efforts[-1] == pytest.approx(gravity_torque(ROBOT, THETA))
 
 
@@ -202,8 +202,8 @@ def test_where_the_velocity_is_not_known_a_change_takes_longer():
     run = CompensatorRun(mode="zero_g")
     run.cycle(1.5)
     run.compensator.apply(settings_with())
-    assert run.cycle(4.0 * FADE_TIME, velocity=None).remainder
-    assert not run.cycle(2.0 * FADE_TIME, velocity=None).remainder
+    assert run.cycle(4.0 * GUIDANCE.fade_time, velocity=None).remainder
+    assert not run.cycle(2.0 * GUIDANCE.fade_time, velocity=None).remainder
 
 
 def test_settings_that_change_no_torque_begin_no_change():

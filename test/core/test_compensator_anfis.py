@@ -13,7 +13,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.anfis import Anfis, AnfisLaw
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME
-from exo_gravity.core.compensation.guidance import FADE_TIME
+from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.errors import ParameterError
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
@@ -52,7 +52,7 @@ def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reaso
 
 def test_the_anfis_refuses_an_arm_given_by_its_moments():
     arm = ArmModel.from_moments(ROBOT.length, ROBOT.first_moment)
-    with pytest.raises(ParameterError, match=r"robot.moments = .*must be 0 for law anfis"):
+    with pytest.raises(ParameterError, match=r"robot.first_moment = .*must be 0 for law anfis"):
         settings_with(law="anfis", anfis=learned(), robot=arm)
 
 
@@ -73,7 +73,7 @@ def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_ch
     run.efforts.clear()
     replaced = wobble(run, 3.0, width, hertz)
     # The laws differ by up to 2 Nm, which fades over 2 s; the exact law changes by up to 3 Nm/rad along the path.
-    remainders = 2.0 * PERIOD / FADE_TIME
+    remainders = 2.0 * PERIOD / GUIDANCE.fade_time
     path = 3.0 * width * 2 * math.pi * hertz * PERIOD
     assert run.largest_step <= 2 * remainders + path
     switches = np.flatnonzero(np.diff(replaced))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import FADE_TIME, RAMP_TIME
+from exo_gravity.core.compensation.guidance import GUIDANCE, RAMP
 from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
@@ -38,7 +38,7 @@ def steps(arm, start, seconds):
 
 def test_it_ramps_in_and_then_gives_the_models_torque_times_the_gain():
     arm = Compensator(settings(gain=[1.0, 0.5], max_effort_rate=1000.0))
-    efforts = steps(arm, 5.0, RAMP_TIME + 0.1)
+    efforts = steps(arm, 5.0, RAMP.time + 0.1)
     first, second = Pendulum().torque(POSE, (0.0, 0.0, -9.80665))
     assert efforts[0] == (0.0, 0.0)
     assert efforts[125] == pytest.approx((0.5 * first, 0.25 * second), rel=0.01)
@@ -59,9 +59,9 @@ def test_a_change_of_settings_fades_in_without_a_step():
     arm = Compensator(settings(max_effort_rate=1000.0))
     before = steps(arm, 1.0, 1.5)[-1]
     arm.apply(settings(gain=[2.0, 2.0], max_effort_rate=1000.0))
-    efforts = [before, *steps(arm, 2.5, FADE_TIME + 0.1)]
+    efforts = [before, *steps(arm, 2.5, GUIDANCE.fade_time + 0.1)]
     assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
-    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / FADE_TIME + 1e-9
+    assert np.abs(np.diff(efforts, axis=0)).max() <= np.abs(before).max() * PERIOD / GUIDANCE.fade_time + 1e-9
 
 
 def test_torque_beyond_the_limit_of_the_urdf_is_clamped_and_named():

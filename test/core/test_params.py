@@ -6,14 +6,38 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.guidance import LONGEST_STEP
-from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of, urdf_table
+from exo_gravity.core.compensation.guidance import RAMP
+from exo_gravity.core.compensation.settings import (
+    COMMAND_PARAMETERS,
+    COMPENSATOR,
+    MODEL_PARAMETERS,
+    URDF,
+    settings_of,
+)
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import GONE, values_of
+from exo_gravity.core.params import GONE, in_force, values_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.core.trunk.params import IMU
+from exo_gravity.lab.bag.content import RECORDER
+from exo_gravity.lab.calibration.tour import CALIBRATOR
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.view.urdf import ROBOT_MODEL
+from exo_gravity.panel.view import PANEL
+from exo_gravity.sim.params import SIMULATOR
 
+THEN = Path(__file__).parents[1] / "data" / "parameters_a47959f4.yaml"
+TABLES = {
+    "can_bridge": CAN_BRIDGE,
+    "imu": IMU,
+    "simulator": SIMULATOR,
+    "recorder": RECORDER,
+    "robot_model": ROBOT_MODEL,
+    "panel": PANEL,
+    "calibrator": CALIBRATOR,
+}
 LIVE = [param for param in COMPENSATOR if not param.fixed]
 WRONG = (-0.1, math.nan, math.inf, 900.0, "", "heavy", True, None, [], [0.1] * 3, [0.1] * 5, [0.1, math.nan, 0.1, 0.1])
 WRONG += ([0.0, 0.0, 0.31, 0.0], [0.1, -1e-9, 0.1, 0.1], [1e308] * 4, ["0.1"] * 4, b"0.1", {}, 1e308)
@@ -22,7 +46,7 @@ WRONG += ([0.0, 0.0, 0.31, 0.0], [0.1, -1e-9, 0.1, 0.1], [1e308] * 4, ["0.1"] * 
 def possible(param, rng):
     """Draw a value within the bounds of the parameter."""
     if param.choices:
-        return rng.choice(param.choices)
+        return rng.choice(list(param.choices))
     if not param.bounds:
         return param.default
     low, high = param.bounds
@@ -55,7 +79,7 @@ def test_hundreds_of_valid_and_invalid_changes_are_applied_or_rejected_and_never
             now += period
             effort = np.array(compensator.step(now, theta).effort)
             step = np.abs(effort - last).max()
-            assert step <= values["max_effort_rate"] * min(period, LONGEST_STEP) * (1 + 1e-9)
+            assert step <= values["max_effort_rate"] * min(period, RAMP.longest_step) * (1 + 1e-9)
             last, moved = effort, moved + step
     assert 90 < refused < 210
     assert moved > 100.0  # Nm; the torque followed the changes
@@ -82,32 +106,62 @@ def test_the_wearers_arm_follows_from_the_body_mass():
     assert settings_of(half).arm.total_mass == pytest.approx(3.707, abs=1e-3)
 
 
-def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it():
-    with pytest.raises(ParameterError, match=r"^limits.lower = .*it is gone: limits.range"):
-        values_of(COMPENSATOR, {"limits.lower": [0.0] * 4})
-    names = {param.name for param in (*COMPENSATOR, *urdf_table(4, ["command_interface"]))}
-    assert len(COMPENSATOR) <= 35  # each of them has users
-    assert names & set(GONE) == {"max_effort_rate"}  # gone from can_bridge only
+def test_every_name_of_a47959f4_is_still_declared_or_refused_with_what_to_write():
+    optional = (*COMMAND_PARAMETERS, *MODEL_PARAMETERS)
+    tables = {**TABLES, "compensator": (*COMPENSATOR, *URDF, *optional)}
+    declared = {node: {param.name: param for param in table} for node, table in tables.items()}
+    names_then = yaml.safe_load(
+        (Path(__file__).parents[1] / "data/parameters_a47959f4.yaml").read_text(encoding="utf-8")
+    )
+    for node, names in names_then.items():
+        for name in set(names) - declared[node].keys():
+            assert GONE.keys() >= {name} and in_force(name, [0.25] * 8).keys() <= declared[node].keys()
+            with pytest.raises(ParameterError, match=f"^{name} = .*: must be written in other parameters: "):
+                values_of(tables[node], {name: [0.25] * 8})
+    every = {name for names in declared.values() for name in names}
+    assert not every & GONE.keys()
+
+
+def test_what_is_written_for_a_parameter_that_is_gone_has_its_value():
+    edges = [-1.0, 1.0, -0.5, 1.5, 0.0, 2.0, 0.1, 2.1]
+    with pytest.raises(
+        ParameterError, match=r"limits.lower: \[-1.0, -0.5, 0.0, 0.1\], limits.upper: \[1.0, 1.5, 2.0, 2.1\]"
+    ):
+        values_of(COMPENSATOR, {"limits.range": edges})
+    moments = in_force("robot.moments", [0.1, 0.2, 0.3, 0.4, 0.01, 0.02, 0.03, 0.04])
+    robot = settings_of(values_of(COMPENSATOR, moments)).robot
+    assert robot.first_moment == (0.1, 0.2, 0.3, 0.4) and robot.off_axis == (0.01, 0.02, 0.03, 0.04)
+    assert in_force("friction.identified", [0.2] * 4 + [0.1] * 4) == {
+        "friction.coulomb": [0.2] * 4,
+        "friction.viscous": [0.1] * 4,
+    }
+    assert in_force("inertial.shoulder_from_imu", [0.0, 0.1, 0.0])["inertial"]
+    assert not in_force("inertial.shoulder_from_imu", [0.0] * 3)["inertial"]
 
 
 def test_first_moments_replace_masses_and_centres_of_gravity():
-    plain = settings_of(values_of(COMPENSATOR, {"robot.moments": [0.0] * 5 + [0.01, 0.0, 0.0]})).robot
-    given = {"robot.moments": [*plain.first_moment, 0.0, 0.01, 0.0, 0.0]}
-    moments = settings_of(values_of(COMPENSATOR, {**given, "robot.mass": [9.0] * 4})).robot
+    across = {"robot.off_axis": [0.0, 0.01, 0.0, 0.0]}
+    plain = settings_of(values_of(COMPENSATOR, across)).robot
+    given = {"robot.first_moment": list(plain.first_moment), "robot.mass": [9.0] * 4, **across}
+    moments = settings_of(values_of(COMPENSATOR, given)).robot
     assert moments.by_moments and not plain.by_moments
-    assert (moments.first_moment, moments.off_axis) == (plain.first_moment, plain.off_axis)
-    assert moments.off_axis == (0.0, 0.01, 0.0, 0.0)
+    assert (moments.first_moment, moments.off_axis) == (plain.first_moment, (0.0, 0.01, 0.0, 0.0))
 
 
 @pytest.mark.parametrize("law", ["paper_static", "paper_mobile"])
-@pytest.mark.parametrize("moments", [(0.1, 0.2, 0.2, 0.03, *[0.0] * 4), (*[0.0] * 4, 0.1, 0.2, 0.2, 0.03)])
-def test_a_law_that_needs_masses_refuses_moments(law, moments):
-    values = values_of(COMPENSATOR, {"robot.moments": list(moments), "law": law})
-    with pytest.raises(ParameterError, match=rf"robot.moments = .*must be 0 for law {law}"):
+@pytest.mark.parametrize("name", ["robot.first_moment", "robot.off_axis"])
+def test_a_law_that_needs_masses_refuses_moments(law, name):
+    values = values_of(COMPENSATOR, {name: [0.1, 0.2, 0.2, 0.03], "law": law})
+    with pytest.raises(ParameterError, match=rf"{name} = .*must be 0 for law {law}"):
         settings_of(values)
 
 
 def test_moments_that_only_too_heavy_an_arm_can_have_are_refused():
-    values = values_of(COMPENSATOR, {"robot.moments": [0.1, 0.2, 6.0, 0.03, *[0.0] * 4]})
+    values = values_of(COMPENSATOR, {"robot.first_moment": [0.1, 0.2, 6.0, 0.03]})
     with pytest.raises(ParameterError, match=r"total mass in kg = 20.0: must be at most 10 "):
         settings_of(values)
+
+
+def test_the_law_of_a_urdf_is_not_for_the_exoskeletons_own_arm():
+    with pytest.raises(ParameterError, match=r"^law = 'urdf': must be chosen at the start"):
+        settings_of(values_of(COMPENSATOR, {"law": "urdf"}))

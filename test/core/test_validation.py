@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 
 import pytest
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.params import GONE, values_of
+from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 
 
@@ -61,20 +60,6 @@ def test_impossible_and_contradicting_parameters_are_refused_with_their_values(g
     with pytest.raises(ParameterError) as caught:
         check(**given)
     assert sentence in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("max_effort_rate", "max_temperature", "ramp_time", "fade_time", "damping", "home", "home_tolerance"),
-        *("status_rate", "lock_memory", "max_velocity", "reply_timeout", "torque_per_ampere"),
-    ],
-)
-def test_a_parameter_that_is_gone_is_refused_with_what_replaces_it(name):
-    with pytest.raises(
-        ParameterError, match=rf"{name} = 1.0: must be left out, because it is gone: {re.escape(GONE[name])}"
-    ):
-        check(**{name: 1.0})
 
 
 def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():

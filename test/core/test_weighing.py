@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.arm.arm import ModelError
-from exo_gravity.core.arm.gravity import LAWS
+from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -47,9 +47,9 @@ class Balance(Compensator):
         self.weighing = Weighing(settings, JOINTS, RATE)
         self._at = at
 
-    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Answer:
+    def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
-        if now >= self._at and self.scale is None:
+        if now >= self._at and self.weighing is None:
             assert self.weigh(self.weighing) == ""
             assert self.weigh(self.weighing) == "a weighing is under way"
         return super().step(now, theta, velocity)
@@ -141,7 +141,7 @@ def test_a_load_that_falls_while_it_is_weighed_is_seen_by_the_arm_that_rises():
 
 def lever(theta: Sequence[float]) -> np.ndarray:
     """Return the torques (4,) of 1 kg in the hand."""
-    return np.array(LAWS["exact"](SETTINGS.unit_load, theta, TILT))
+    return np.array(exact_torque(SETTINGS.unit_load, theta, TILT))
 
 
 def test_with_the_empty_hand_weighed_before_the_error_of_the_model_is_left_out():

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Answer, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -80,7 +80,7 @@ class CompensatedArm:
         )
         self.is_damped = True
         self.compensator = Compensator(self.settings, JOINTS)
-        self.answer = Answer(None)
+        self.answer = Compensation.withdrawn("")
         self.wire = Wire()
         self.clock = self.wire.clock
         motors = joints_of(formats)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.guidance import MAX_FADE_RATE
+from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import State
@@ -100,7 +100,7 @@ def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_els
     arm.run(4.5)
     assert arm.answer.remainder == ()
     of_tenth = np.array(arm.torques)[:: round(0.1 / CYCLE)]
-    assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * MAX_FADE_RATE + 2 * CODE
+    assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * GUIDANCE.max_rate + 2 * CODE
     assert arm.top_speed < 0.1
 
 

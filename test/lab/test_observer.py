@@ -32,7 +32,7 @@ EXACT = ModelError(STILL, STILL, 0.0, 0.0)
 COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)
 SETTINGS = Settings(
     "right", DEFAULT_LINKS, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), model_error=EXACT,
-    terms=TermSettings(friction=Friction(0.0, (*COULOMB, *VISCOUS))),
+    terms=TermSettings(friction=Friction(0.0, COULOMB, VISCOUS)),
 )  # fmt: skip
 WHOLE = DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog)
 TILT = Tilt.of("right", 0.1, -0.05)

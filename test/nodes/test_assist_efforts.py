@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -63,7 +64,7 @@ class Rig(CompensatorRig):
 def running() -> Iterator[Rig]:
     """A node that changes its load sooner than a wearer may feel, which test_compensator.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guidance, "FADE_TIME", 0.2)
+        patch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, fade_time=0.2))
         rig = Rig()
         yield rig
         rig.close()
@@ -121,7 +122,7 @@ def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
 def test_terms_are_set_live_and_need_velocities(rig):
     rig.velocity = (0.15, -0.15, 0.0, 0.0)  # a change of load waits for slow joints
     rig.wait_until(lambda: rig.adds(STILL))
-    assert rig.set(friction__identified=[0.2, 0.4, 0.2, 0.2, 0.0, 0.0, 0.0, 0.0], friction__share=0.5) == ["", ""]
+    assert rig.set(friction__coulomb=[0.2, 0.4, 0.2, 0.2], friction__share=0.5) == ["", ""]
     rig.wait_until(lambda: rig.adds((0.1, -0.2, 0.0, 0.0)))
     rig.wait_until(lambda: rig.values["terms"] == "friction")
     rig.velocity = ()

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import KeyValue
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.compensation.compensator import Answer
+from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, Traffic
 from exo_gravity.core.motors.specs import MOTORS
@@ -203,7 +203,9 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node, exchange):
 def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
     compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
     exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
-    command = await_efforts(exchange, lambda: compensator.send(0.0, JointState(), Answer(effort, held=held)))
+    command = await_efforts(
+        exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, "", (), "", (), False, held))
+    )
     assert (tuple(command.effort), command.damped, command.held) == (effort, False, bool(held))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -90,9 +91,9 @@ class Rig(CompensatorRig):
 def quick() -> Iterator[None]:
     """Shorter ramps and fades, which test_limiter.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guidance, "RAMP_TIME", 0.2)
-        patch.setattr(compensator, "RAMP_TIME", 0.2)
-        patch.setattr(guidance, "LAST_FADE", 0.4)
+        short = replace(guidance.RAMP, time=0.2, last_fade=0.4)
+        patch.setattr(guidance, "RAMP", short)
+        patch.setattr(compensator, "RAMP", short)
         yield
 
 

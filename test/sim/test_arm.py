@@ -154,7 +154,7 @@ def test_reset_puts_the_arm_at_rest_in_a_pose():
         ({"position_min": (2.0, 0, 0, 0)}, "position_min"),
         ({"cog_y": (0, 0, 0.2, 0)}, "cog_y"),
         ({"stribeck_friction": (0, 0, -0.1, 0)}, "stribeck_friction"),
-        ({"links": ArmModel.from_moments((0.05, 0.13, 0.3, 0.3), (0.1,) * 4)}, "robot.moments"),
+        ({"links": ArmModel.from_moments((0.05, 0.13, 0.3, 0.3), (0.1,) * 4)}, "robot.first_moment"),
         ({"links": ArmModel((0.05, 0.13, 0.3, 0.3), (0,) * 4, (0.5, 0.5, 0.0, 0.2))}, "links.mass"),
     ],
 )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -43,7 +43,7 @@ class CompensatorRun:
         theta: Sequence[float] = THETA,
         period: float = PERIOD,
         velocity: Sequence[float] | None = (0.0,) * 4,
-    ) -> Answer:
+    ) -> Compensation:
         """Run the compensator for `seconds`, at least one cycle, and return its last answer."""
         for _ in range(max(1, round(seconds / period))):
             self.now += period

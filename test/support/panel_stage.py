@@ -28,7 +28,8 @@ WEARER_FILE = {
     "wearer.body_mass": 61.5,
     "wearer.sex": "female",
     "wearer.segment_length": [0.3, 0.25, 0.08],
-    "limits.range": [-0.5, 0.5, -0.2, 1.5, -0.2, 1.5, 0.0, 2.0],
+    "limits.lower": [-0.5, -0.2, -0.2, 0.0],
+    "limits.upper": [0.5, 1.5, 1.5, 2.0],
 }
 STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
 

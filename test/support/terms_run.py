@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from exo_gravity.core import LAWS, ArmModel, Tilt
+from exo_gravity.core import ArmModel, Tilt
+from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.compensation.terms.terms import Terms, TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, MOTORS
@@ -72,7 +73,7 @@ class TermsRun:
         self.given = self.most_given = self.rubbed = self.worst_balance = 0.0
         self.positions: list[list[float]] = []
         self.applied: list[np.ndarray] = []
-        self._gravity: deque[Sequence[float]] = deque([LAWS["exact"](self.links, self.pose, UPRIGHT)])
+        self._gravity: deque[Sequence[float]] = deque([exact_torque(self.links, self.pose, UPRIGHT)])
         self._extra: deque[Sequence[float]] = deque([(0.0,) * 4])
         self._late = max(1, round(self.delay / self.period))
         self._push: Push = no_push
@@ -96,7 +97,7 @@ class TermsRun:
             reply = motor.joint_reply(answer[1])
             theta.append(reply.position)
             velocity.append(reply.velocity)
-        self._gravity.append(LAWS["exact"](self.links, theta, UPRIGHT))
+        self._gravity.append(exact_torque(self.links, theta, UPRIGHT))
         self._extra.append(self.terms.torque(100.0 + device.time, theta, velocity))
         while len(self._extra) > self._late:
             self._extra.popleft()

@@ -51,7 +51,7 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
         for theta, torque, loaded in zip(POSES, effort, LOADED, strict=True)
     )
     result = identify(taken, ROBOT.length)
-    change = Change("/right/compensator", "robot.moments", result.moments.tolist(), "kg m, <±0.001>")
+    change = Change("/right/compensator", "robot.first_moment", result.moments.tolist(), "kg m, <±0.001>")
     found = CalibrationResult((change,), ("M4 is 20 % larger.",), (), configured_arm(), taken, result)
     return replace(found, **changes)  # type: ignore[arg-type]
 
@@ -83,7 +83,7 @@ def test_the_page_says_what_was_found_what_does_not_show_and_where_the_arm_creep
     page = page_of(found, "gravity", "old.yaml", DAY)
     assert "<h1>calibrate gravity, right arm</h1>" in page and "2026-11-22, from old.yaml" in page
     assert found.identified is not None
-    for words in ("<b>Calibrated.</b>", "robot.moments", "kg m, &lt;±0.001&gt;", "M4 is 20 % larger.", "Singular"):
+    for words in ("<b>Calibrated.</b>", "robot.first_moment", "kg m, &lt;±0.001&gt;", "M4 is 20 % larger.", "Singular"):
         assert words in page
     assert page.count("data:image/png;base64,") == 1
     assert all(escape(sentence) in page for sentence in found.identified.unknown)
@@ -105,7 +105,7 @@ def test_a_refusal_is_on_the_page_without_new_values(found: CalibrationResult) -
     refused = replace(found, refusals=("pose 3 slipped",), identified=None)
     page = page_of(refused, "gravity", "old.yaml", DAY)
     assert "Not calibrated" in page and "<li>pose 3 slipped</li>" in page
-    assert "robot.moments" not in page and "<img" not in page
+    assert "robot.first_moment" not in page and "<img" not in page
 
 
 def test_friction_is_drawn_over_speed_and_a_result_without_poses_is_its_values_alone() -> None:

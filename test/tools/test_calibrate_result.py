@@ -76,7 +76,7 @@ def test_the_comments_inside_a_list_stay(tmp_path: Path) -> None:
 def test_a_new_value_joins_the_mapping_that_it_belongs_to(tmp_path: Path) -> None:
     new = written(
         tmp_path,
-        Change("/right/compensator", "robot.moments", [0.1, 0.2, 0.3, 0.05], "kg m"),
+        Change("/right/compensator", "robot.first_moment", [0.1, 0.2, 0.3, 0.05], "kg m"),
         Change("/right/compensator", "wearer.cog", [0.0, 0.0, 0.1, 0.1], "m"),
         Change("/right/compensator", "gain", [1.0, 1.0, 1.0, 1.0], "none"),
     )

@@ -26,10 +26,8 @@ MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak 
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
 
-ONES = (1.0,) * JOINT_COUNT
-ZEROS = (0.0,) * JOINT_COUNT
-NO_PAYLOAD = (0.0,) * 4
-UNKNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
+NO_PAYLOAD = (0.0, 0.0, 0.0, 0.0)
+NOT_KNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
 
 
 @dataclass(frozen=True, eq=False, init=False)
@@ -45,7 +43,7 @@ class ArmModel:
     mass: np.ndarray  #: (4,) kg, link masses m_n
     gain: np.ndarray  #: (4,), the paper's c_n, which scales the torque of joint n; 0..2, 1 by default
     gravity: float  #: m/s^2
-    off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see `core.model.gravity`; 0 by default
+    off_axis: tuple[float, ...]  #: (W, Z, Y3, Y4) kg m across the links, see `core.arm.gravity`; 0 by default
     #: M1..M4 in kg m: the mass of link n times d_n plus all mass beyond link n times l_n; plain floats
     first_moment: tuple[float, ...] = field(init=False, repr=False)
     #: (4,) m/s^2, c_n times gravity; plain floats
@@ -60,9 +58,9 @@ class ArmModel:
         length: Vector,
         cog: Vector,
         mass: Vector,
-        gain: Vector = ONES,
+        gain: Vector = (1.0,) * JOINT_COUNT,
         gravity: float = STANDARD_GRAVITY,
-        off_axis: Vector = ZEROS,
+        off_axis: Vector = (0.0,) * JOINT_COUNT,
         first_moment: Vector | None = None,
     ) -> None:
         lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
@@ -73,13 +71,13 @@ class ArmModel:
             masses = four_floats("mass", mass, 0.0, MAX_MASS, "kg")
             moments = moments_along(lengths, cogs, masses)
         else:
-            cogs = masses = UNKNOWN
+            cogs = masses = NOT_KNOWN
             moments = four_floats("first_moment", first_moment, 0.0, MAX_MOMENT, "kg m")
         gains = four_floats("gain", gain, 0.0, MAX_GAIN)
         gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
         across = tuple(four_floats("off_axis", off_axis, -MAX_MOMENT, MAX_MOMENT, "kg m").tolist())
         scale = tuple((gains * gravity).tolist())
-        given = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is UNKNOWN)
+        given = (lengths, cogs, masses, gains, gravity, across, tuple(moments.tolist()), scale, masses is NOT_KNOWN)
         values = (*given, NO_PAYLOAD)
         for own_field, value in zip(fields(self), values, strict=True):
             object.__setattr__(self, own_field.name, value)
@@ -89,15 +87,15 @@ class ArmModel:
         cls,
         length: Vector,
         first_moment: Vector,
-        off_axis: Vector = ZEROS,
-        gain: Vector = ONES,
+        off_axis: Vector = (0.0,) * JOINT_COUNT,
+        gain: Vector = (1.0,) * JOINT_COUNT,
         gravity: float = STANDARD_GRAVITY,
     ) -> "ArmModel":
         """Return the arm with links of `length` (4,) m that is given by its moments, (4,) kg m each.
 
         first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
         """
-        return cls(length, UNKNOWN, UNKNOWN, gain, gravity, off_axis, first_moment)
+        return cls(length, NOT_KNOWN, NOT_KNOWN, gain, gravity, off_axis, first_moment)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ArmModel) and self._key() == other._key()
@@ -121,13 +119,12 @@ class ArmModel:
         """Raise ParameterError unless masses are known and all centres of gravity lie on the links, as `what` needs."""
         if self.payload[0]:
             raise ParameterError("payload.mass", self.payload[0], f"0 for {what}, which knows no load in the hand")
-        moments = [*(self.first_moment if self.by_moments else ZEROS), *self.off_axis]
         if self.by_moments:
-            raise ParameterError("robot.moments", moments, f"0 for {what}, which needs mass and cog")
+            raise ParameterError("robot.first_moment", self.first_moment, f"0 for {what}, which needs mass and cog")
         if any(self.off_axis):
-            raise ParameterError("robot.moments", moments, f"0 for {what}, which knows no moments across links")
+            raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
 
-    def with_payload(self, mass: float, cog: Vector = ZEROS[:3]) -> "ArmModel":
+    def with_payload(self, mass: float, cog: Vector = (0.0, 0.0, 0.0)) -> "ArmModel":
         """Return this arm with a load of `mass` kg in its hand, instead of any other.
 
         cog: (3,) m, its centre of gravity in frame 4 of Table 1: from the end of link 4, along link 4 (x_4), across it

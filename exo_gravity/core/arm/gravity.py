@@ -32,9 +32,8 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
-Torque = tuple[float, ...]  # (4,) Nm in joint order
-NO_TORQUE: Torque = (0.0, 0.0, 0.0, 0.0)
-Law = Callable[[ArmModel, Sequence[float], Tilt], Torque]  # arm, theta (4,) rad, tilt -> the torque that holds the arm
+Torque = tuple[float, ...]  # (n,) Nm in joint order
+NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
 Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
 
 
@@ -144,21 +143,28 @@ def _torque(formula: Callable[..., tuple[Any, ...]], arm: ArmModel, *inputs: np.
     return np.asarray(np.stack(unscaled, axis=-1) * (arm.gain * arm.gravity))
 
 
-def _law(formula: Callable[..., Torque]) -> Law:
-    def torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
-        a, b, c, d = arm.scale
-        tau, felt = formula(arm, theta, tilt), tilt.magnitude
-        return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
+def exact_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+    """Return the torque (4,) in Nm that holds `arm` by the exact law, of one pose in plain floats.
 
-    return torque
+    theta: (4,) rad.
+    """
+    return _scaled(arm, tilt, _exact(math, arm, theta, tilt.direction))
 
 
-#: the closed forms for the control loop, one pose in plain floats; they apply in every pose at any tilt
-LAWS: dict[str, Law] = {
-    "exact": _law(lambda arm, t, tilt: _exact(math, arm, t, tilt.direction)),
-    "paper_static": _law(lambda arm, t, tilt: _paper_static(math, arm, (tilt.axis_angle, *t[1:]))),
-    "paper_mobile": _law(lambda arm, t, tilt: _paper_mobile(math, arm, (tilt.axis_angle, *t[1:]), tilt.beta, tilt.phi)),
-}
+def static_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+    """Return the torque of EQ2-EQ5 like `exact_torque`; joint 1's own angle is not used."""
+    return _scaled(arm, tilt, _paper_static(math, arm, (tilt.axis_angle, *theta[1:])))
+
+
+def mobile_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+    """Return the torque of EQ1m-EQ4m like `exact_torque`; joint 1's own angle is not used."""
+    return _scaled(arm, tilt, _paper_mobile(math, arm, (tilt.axis_angle, *theta[1:]), tilt.beta, tilt.phi))
+
+
+def _scaled(arm: ArmModel, tilt: Tilt, tau: Torque) -> Torque:
+    a, b, c, d = arm.scale
+    felt = tilt.magnitude
+    return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
 
 
 MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")

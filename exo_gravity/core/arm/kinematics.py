@@ -21,8 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ZEROS, ArmModel
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
 from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
@@ -30,6 +30,7 @@ from exo_gravity.core.numbers import JOINT_COUNT, Vector
 ROTORS = tuple(MOTORS[name].rotor_inertia for name in USUAL_MOTORS)  # kg m^2, where the motors are not known
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which the mass of an arm given by its moments is assumed
 LEAST_REACH = 0.01  # m
+NO_LENGTH = (0.0,) * JOINT_COUNT  # m: directions do not depend on the lengths
 GRID = tuple(map(math.radians, (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)))  # of joints 2 to 4, for the least inertia
 
 
@@ -90,7 +91,7 @@ class LinkInertia(NamedTuple):
 
     def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (4,) each."""
-        links = frames(ZEROS, theta)
+        links = frames(NO_LENGTH, theta)
         turning = spin_up = ZERO  # of the link
         second = []
         for (_, axis, along), speed, change in zip(links, velocity, acceleration, strict=True):
@@ -109,7 +110,7 @@ class LinkInertia(NamedTuple):
         by q_k is z_{k-1} x x'_j + z'_{k-1} x x_j. turning: angular velocity of the base in its own axes, (3,) rad/s,
         which adds to both.
         """
-        links = frames(ZEROS, theta)
+        links = frames(NO_LENGTH, theta)
         swings, derivatives = [], []  # z'_{k-1}, and x'_j
         for (_, axis, along), speed in zip(links, velocity, strict=True):
             swings.append(cross(turning, axis))
@@ -128,7 +129,7 @@ class LinkInertia(NamedTuple):
 
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
-        return np.array([self.torque(theta, ZEROS, row) for row in np.eye(JOINT_COUNT).tolist()])
+        return np.array([self.torque(theta, NO_TORQUE, row) for row in np.eye(JOINT_COUNT).tolist()])
 
 
 @lru_cache(8)
@@ -177,7 +178,7 @@ def turning_torque(arm: ArmModel, side: str, theta: Sequence[float], angular_acc
     in its own axes.
     """
     alpha = turning_in_base(side, angular_acceleration)
-    links = frames(ZEROS, theta)
+    links = frames(NO_LENGTH, theta)
     torque = _torque(links, links_of(arm).weights, [cross(alpha, link.along) for link in links])
     return tuple(map(operator.mul, arm.gain.tolist(), torque))
 

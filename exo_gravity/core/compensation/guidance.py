@@ -5,8 +5,8 @@ torque moves from what the settings before it would give in this pose to what th
 
     torque = after + share * (before - after + offset)
 
-The share falls from 1 to 0 within FADE_TIME or longer, more slowly the faster the joint moves where the change drives
-it. Beyond GUIDE.speed it rises again, at SPEED_GAIN: so an arm that becomes heavy sinks at about that speed until it
+The share falls from 1 to 0 within `fade_time` or longer, more slowly the faster the joint moves where the change drives
+it. Beyond GUIDE.speed it rises again, at `speed_gain`: so an arm that becomes heavy sinks at about that speed until it
 hangs, and a spring that is switched on pulls no faster. The torque always lies between the old load's and the new
 one's in this pose, wherever the arm has moved meanwhile: it cannot wind up. What the two settings do not explain,
 because a change follows another or a law does not apply in this pose, is the constant offset of the start.
@@ -14,29 +14,53 @@ because a change follows another or a law does not apply in this pose, is the co
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.safety.limits import GUIDE
 
-RAMP_TIME = 1.0  # s from zero to full torque, at the start and after a break
-# s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm is
-# already being let down, so the restart from zero cannot drop it.
-BREAK = 0.2
-LONGEST_STEP = 0.01  # s that the rate limit allows for after a pause, so that the torque does not catch up in one step
-LAST_FADE = 2.0  # s of the last fade; a launcher kills a node 5 s after it asked it to end
-# Of a change of load:
-FADE_TIME = 2.0  # s from the old load to the new one where the joint does not move,
-MAX_FADE_RATE = 4.0  # Nm/s, but no faster than this,
-LONGEST_FADE = 10.0  # s, of larger arms; and always where the velocity is not known
-SPEED_GAIN = 20.0  # Nm/rad
-WATCH = 1.0  # s after the last fade in which a joint that begins to move is still guided
-LARGE = 1.0  # Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
-SMALL = 0.05  # Nm; a smaller difference is nothing to guide
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
-DROP_RISE = 0.25  # m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
-DROP_TIME = 0.03  # s, time constant of that
-DROP_SPEED = 0.8  # m/s upwards, however slowly it was gained: a light load
-LEAST_DROP = 0.1  # kg; less throws no arm
+
+
+@dataclass(frozen=True)
+class Ramp:
+    """How torque begins and ends."""
+
+    time: float = 1.0  #: s from zero to full torque, at the start and after a pause
+    #: s without an answer, after which the torque ramps in from zero. This is longer than any command_timeout: the arm
+    #: is already being let down, so the restart from zero cannot drop it.
+    pause: float = 0.2
+    #: s that the rate limit allows for after a pause, so that the torque does not catch up in one step
+    longest_step: float = 0.01
+    last_fade: float = 2.0  #: s of the last fade; a launcher kills a node 5 s after it asked it to end
+
+
+@dataclass(frozen=True)
+class Guidance:
+    """How fast a change of load is."""
+
+    fade_time: float = 2.0  #: s from the old load to the new one where the joint does not move,
+    max_rate: float = 4.0  #: Nm/s, but no faster than this,
+    longest: float = 10.0  #: s, of larger arms; and always where the velocity is not known
+    speed_gain: float = 20.0  #: Nm/rad, beyond GUIDE.speed
+    watch: float = 1.0  #: s after the last fade in which a joint that begins to move is still guided
+    #: Nm between old and new load; less is slow enough without damping, which a wearer who moves would feel
+    large: float = 1.0
+    small: float = 0.05  #: Nm; a smaller difference needs no guiding
+
+
+@dataclass(frozen=True)
+class DropLimits:
+    """By what a load that leaves the hand shows."""
+
+    rise: float = 0.25  #: m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
+    low_pass: float = 0.03  #: s, time constant of that
+    speed: float = 0.8  #: m/s upwards, however slowly it was gained: a light load
+    least_mass: float = 0.1  #: kg; less throws no arm
+    least_carried: float = 0.5  #: of the load's torque, that motors must apply to carry it
+
+
+RAMP, GUIDANCE, DROP = Ramp(), Guidance(), DropLimits()
 
 
 def limited(wanted: float, last: float, limit: float, step: float) -> float:
@@ -56,32 +80,33 @@ class DropWatch:
 
     def step(self, dt: float, speed: float, mass: float) -> bool:
         """Return whether the load of `mass` kg was dropped; speed: m/s of the hand, upwards, `dt` s after the last."""
-        self._slow += min(1.0, dt / DROP_TIME) * (speed - self._slow)
-        return mass > LEAST_DROP and (speed > DROP_SPEED or (speed > 0.0 and speed - self._slow > DROP_RISE))
+        self._slow += min(1.0, dt / DROP.low_pass) * (speed - self._slow)
+        is_sudden = speed > 0.0 and speed - self._slow > DROP.rise
+        return mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
 
 
 class GuidedChange:
     """The way of `count` joints from one load to another. remainder: (n,) Nm that the torque still has to go."""
 
     def __init__(self, count: int) -> None:
-        self._nothing: Torque = (0.0,) * count
+        self._zeros: Torque = (0.0,) * count
         self.stop()
 
     def stop(self) -> None:
         """Forget the change: the next torque is the new load's."""
-        self._share, self._offset, self.remainder = self._nothing, self._nothing, self._nothing
+        self._share, self._offset, self.remainder = self._zeros, self._zeros, self._zeros
         self._largest = 0.0  # Nm between old and new load in this pose
-        self._done = WATCH  # s for which every share has been zero
+        self._done = GUIDANCE.watch  # s for which every share has been zero
 
     @property
     def is_over(self) -> bool:
         """Whether no change is under way."""
-        return self._done >= WATCH
+        return self._done >= GUIDANCE.watch
 
     @property
     def is_large(self) -> bool:
         """Whether the change is large enough for the motors to damp the joints meanwhile."""
-        return not self.is_over and self._largest > LARGE
+        return not self.is_over and self._largest > GUIDANCE.large
 
     def begin(self, torque: Torque, starts: Sequence[Torque], after: Torque) -> list[int]:
         """Begin at the present `torque` the way to `after` from one of `starts`, all (n,) Nm in this pose.
@@ -92,12 +117,12 @@ class GuidedChange:
         for now, new, *olds in zip(torque, after, *starts, strict=True):
             choices = []
             for index, old in enumerate(olds):
-                part = (now - new) / (old - new) if abs(old - new) > SMALL else 1.0
+                part = (now - new) / (old - new) if abs(old - new) > GUIDANCE.small else 1.0
                 offset = 0.0 if 0.0 <= part < 1.0 else now - old
                 choices.append((abs(offset), index, part if 0.0 <= part <= 1.0 else 1.0, offset, old))
             ways.append(min(choices))
         _, chosen, shares, offsets, before = zip(*ways, strict=True)
-        if max(abs(a - b) for a, b in zip((*torque, *before), (*after, *after), strict=True)) < SMALL:
+        if max(abs(a - b) for a, b in zip((*torque, *before), (*after, *after), strict=True)) < GUIDANCE.small:
             self.stop()
         else:
             self._share, self._offset, self._done = shares, offsets, 0.0
@@ -105,17 +130,17 @@ class GuidedChange:
 
     def step(self, dt: float, velocity: Sequence[float] | None, before: Torque, after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more; velocity: (n,) rad/s, None if not known."""
-        speeds = velocity or self._nothing
+        g, speeds = GUIDANCE, velocity or self._zeros
         shares, ways, remainder = [], [], []
         for share, offset, speed, old, new in zip(self._share, self._offset, speeds, before, after, strict=True):
             way = old - new + offset
-            size = max(SMALL, abs(way))
+            size = max(g.small, abs(way))
             driven = -math.copysign(speed, way * speed)  # > 0 where the change drives the joint
             if driven > GUIDE.speed:
-                share = min(1.0, share + SPEED_GAIN / size * (driven - GUIDE.speed) * dt)
+                share = min(1.0, share + g.speed_gain / size * (driven - GUIDE.speed) * dt)
             else:
-                fastest = max(MAX_FADE_RATE / size, 1.0 / LONGEST_FADE)
-                pace = min(1.0 / FADE_TIME, fastest) if velocity else 1.0 / LONGEST_FADE
+                fastest = max(g.max_rate / size, 1.0 / g.longest)
+                pace = min(1.0 / g.fade_time, fastest) if velocity else 1.0 / g.longest
                 share = max(0.0, share - pace * (1.0 - max(0.0, driven) / GUIDE.speed) * dt)
             shares.append(share)
             ways.append(abs(way))
@@ -130,8 +155,8 @@ class CommandFade:
     """Effort commands for an effort controller of ros2_control, which keeps its last command for ever.
 
     So the sender lets the arm down: `timeout` s after the last sound effort, or when efforts are withdrawn, the torque
-    fades linearly to zero over LAST_FADE. The fault is latched: zeros follow until an operator clears it, because an
-    arm that was let down must not rise by itself. The next torque ramps in.
+    fades linearly to zero in RAMP.last_fade. The fault is latched: zeros follow until an operator clears it, because
+    an arm that was let down must not rise by itself. The next torque ramps in.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -158,7 +183,7 @@ class CommandFade:
             return None
         if self.state == "waiting":
             self.state, self._held, self._start = "active", tuple(applied), now
-        left = max(0.0, 1.0 - (now - self._start) / RAMP_TIME)
+        left = max(0.0, 1.0 - (now - self._start) / RAMP.time)
         self._effort, self._time = tuple([tau + left * h for tau, h in zip(effort, self._held, strict=True)]), now
         return self._effort
 
@@ -173,7 +198,7 @@ class CommandFade:
             self.withdraw(now, f"no joint_states younger than {1000.0 * self._timeout:.0f} ms")
         if not self.problem:
             return None
-        left = 1.0 - (now - self._time) / LAST_FADE
+        left = 1.0 - (now - self._time) / RAMP.last_fade
         if left <= 0.0:
             self.state = "zero"
         return tuple(max(0.0, min(1.0, left)) * effort for effort in self._effort)

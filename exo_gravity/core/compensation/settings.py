@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.arm.arm import (
@@ -18,10 +18,10 @@ from exo_gravity.core.arm.arm import (
     ArmModel,
     ModelError,
 )
-from exo_gravity.core.arm.gravity import LAWS, NO_TORQUE, Torque
-from exo_gravity.core.arm.rotation import Floats3
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.arm.wearer import SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.compensation.laws import LAWS, ArmLaw, GravityModel, Law, UrdfLaw
 from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.numbers import JOINT_COUNT
@@ -29,7 +29,6 @@ from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, ch
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
 MODES = ("one_g", "zero_g")
-LAW_NAMES = (*LAWS, "anfis")
 URDF_LAW = "urdf"  # chosen at the start, because it is that of another arm
 # Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
 MAX_SCALE = 20.0
@@ -38,14 +37,15 @@ MAX_CARRIED = 10.0  # kg, robot and wearer's share: the arm of a 150 kg wearer h
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of the exoskeleton's own arm. All but `side` and `use_imu` may change while the arm is worn.
+    """What holds an arm of n joints. All but `side` and `use_imu` may change while the arm is worn.
 
-    Raises ParameterError.
+    An arm that is known by its URDF alone has no `robot`: then it has no wearer, terms, load or weighing either, and
+    none of the models that are computed here. Raises ParameterError.
     """
 
-    side: str  #: 'left' or 'right'
-    robot: ArmModel  #: the exoskeleton's own arm
-    law: str = owned("exact", "law that computes the gravity torque", choices=LAW_NAMES)
+    side: str  #: 'left' or 'right'; 'left' with `urdf`, whose root link's axes are not mirrored
+    robot: ArmModel | None  #: the exoskeleton's own arm; None with `urdf`
+    law: str = owned("exact", "law that computes the gravity torque", choices=LAWS)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
     support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
@@ -57,8 +57,10 @@ class Settings:
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
-    inertial: bool = False  #: also compensate the trunk's acceleration, as its IMU measures it
-    shoulder_from_imu: Floats3 = (0.0, 0.0, 0.0)  #: (3,) m in the trunk's axes, for `inertial`
+    inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
+    shoulder_from_imu: tuple[float, float, float] = owned(
+        (0.0, 0.0, 0.0), "the arm's base from the IMU along the trunk's axes, for `inertial`", (-1.0, 1.0), "m"
+    )
     use_imu: bool = True  #: False assumes an upright trunk
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
@@ -66,38 +68,44 @@ class Settings:
     robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
     payload_mass: float = 0.0  #: kg in the hand
     payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in frame 4
+    urdf: UrdfLaw | None = None  #: the law of another arm, in place of `robot`
     #: a load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2
-    unit_load: ArmModel = field(init=False)
+    unit_load: ArmModel = field(init=False, repr=False, compare=False)
     #: the robot with the load in its hand, which is carried in full in both modes, like the robot's own weight
-    loaded: ArmModel = field(init=False)
+    loaded: ArmModel = field(init=False, repr=False, compare=False)
     #: what is compensated: `loaded` in One-G, the same plus `support` times the wearer in Zero-G
-    arm: ArmModel = field(init=False)
-    moving: ArmModel = field(init=False)  #: the same by its masses
+    arm: ArmModel = field(init=False, repr=False, compare=False)
+    moving: ArmModel = field(init=False, repr=False, compare=False)  #: the same by its masses
+    chosen: Law = field(init=False, repr=False, compare=False)  #: the law called `law`
+    exact: Law = field(init=False, repr=False, compare=False)  #: what replaces it where it does not apply
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
             raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
-        check_owned(self)
-        if self.law == "anfis" and self.anfis is None:
-            raise ParameterError("law", self.law, "used with anfis_file, a model from train_anfis")
-        loaded = self.robot.with_payload(self.payload_mass, self.payload_cog)
-        if self.law != "exact":
-            loaded.check_masses(f"law {self.law}")
+        if self.robot is not None:
+            check_owned(self)
+            self._carry(self.robot)
+        object.__setattr__(self, "chosen", LAWS[self.law](self))
+        object.__setattr__(self, "exact", self.urdf or ArmLaw(self.arm, exact_torque))
+
+    def _carry(self, robot: ArmModel) -> None:
+        """Compute what is carried by the exoskeleton's own arm."""
+        loaded = robot.with_payload(self.payload_mass, self.payload_cog)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
         if loaded.total_mass + wearer > MAX_CARRIED:
-            robot = loaded.total_mass - self.payload_mass
-            parts = f"robot {robot:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
+            bare = loaded.total_mass - self.payload_mass
+            parts = f"robot {bare:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
             bound = f"at most {MAX_CARRIED:g} ({parts})"
             raise ParameterError("total mass in kg", round(loaded.total_mass + wearer, 2), bound)
-        if max(self.robot.scale) > MAX_SCALE:
-            scale = [round(value, 2) for value in self.robot.scale]
+        if max(robot.scale) > MAX_SCALE:
+            scale = [round(value, 2) for value in robot.scale]
             raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
-        by_mass = (self.robot_by_mass or self.robot).with_payload(self.payload_mass, self.payload_cog)
+        by_mass = (self.robot_by_mass or robot).with_payload(self.payload_mass, self.payload_cog)
         carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
-        object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or self.robot))
-        nothing = ArmModel.from_moments(self.robot.length, NO_TORQUE, gravity=1.0)
+        object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or robot))
+        nothing = ArmModel.from_moments(robot.length, NO_TORQUE, gravity=1.0)
         object.__setattr__(self, "unit_load", nothing.with_payload(1.0, self.payload_cog))
         object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
@@ -113,49 +121,19 @@ class Settings:
         """The share of the wearer's arm that zero_g compensates at present."""
         return max(self.support, self.raised_support)
 
+    @property
+    def mass(self) -> float:
+        """What is carried, in kg."""
+        return self.urdf.model.mass if self.urdf else self.arm.total_mass
+
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
-        """Return the torque (4,) in Nm that holds the arm at `theta` (4,) rad; exact: by the exact law in any case.
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; exact: by the exact law in any case.
 
-        And why the chosen law does not apply here, as `AnfisLaw.outside`, or ''. Then the exact law replaces it.
+        And why the chosen law does not apply here, or ''. Then the exact law replaces it.
         """
-        if self.law != "anfis" or not self.anfis:
-            return LAWS["exact" if exact else self.law](self.arm, theta, tilt), ""
-        reason = self.anfis.outside(self.arm, theta, tilt)
-        law = LAWS["exact"] if exact or reason else self.anfis.torque
-        return law(self.arm, theta, tilt), reason
-
-
-class GravityModel(Protocol):
-    """An arm of n joints whose torques come from outside `core`."""
-
-    max_effort: tuple[float, ...]  #: the joints' own limits, (n,) Nm; 0 if not known
-    mass: float  #: kg that the joints carry
-
-    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> Torque:
-        """Return the torque (n,) in Nm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root link's axes."""
-        ...
-
-
-@dataclass(frozen=True)
-class UrdfSettings:
-    """Settings of any serial arm of n joints, whose torques come from `arm`."""
-
-    law: ClassVar[str] = URDF_LAW
-    inertial: ClassVar[bool] = False
-    side: ClassVar[str] = "left"  # the root link's axes are not mirrored
-
-    arm: GravityModel
-    gain: Sequence[float]  #: scales the torque, (n,)
-    gravity: float  #: m/s^2
-    max_effort: Sequence[float]  #: (n,) Nm
-    max_effort_rate: float  #: Nm/s
-    tilt_timeout: float  #: s
-    use_imu: bool  #: False assumes that the root link's z axis points up
-
-    def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = True) -> tuple[Torque, str]:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad, and '': the law applies everywhere."""
-        torque = self.arm.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
-        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)]), ""
+        reason = self.chosen.outside(theta, tilt)
+        law = self.exact if exact or reason else self.chosen
+        return law.torque(theta, tilt), reason
 
 
 MAX_JOINTS = 32
@@ -175,8 +153,11 @@ COMPENSATOR = (
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("robot.moments", [0.0] * 8, "M1 to M4, W, Z, Y3, Y4 by `calibrate`, for the law exact; M1 to M4 all 0: by "
-          "mass and cog", (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
+    Param("robot.first_moment", [0.0] * JOINT_COUNT, "M1 to M4 by `calibrate`, for the law exact: of link n along it, "
+          "with all mass beyond; all 0: by mass and cog", (0.0, MAX_MOMENT), "kg m", expert=True),
+    Param("robot.off_axis", [0.0] * JOINT_COUNT, "W, Z, Y3, Y4 by `calibrate`, for the law exact: W of link 1 along "
+          "z_1 and of link 2 along y_2, Z of links 2 to 4 along z_2, Y3 and Y4 of links 3 and 4 along their y",
+          (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
@@ -188,8 +169,8 @@ COMPENSATOR = (
           (-MAX_REACH, MAX_REACH), "m"),
     param_of(Settings, "max_effort"),
     param_of(Settings, "max_effort_rate"),
-    Param("inertial.shoulder_from_imu", [0.0] * 3, "the arm's base from the IMU along the trunk's axes; where it is "
-          "given, the trunk's acceleration is compensated too; zeros: off", (-1.0, 1.0), "m"),
+    param_of(Settings, "inertial"),
+    param_of(Settings, "shoulder_from_imu"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *term_parameters(),
@@ -257,14 +238,11 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
     mass, cog = wearer_of(values)
-    shoulder = tuple(values["inertial.shoulder_from_imu"])
     return Settings(
         side=values["side"],
         robot=robot_of(values),
         wearer_mass=mass,
         wearer_cog=cog,
-        inertial=any(shoulder),
-        shoulder_from_imu=shoulder,
         use_imu=values["use_imu"],
         anfis=anfis,
         terms=term_settings_of(values),
@@ -276,21 +254,22 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
     )
 
 
-def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> UrdfSettings:
+def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> Settings:
     """Return the settings that parameter values describe for the arm `model`, or raise ParameterError."""
     limits = []
     for name, given, own in zip(values["joint_names"], values["max_effort"], model.max_effort, strict=True):
         if not (given or own):
             raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
         limits.append(given or own)
-    others = {name: values[name] for name in ("gain", "gravity", "max_effort_rate", "tilt_timeout", "use_imu")}
-    return UrdfSettings(model, max_effort=tuple(limits), **others)
+    law = UrdfLaw(model, values["gain"], values["gravity"])
+    others = {name: values[name] for name in ("max_effort_rate", "tilt_timeout", "use_imu")}
+    return Settings("left", None, URDF_LAW, urdf=law, max_effort=tuple(limits), **others)
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
-    """Return the robot's arm, by its moments if robot.moments has any along the links, or raise ParameterError."""
-    length, moments, rest = values["link_length"], values["robot.moments"], (values["gain"], values["gravity"])
-    along, across = moments[:JOINT_COUNT], moments[JOINT_COUNT:]
+    """Return the robot's arm, by its moments if robot.first_moment has any, or raise ParameterError."""
+    length, along, across = (values[name] for name in ("link_length", "robot.first_moment", "robot.off_axis"))
+    rest = values["gain"], values["gravity"]
     with named("robot."):
         if any(along):
             return ArmModel.from_moments(length, along, across, *rest)

@@ -10,6 +10,7 @@ frequency, however they are coupled.
 
 import math
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,26 +18,45 @@ import numpy as np
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
-MAX_SPEED = 0.3  # rad/s, of any joint
-ACCELERATION = 0.5  # rad/s^2
-AMPLITUDE = 0.06  # rad, of a sweep on each side of its pose
-WINDOW = 0.55  # of a sweep's amplitude: the part on both sides of the pose that is measured
-FOLLOWED = 0.5  # of this part, that each joint must follow in a valid sweep
-LEAD = 0.3  # s at rest before each motion, in which the joints are brought to the edge of moving
-BINS = 4  # of each sweep: neighbouring samples share the slow oscillations of the controller
-RESOLUTION = 0.002  # Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
-ADDED = 0.005  # kg m^2 at each joint: with it 1 kg on link 4 at 100 Hz is carried without sticking (measured)
-FREQUENCY_PER_RATE = 0.12  # natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
-MAX_FREQUENCY = 20.0  # rad/s
-INTEGRAL_SHARE = 0.4  # of the frequency, at which the integral part acts; unstable from 2 on
-# Times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that stick on
-# opposite sides of their path would cancel each other's integral where the inertia of both together is small.
-FLOOR = 2.0
-USUAL_FRICTION = 0.15  # Nm, until it is measured
-FRICTION_RATE = 6.0  # of the friction, per s: at once, a joint that rests anywhere within its friction would jump
-AHEAD, FASTER = 0.003, 0.03  # rad and rad/s ahead of the reference, from which on no more friction is compensated
-SLOW_ERROR, STOP_ERROR = 0.04, 0.08  # rad behind the reference, from which on it slows down, and at which it waits
-FULL_FRICTION_SPEED = 0.03  # rad/s of the reference, from which on friction is compensated fully
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """How the arm moves along a line and through a pose."""
+
+    speed: float = 0.3  #: rad/s, the most of any joint
+    acceleration: float = 0.5  #: rad/s^2
+    amplitude: float = 0.06  #: rad, of a sweep on each side of its pose
+    window: float = 0.55  #: of a sweep's amplitude: the part on both sides of the pose that is measured
+    followed: float = 0.5  #: of this part, that each joint must follow in a valid sweep
+    lead: float = 0.3  #: s at rest before each motion, in which the joints are brought to the edge of moving
+    bins: int = 4  #: of each sweep: neighbouring samples share the slow oscillations of the controller
+    #: Nm: standard error that is left of the 12-bit torque command (7.3 mNm per code) after averaging
+    resolution: float = 0.002
+
+
+@dataclass(frozen=True)
+class TrackerTuning:
+    """The PID controller and the friction compensation of `Tracker`."""
+
+    #: kg m^2 at each joint: with it 1 kg on link 4 at 100 Hz is carried without sticking (measured)
+    added: float = 0.005
+    #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
+    frequency_per_rate: float = 0.12
+    max_frequency: float = 20.0  #: rad/s
+    integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
+    #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
+    #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
+    floor: float = 2.0
+    usual_friction: float = 0.15  #: Nm, until it is measured
+    friction_rate: float = 6.0  #: of the friction, per s: at once, a joint that rests within its friction would jump
+    ahead: float = 0.003  #: rad ahead of the reference, from which on no more friction is compensated;
+    faster: float = 0.03  #: rad/s, the same of the speed
+    slow_error: float = 0.04  #: rad behind the reference, from which on it slows down,
+    stop_error: float = 0.08  #: and at which it waits
+    full_friction_speed: float = 0.03  #: rad/s of the reference, from which on friction is compensated fully
+
+
+MOTION, TRACKER = MotionTuning(), TrackerTuning()
 
 
 class Observation(NamedTuple):
@@ -65,7 +85,7 @@ class Station(NamedTuple):
 
     theta: tuple[float, ...]  #: (4,) rad
     speed: float = 0.1  #: rad/s, of the sweep
-    amplitude: float = AMPLITUDE  #: rad, on each side of the pose
+    amplitude: float = MOTION.amplitude  #: rad, on each side of the pose
     cycles: int = 2
 
     @property
@@ -80,26 +100,26 @@ class Line:
     duration: s.
     """
 
-    def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MAX_SPEED) -> None:
+    def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MOTION.speed) -> None:
         self._start = np.asarray(start, dtype=float)
         way = np.asarray(end, dtype=float) - self._start
         self._length = float(np.abs(way).max())
         self._heading = way / self._length if self._length else way
-        self._speed = min(speed, MAX_SPEED, math.sqrt(self._length * ACCELERATION))
-        self._ramp = self._speed / ACCELERATION
+        self._speed = min(speed, MOTION.speed, math.sqrt(self._length * MOTION.acceleration))
+        self._ramp = self._speed / MOTION.acceleration
         self.duration = self._length / self._speed + self._ramp if self._length else 0.0
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position (4,) rad and velocity (4,) rad/s at `time` s after the start."""
         time = min(max(time, 0.0), self.duration)
         rising, falling = min(time, self._ramp), max(0.0, time - self.duration + self._ramp)
-        travelled = ACCELERATION * (rising**2 - falling**2) / 2 + self._speed * (time - rising)
-        return self._start + travelled * self._heading, ACCELERATION * (rising - falling) * self._heading
+        travelled = MOTION.acceleration * (rising**2 - falling**2) / 2 + self._speed * (time - rising)
+        return self._start + travelled * self._heading, MOTION.acceleration * (rising - falling) * self._heading
 
     def is_measured(self, time: float) -> bool:
-        """Return whether the motion is in its middle, within WINDOW of the half length at steady speed."""
+        """Return whether the motion is in its middle, within `window` of the half length at steady speed."""
         is_steady = self._ramp <= time <= self.duration - self._ramp
-        return is_steady and abs(time - self.duration / 2.0) * self._speed <= WINDOW * self._length / 2.0
+        return is_steady and abs(time - self.duration / 2.0) * self._speed <= MOTION.window * self._length / 2.0
 
 
 def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
@@ -108,10 +128,10 @@ def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
     They alternate between there and back. What is expected at an angle should be subtracted from the effort: the rest
     does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
     """
-    bins = np.zeros((len(sweeps), BINS, JOINT_COUNT))  # mean effort in order of the angle
+    bins = np.zeros((len(sweeps), MOTION.bins, JOINT_COUNT))  # mean effort in order of the angle
     for number, sweep in enumerate(sweeps):
         effort = sweep.effort[::-1] if number % 2 else sweep.effort
-        bins[number] = [part.mean(axis=0) for part in np.array_split(effort, BINS)]
+        bins[number] = [part.mean(axis=0) for part in np.array_split(effort, MOTION.bins)]
     there, back = bins[0::2], bins[1::2]
     gravity = (there + back) / 2.0
     cycles = gravity.mean(axis=1)
@@ -119,7 +139,7 @@ def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
     scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
     theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
     direction = mean_direction(np.concatenate([sweep.direction for sweep in sweeps]))
-    seen = Observation(theta, direction, cycles.mean(axis=0), friction, np.hypot(scatter, RESOLUTION))
+    seen = Observation(theta, direction, cycles.mean(axis=0), friction, np.hypot(scatter, MOTION.resolution))
     return seen, np.ptp(cycles, axis=0)
 
 
@@ -132,7 +152,7 @@ def mean_direction(directions: np.ndarray) -> np.ndarray:
 def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
     """Return the share (4,) of the measured way that each joint went in every one of `sweeps` through `station`."""
     ways = np.min([np.abs(sweep.position[-1] - sweep.position[0]) for sweep in sweeps], axis=0)
-    return np.asarray(ways / (2.0 * WINDOW * station.amplitude))
+    return np.asarray(ways / (2.0 * MOTION.window * station.amplitude))
 
 
 class Tracker:
@@ -145,11 +165,11 @@ class Tracker:
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
-        self.friction = np.full(JOINT_COUNT, USUAL_FRICTION)
+        self.friction = np.full(JOINT_COUNT, TRACKER.usual_friction)
         self.saturated = np.zeros(JOINT_COUNT)
         self.error = np.zeros(JOINT_COUNT)
         self.correction = np.zeros(JOINT_COUNT)
-        self._frequency = min(MAX_FREQUENCY, FREQUENCY_PER_RATE * rate)
+        self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(JOINT_COUNT)
         self._slide = np.zeros(JOINT_COUNT)  # Nm that compensate friction
@@ -182,28 +202,28 @@ class Tracker:
         the samples. matrix: (4, 4) kg m^2, the approximate mass matrix.
         """
         if self._time > self._line.duration:
-            self._line, self._time = next(self.lines), -LEAD
+            self._line, self._time = next(self.lines), -MOTION.lead
         goal, heading = self._line.at(self._time)
         self.error = goal - position
         behind = float(np.abs(self.error).max())
-        pace = max(0.0, min(1.0, (STOP_ERROR - behind) / (STOP_ERROR - SLOW_ERROR)))
+        pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
             # The effort of the last cycle brought the arm here.
             self._samples.append((position, np.subtract(self._effort, expected), direction))
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
-        coming = self._line.at(self._time + LEAD)[1] if self._time < LEAD else heading
+        coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
         self._compensate_friction(dt, coming, speed_error)
-        self._effort = self._controlled(dt, speed_error, expected, matrix + ADDED * np.eye(JOINT_COUNT))
+        self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(JOINT_COUNT))
         return self._effort
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (4,) rad/s, and no further in a joint that is ahead."""
-        most, way = FRICTION_RATE * self.friction * dt, np.sign(heading)
-        wanted = self.friction * np.clip(heading / FULL_FRICTION_SPEED, -1.0, 1.0)
+        most, way = TRACKER.friction_rate * self.friction * dt, np.sign(heading)
+        wanted = self.friction * np.clip(heading / TRACKER.full_friction_speed, -1.0, 1.0)
         change = np.clip(wanted - self._slide, -most, most)
-        is_ahead = (self.error * way < -AHEAD) | (speed_error * way < -FASTER)
+        is_ahead = (self.error * way < -TRACKER.ahead) | (speed_error * way < -TRACKER.faster)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
@@ -211,8 +231,8 @@ class Tracker:
         stiff = matrix @ self.error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
         weakest = float(np.linalg.eigvalsh(matrix)[0])
-        floor = FLOOR * weakest * self.error * frequency**2
-        integral = self._integral + INTEGRAL_SHARE * frequency * dt * (stiff + floor)
+        floor = TRACKER.floor * weakest * self.error * frequency**2
+        integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)

@@ -1,43 +1,54 @@
 """Weighs what is in the hand of a relaxed arm: the motors take it over, and sweep all joints a little there and back.
 
-For TAKE_OVER s the arm is held where it is, so that the wearer can relax and the motors get the load. The mean of both
-directions of a sweep is what the settings do not carry, without the joints' friction (`motion.average`). With dz/dq,
+At first the arm is held where it is, so that the wearer can relax and the motors get the load. The mean of both
+directions of a sweep is what the settings do not carry, without the joints' friction (`tracking.average`). With dz/dq,
 the height that each joint gives the hand, m kg in the hand take the torque m g dz/dq; m is fitted to it.
 
 The result contains the error of the model, which weighing the empty hand in the same pose shows. Muscles look like a
-load: what the wearers carry themselves is missing from the result, unless their torque is one that no load can cause.
+load: what the wearer carries is missing from the result, unless their torque is one that no load can cause.
 """
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_PAYLOAD, ArmModel
-from exo_gravity.core.arm.gravity import LAWS, Torque
+from exo_gravity.core.arm.gravity import Torque, exact_torque
 from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.tracking import FOLLOWED, LEAD, Line, Station, Sweep, Tracker, average, followed
+from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.numbers import COVER
 
-TAKE_OVER = 4.0  # s
-CYCLES = 3  # there and back
-LEAST_LEVER = 0.2  # m, of dz/dq: below, a load needs too little torque
-LEAST_RATE = 80.0  # Hz
-START_SPEED = 0.2  # rad/s of a joint at the start
-LARGEST_ERROR = 0.4  # rad of a joint from its path
-PERSISTENCE = 0.3  # s for which a joint may want more than it may have
-LIFTED = 0.5  # kg less than nothing, and
-FOREIGN = 2.0  # Nm of any joint that is no load's: more is a hand on the arm, and a joint gets no more
-UNREST = (0.08, 0.05)  # kg, and share of the mass, between two turns
-UNLIKE = (0.3, 0.1)  # Nm, and share of the torque, that is no load's, beyond COVER standard errors
-LEAST_ERROR = 0.05  # Nm: standard error of a joint's torque at best
-MAX_GAP = 0.1  # s
-SAME_POSE = 0.1  # m, of dz/dq
-EMPTY = 0.15  # kg: a result of less, while no load is configured, is that of an empty hand
 CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
+
+
+@dataclass(frozen=True)
+class WeighingTuning:
+    """When a load can be weighed, and when a result is believed."""
+
+    take_over: float = 4.0  #: s in which the motors take the load over
+    cycles: int = 3  #: there and back
+    least_lever: float = 0.2  #: m, of dz/dq: below, a load needs too little torque
+    least_rate: float = 80.0  #: Hz of the joint states
+    start_speed: float = 0.2  #: rad/s of a joint at the start
+    largest_error: float = 0.4  #: rad of a joint from its path
+    persistence: float = 0.3  #: s for which a joint may want more than it may have, or a hand may push
+    lifted: float = 0.5  #: kg less than nothing, that a wearer may lift
+    foreign: float = 2.0  #: Nm of any joint that is no load's: more is a hand on the arm, and a joint gets no more
+    unrest: tuple[float, float] = (0.08, 0.05)  #: kg, and share of the mass, between two turns
+    #: Nm, and share of the torque, that is no load's, beyond the 95 % band
+    unlike: tuple[float, float] = (0.3, 0.1)
+    least_error: float = 0.05  #: Nm: standard error of a joint's torque at best
+    pause: float = 0.1  #: s without joint states, that ends it
+    same_pose: float = 0.1  #: m, of dz/dq
+    empty: float = 0.15  #: kg: a result of less, while no load is configured, is that of an empty hand
+
+
+WEIGHING = WeighingTuning()
 
 
 class Weighed(NamedTuple):
@@ -54,8 +65,8 @@ def refusal(s: Settings, terms: Sequence[str], rate: float) -> str:
         return f"{', '.join(carriers)} would carry a part of the load: switch it off"
     if any(s.wearer_mass) and (s.mode != "zero_g" or s.support < 1.0):
         return "a wearer can relax only while the whole arm is carried: mode zero_g with support 1"
-    if rate < LEAST_RATE:
-        return f"joint states come at {rate:.0f} Hz, must be {LEAST_RATE:g} or more"
+    if rate < WEIGHING.least_rate:
+        return f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
     return ""
 
 
@@ -87,7 +98,8 @@ class Weighing:
     def empty(self) -> Weighed | None:
         """The latest result for an empty hand, or None."""
         result = self.result
-        return result if result and abs(result.mass) < EMPTY and not self._settings.payload_mass else self._empty
+        is_empty = result and abs(result.mass) < WEIGHING.empty and not self._settings.payload_mass
+        return result if is_empty else self._empty
 
     @property
     def text(self) -> str:
@@ -102,7 +114,7 @@ class Weighing:
         if self.empty is self.result:
             return f"{text}: the hand is empty"
         more, empty = mass, self._empty
-        if empty and math.dist(empty.lever, lever) <= SAME_POSE:
+        if empty and math.dist(empty.lever, lever) <= WEIGHING.same_pose:
             more -= empty.mass
             error = COVER * math.hypot(random, empty.deviation, self._share * more, math.sqrt(2.0) * self._leaning)
             text = f"{text}; {more:.3f} +- {error:.3f} kg more than with an empty hand"
@@ -120,7 +132,7 @@ class Weighing:
         effort = self._tracker.step(dt, theta, velocity, torque, tilt.direction, self._matrix)
         if self.is_over or self._is_wrong(dt):
             return torque
-        most = FOREIGN + MAX_PAYLOAD * self._settings.robot.gravity * np.abs(self._lever)  # what a load may need
+        most = WEIGHING.foreign + MAX_PAYLOAD * self._settings.arm.gravity * np.abs(self._lever)  # what a load may need
         return tuple((np.array(torque) + np.clip(np.subtract(effort, torque), -most, most)).tolist())
 
     def _begin(self, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> None:
@@ -130,19 +142,19 @@ class Weighing:
         tilt; and the standard errors of the result: of the torque's scale, as a share, and in kg of the trunk's tilt,
         and of the whole model with it.
         """
-        s, error, gravity = self._settings, self._settings.model_error, self._settings.robot.gravity
-        self._lever = np.array(LAWS["exact"](s.unit_load, theta, tilt))  # dz/dq, m
+        s, error, gravity = self._settings, self._settings.model_error, self._settings.arm.gravity
+        self._lever = np.array(exact_torque(s.unit_load, theta, tilt))  # dz/dq, m
         fastest = max(map(abs, velocity))
-        if np.linalg.norm(self._lever) < LEAST_LEVER:
+        if np.linalg.norm(self._lever) < WEIGHING.least_lever:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
             self.trouble = f"the hand hangs below the joints, where a load needs no torque: {pose}"
             return
-        if fastest > START_SPEED:
+        if fastest > WEIGHING.start_speed:
             self.trouble = f"the arm moves at {fastest:.2f} rad/s: hold it still"
-        wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
-        self._worn = np.array(LAWS["exact"](wearer, theta, tilt))  # Nm
-        by_tilt = np.array([LAWS["exact"](s.arm, theta, axis) for axis in AXES]).T  # (4, 3) Nm/rad
-        covariance = np.diag(np.hypot(error.torque, LEAST_ERROR) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T
+        wearer = ArmModel(s.arm.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
+        self._worn = np.array(exact_torque(wearer, theta, tilt))  # Nm
+        by_tilt = np.array([exact_torque(s.arm, theta, axis) for axis in AXES]).T  # (4, 3) Nm/rad
+        covariance = np.diag(np.hypot(error.torque, WEIGHING.least_error) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T
         weight = np.linalg.solve(covariance, self._lever)
         self._weight = weight / (weight @ self._lever)  # 1/m
         self._tilted = error.tilt * np.linalg.norm(by_tilt, axis=1)  # Nm
@@ -150,12 +162,12 @@ class Weighing:
         self._share = math.hypot(*(self._weight * self._lever * error.scale))
         model = math.hypot(*(self._weight * error.torque), error.wearer * float(self._weight @ self._worn))
         self._model = math.hypot(model / gravity, self._leaning)
-        self._tracker.lines = self._way(Station(tuple(theta), cycles=CYCLES))
+        self._tracker.lines = self._way(Station(tuple(theta), cycles=WEIGHING.cycles))
 
     def _way(self, station: Station) -> Iterator[Line]:
         """Yield each line when it begins; have the result, or the trouble, after the last one."""
         here, sweeps = np.array(station.theta), list[Sweep]()
-        for _ in range(round(TAKE_OVER / LEAD)):
+        for _ in range(round(WEIGHING.take_over / MOTION.lead)):
             yield Line(here, here)
         yield Line(here, station.ends[0], station.speed)
         self._is_moving = True
@@ -167,21 +179,22 @@ class Weighing:
 
     def _is_wrong(self, dt: float) -> bool:
         """Note what is wrong with the motion; return whether anything is."""
-        error, gravity = self._tracker.error, self._settings.robot.gravity
+        error, gravity = self._tracker.error, self._settings.arm.gravity
         worst = int(np.argmax(np.abs(error)))
-        saturated = [name for name, t in zip(self._names, self._tracker.saturated, strict=True) if t > PERSISTENCE]
-        correction = self._tracker.correction / (self._settings.robot.gain * gravity)
+        times = zip(self._names, self._tracker.saturated, strict=True)
+        saturated = [name for name, time in times if time > WEIGHING.persistence]
+        correction = self._tracker.correction / (self._settings.arm.gain * gravity)
         mass = float(self._weight @ correction)
         foreign = (np.abs(correction - mass * self._lever) * gravity).tolist()
-        is_foreign = max(foreign) > FOREIGN or not -LIFTED < mass < MAX_PAYLOAD
+        is_foreign = max(foreign) > WEIGHING.foreign or not -WEIGHING.lifted < mass < MAX_PAYLOAD
         self._foreign = self._foreign + dt if is_foreign else 0.0
-        if not dt <= MAX_GAP:
+        if not dt <= WEIGHING.pause:
             self.trouble = f"no joint states for {1000.0 * dt:.0f} ms"
-        elif abs(error[worst]) > LARGEST_ERROR:
+        elif abs(error[worst]) > WEIGHING.largest_error:
             self.is_thrown = float(error @ self._lever) < 0.0
             why = "was the load dropped?" if self.is_thrown else "relax gradually, and touch nothing"
             self.trouble = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
-        elif self._foreign > PERSISTENCE:
+        elif self._foreign > WEIGHING.persistence:
             self.trouble = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"
         elif saturated:
             remedy = "the load needs more than max_effort here: hold it nearer to the body"
@@ -189,23 +202,23 @@ class Weighing:
         return bool(self.trouble)
 
     def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
-        """Fit the mass to the sweeps, of whose way each joint must have followed FOLLOWED; shares: (4,)."""
+        """Fit the mass to the sweeps, of whose way each joint must have followed MOTION.followed; shares: (4,)."""
         seen, unrest = average(sweeps)
-        error, weight, gravity = self._settings.model_error, self._weight, self._settings.robot.gravity
-        scale = self._settings.robot.gain * gravity
+        error, weight, gravity = self._settings.model_error, self._weight, self._settings.arm.gravity
+        scale = self._settings.arm.gain * gravity
         mass = float(weight @ (seen.effort / scale))
         needed = mass * scale * self._lever
         parts = (error.torque, seen.spread, self._share * needed, error.wearer * self._worn, self._tilted)
         known = COVER * np.linalg.norm(np.array(parts), axis=0)
-        unlike = np.abs(seen.effort - needed) - known - UNLIKE[0] - UNLIKE[1] * np.abs(needed)
+        unlike = np.abs(seen.effort - needed) - known - WEIGHING.unlike[0] - WEIGHING.unlike[1] * np.abs(needed)
         restless = math.hypot(*(weight * unrest)) / gravity
-        if restless > UNREST[0] + UNREST[1] * abs(mass):
+        if restless > WEIGHING.unrest[0] + WEIGHING.unrest[1] * abs(mass):
             self.trouble = f"{restless:.2f} kg between two turns: relax, and touch nothing"
         for name, share, off in zip(self._names, shares, unlike, strict=True):
-            if share < FOLLOWED:
+            if share < MOTION.followed:
                 self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
             elif off > 0.0:
-                torque = f"{off + UNLIKE[0]:.1f} Nm"
+                torque = f"{off + WEIGHING.unlike[0]:.1f} Nm"
                 self.trouble = f"{name}: no load in the hand explains {torque}: is somebody touching the arm?"
         if not self.trouble:
             self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)

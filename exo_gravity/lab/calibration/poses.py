@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import LAWS, Torque, regressor
+from exo_gravity.core.arm.gravity import Torque, exact_torque, regressor
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import AMPLITUDE, LEAD, MAX_SPEED, Line, Station
+from exo_gravity.core.compensation.tracking import MOTION, Line, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
@@ -59,7 +59,7 @@ CHOICE = PoseChoice()
 class FrictionSweeps:
     """The sweeps of the hanging arm that show its friction."""
 
-    speeds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.18, MAX_SPEED)  #: rad/s, at which friction is measured
+    speeds: tuple[float, ...] = (0.02, 0.05, 0.1, 0.18, MOTION.speed)  #: rad/s, at which friction is measured
     time: float = 1.2  #: s of such a sweep's half at steady speed
     amplitude: tuple[float, float] = (0.05, 0.3)  #: rad, smallest and largest
 
@@ -96,7 +96,7 @@ class TorqueGuess:
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
-        law = LAWS["exact"]
+        law = exact_torque
         return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -168,11 +168,11 @@ class Itinerary:
     def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
         """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
         home, way = (
-            np.array([Line(pose, candidate).duration + LEAD for candidate in self._candidates])
+            np.array([Line(pose, candidate).duration + MOTION.lead for candidate in self._candidates])
             for pose in (np.array(self._home.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
-        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + LEAD)
+        sweeps = 2 * self._home.cycles * (Line(*self._home.ends, self._home.speed).duration + MOTION.lead)
         fits = way + sweeps <= budget * (CHOICE.time_share if left > 1 else 1.0)
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
@@ -183,7 +183,7 @@ class Itinerary:
         known. friction: (4,) Nm, against which the arm is moved.
         """
         shares = np.linspace(0.0, 1.0, CHOICE.waypoints + 1)[1:, None, None]
-        sweep = AMPLITUDE * np.array((-1.0, 1.0))[:, None, None]
+        sweep = MOTION.amplitude * np.array((-1.0, 1.0))[:, None, None]
         start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
         mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
         most = CHOICE.effort_share * np.array(self._limits.max_effort) - [
@@ -196,7 +196,7 @@ class Itinerary:
         return np.asarray(np.where(is_home & (room >= 0.0), np.inf, room).min(axis=0))
 
 
-def hanging(limits: Limits, speed: float = 0.1, amplitude: float = AMPLITUDE) -> Station:
+def hanging(limits: Limits, speed: float = 0.1, amplitude: float = MOTION.amplitude) -> Station:
     """Return the hanging arm, farther off the soft walls than other poses: friction is not known there at first."""
     low, high = measurable(limits, amplitude)
     return Station(
@@ -216,7 +216,7 @@ def candidates(limits: Limits) -> np.ndarray:
 
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
-    poses = np.random.default_rng(1).uniform(*measurable(limits, AMPLITUDE), (CHOICE.candidates, JOINT_COUNT))
+    poses = np.random.default_rng(1).uniform(*measurable(limits, MOTION.amplitude), (CHOICE.candidates, JOINT_COUNT))
     down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
     return np.asarray(poses[down.min(axis=1) >= -CHOICE.most_upwards])
 

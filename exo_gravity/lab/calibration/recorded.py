@@ -15,7 +15,7 @@ import numpy as np
 from rosbags.serde import SerdeError
 
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import BINS, Observation, Sweep, average, mean_direction
+from exo_gravity.core.compensation.tracking import MOTION, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.bag.content import Bag
@@ -126,7 +126,7 @@ def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:
         for run in (there, back):
             is_inside = np.abs(position[run] - (low + high) / 2.0) <= (high - low) * (0.5 - DETECTION.edge)
             middles.append(np.flatnonzero(np.all(is_inside, axis=1)) + run.start)
-        if np.any(high - low < DETECTION.least_way) or min(map(len, middles)) < 2 * BINS:
+        if np.any(high - low < DETECTION.least_way) or min(map(len, middles)) < 2 * MOTION.bins:
             continue
         used = back.stop
         speeds = [np.ptp(position[part[[0, -1]]], axis=0) / np.ptp(time[part]) for part in middles]
@@ -144,7 +144,7 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     way = np.where(is_slow, np.sign(speed) @ 3.0 ** np.arange(JOINT_COUNT), 0.5)
     edges = np.flatnonzero(np.diff(way, prepend=np.nan, append=np.nan) != 0.0)
     for low, high in pairwise(edges.tolist()):
-        if is_slow[low] and high - low > 4 * BINS:
+        if is_slow[low] and high - low > 4 * MOTION.bins:
             yield slice(int(first) + low, int(first) + high)
 
 

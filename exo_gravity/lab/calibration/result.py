@@ -44,7 +44,7 @@ class Change(NamedTuple):
     """A new value of a parameter, or a comment alone."""
 
     node: str  #: '/right/compensator'
-    name: str  #: dotted, 'robot.moments'; '' for a comment alone
+    name: str  #: dotted, 'robot.first_moment'; '' for a comment alone
     value: Value  #: in Python's own types
     note: str = ""  #: uncertainty and unit, for a comment in the file
 

@@ -18,16 +18,7 @@ from exo_gravity.core.arm.gravity import Torque, load_moments
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt, angle_between
 from exo_gravity.core.compensation.settings import COMPENSATOR
-from exo_gravity.core.compensation.tracking import (
-    FOLLOWED,
-    Line,
-    Observation,
-    Station,
-    Sweep,
-    Tracker,
-    average,
-    followed,
-)
+from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param
@@ -182,7 +173,7 @@ class Tour:
             pair = yield from self._tracker.sweep(station)
             sweeps += pair
             share, was_known = followed(pair, station), bool(np.any(self._friction))
-            sticks = bool(np.min(share) < FOLLOWED)
+            sticks = bool(np.min(share) < MOTION.followed)
             if station.speed >= STEADY_SPEED:
                 self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
                 self._tracker.friction = self._friction
@@ -194,7 +185,9 @@ class Tour:
                 self._skipped += 1
                 if self._skipped > MAX_SKIPPED:
                     name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
-                    self.trouble = f"{name}: it sticks: it follows {least:.0%} of a slow motion, must be {FOLLOWED:.0%}"
+                    self.trouble = (
+                        f"{name}: it sticks: it follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
+                    )
                 return
         self._keep(station, sweeps)
 

@@ -53,6 +53,7 @@ WEARER = WearerTour()
 
 
 WORN = ("upper arm", "forearm and hand")  # on links 3 and 4
+MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
@@ -119,8 +120,11 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
     before = moments_of(arm.robot)
     moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
-    changes = [
-        Change(node, "robot.moments", moments, f"{' '.join(MOMENTS)} {unit}, +-{_row(error)}, was {_row(before)}"),
+    changes = []
+    for name, part in MOMENT_PARAMETERS.items():
+        note = f"{' '.join(MOMENTS[part])} {unit}, +-{_row(error[part])}, was {_row(before[part])}"
+        changes.append(Change(node, name, moments[part], note))
+    changes += [
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):

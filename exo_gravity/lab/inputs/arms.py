@@ -13,10 +13,10 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, settings_of
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, robot_of, settings_of
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
-from exo_gravity.core.params import Param, values_of
+from exo_gravity.core.params import Param, in_force, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
 
@@ -59,7 +59,8 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     with named(f"{namespace}/compensator "):
         # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
-        robot = settings_of({**compensator, "law": "exact"}).robot
+        settings_of({**compensator, "law": "exact"})
+        robot = robot_of(compensator)
     name, names, side = namespace.strip("/") or "arm", tuple(compensator["joint_names"]), compensator["side"]
     bounds = np.array(limits.position_min), np.array(limits.position_max)
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot, name, side, names, *bounds)
@@ -100,11 +101,12 @@ def node_values(nodes: Nodes, node: str, table: tuple[Param, ...]) -> dict[str, 
 def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dict[str, Any]:
     """Return every parameter of the compensator or can_bridge of `arm` in a recording, {} if it has none of that node.
 
-    parameters: YAML text by node. One that the recorded version lacked has its default.
+    parameters: YAML text by node. One that the recorded version lacked has its default, one that is gone its new name.
     """
     node = node_of(arm, executable)
     if node not in parameters:
         return {}
     given = yaml.load(parameters[node], Loader)[node]["ros__parameters"]
+    given = {new: plain for name, value in given.items() for new, plain in in_force(name, value).items()}
     table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
     return {param.name: param.default for param in table} | given

@@ -1,7 +1,7 @@
 """The two references: gravity torques by independent libraries, from the same masses and Table 1 of the paper.
 
 The Robotics Toolbox's `gravload` runs a recursive Newton-Euler algorithm over the Denavit-Hartenberg parameters;
-Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.model.gravity` or
+Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.arm.gravity` or
 with each other.
 """
 

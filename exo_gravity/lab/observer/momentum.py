@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import LAWS, NO_TORQUE, Torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
 from exo_gravity.core.arm.kinematics import ROTORS, LinkInertia, links_of
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import AXES, Tilt
@@ -72,7 +72,7 @@ class MomentumObserver:
         s, self._tuning = settings, tuning
         self._error = s.model_error
         self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
-        self._wearer = ArmModel(s.robot.length, s.wearer_cog, s.wearer_mass, s.robot.gain, s.robot.gravity)
+        self._wearer = ArmModel(s.loaded.length, s.wearer_cog, s.wearer_mass, s.loaded.gain, s.loaded.gravity)
         own, worn = links_of(s.loaded), links_of(self._wearer)
         rows = zip(own.weights, worn.weights, strict=True)
         self._links = LinkInertia(tuple([tuple(map(operator.add, *row)) for row in rows]), ROTORS)
@@ -97,7 +97,7 @@ class MomentumObserver:
         """
         theta, velocity, effort = joints
         tuning, bandwidth = self._tuning, self._tuning.bandwidth
-        columns = [LAWS["exact"](self._whole, theta, axis) for axis in AXES]
+        columns = [exact_torque(self._whole, theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
@@ -121,7 +121,7 @@ class MomentumObserver:
             self._outer, self._slow, self._felt = tuple(once), momentum, felt
         self._input, self._momentum = tuple(unexplained), momentum
         lag = list(map(operator.sub, once, self._outer))
-        worn = LAWS["exact"](self._wearer, theta, tilt)
+        worn = exact_torque(self._wearer, theta, tilt)
         shaken = tuning.motion_share * math.dist(felt, self._felt)
         largest = [math.hypot(*column) for column in zip(*columns, strict=True)]  # gravity in any direction
         deviation = [

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ZEROS, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.kinematics import frames
 from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError
@@ -57,8 +57,8 @@ class ArmDescription:
     robot: ArmModel  #: without a wearer
     mass: Vector  #: (4,) kg, used if `robot` is given by its moments
     limits: Limits  #: names, position, speed and torque limits of the joints
-    damping: Vector = ZEROS  #: (4,) Nm s/rad, 0 for unknown
-    friction: Vector = ZEROS  #: (4,) Nm, 0 for unknown
+    damping: Vector = (0.0,) * JOINT_COUNT  #: (4,) Nm s/rad, 0 for unknown
+    friction: Vector = (0.0,) * JOINT_COUNT  #: (4,) Nm, 0 for unknown
     shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
 
     @property
@@ -85,9 +85,9 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
         robot_of(compensator),
         compensator["robot.mass"],
         limits_of(can_bridge),
-        compensator["friction.identified"][JOINT_COUNT:],
-        compensator["friction.identified"][:JOINT_COUNT],
-        compensator["inertial.shoulder_from_imu"],
+        compensator["friction.viscous"],
+        compensator["friction.coulomb"],
+        compensator["shoulder_from_imu"],
     )
 
 

@@ -18,9 +18,9 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation import settings
-from exo_gravity.core.compensation.compensator import Answer, Compensator
+from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
-from exo_gravity.core.compensation.settings import URDF_LAW, Settings, UrdfSettings
+from exo_gravity.core.compensation.settings import URDF_LAW, Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
@@ -33,7 +33,7 @@ DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 TICK = 0.01  # s between two messages of a fade
 
 JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
-Read = Callable[[dict[str, Any]], Settings | UrdfSettings]
+Read = Callable[[dict[str, Any]], Settings]
 
 
 def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
@@ -52,35 +52,35 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     return table, values, lambda values: settings.urdf_settings_of(values, model)
 
 
-def sentence(s: Settings | UrdfSettings) -> str:
+def sentence(s: Settings) -> str:
     """Return what is compensated, for the log."""
-    mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if isinstance(s, Settings) else ""
-    mass = s.arm.total_mass if isinstance(s, Settings) else s.arm.mass
-    return f"{mode}law {s.law}: compensates {mass:.2f} kg, at most {row(s.max_effort)} Nm"
+    mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if s.robot else ""
+    return f"{mode}law {s.law}: compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
 
 
-def report(control: Compensator, answer: Answer, names: Sequence[str]) -> dict[str, object]:
+def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
     """Return what the arm's settings and terms are, for /diagnostics. names: of the joints."""
     s, terms = control.settings, control.terms
     most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, ""))
     values: dict[str, object] = {"law": s.law, "changing load": f"{name}, {most:.1f} Nm to go" if name else "none"}
     values["max effort (Nm)"] = row(s.max_effort)
-    if isinstance(s, UrdfSettings):
-        return {**values, "mass carried (kg)": f"{s.arm.mass:.3f}", "gain": row(s.gain)}
-    values |= {
-        "law in use": "exact" if answer.fallback else s.law,
-        "mode": s.mode,
-        "support": s.support,
-        "support in use": row([s.support_now]),
-        "support request": control.support_request.report(time.monotonic()),
-        "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
-        "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
-        "robot moments (kg m)": row(moments_of(s.robot)),
-        "wearer mass (kg)": row(s.wearer_mass),
-        "wearer cog (m)": row(s.wearer_cog),
-        "payload mass (kg)": f"{s.payload_mass:.3f}",
-        "mass carried (kg)": f"{s.arm.total_mass:.3f}",
-    }
+    values["law in use"] = "exact" if answer.fallback else s.law
+    values["mass carried (kg)"] = f"{s.mass:.3f}"
+    if s.urdf:
+        values["gain"] = row(s.urdf.gain)
+    if s.robot:
+        values |= {
+            "mode": s.mode,
+            "support": s.support,
+            "support in use": row([s.support_now]),
+            "support request": control.support_request.report(time.monotonic()),
+            "robot mass (kg)": "not known" if s.robot.by_moments else row(s.robot.mass),
+            "robot cog (m)": "not known" if s.robot.by_moments else row(s.robot.cog),
+            "robot moments (kg m)": row(moments_of(s.robot)),
+            "wearer mass (kg)": row(s.wearer_mass),
+            "wearer cog (m)": row(s.wearer_cog),
+            "payload mass (kg)": f"{s.payload_mass:.3f}",
+        }
     if terms:
         values["terms"] = ", ".join(terms.active) or "none"
         values["assist"] = terms.assist.report
@@ -142,7 +142,7 @@ class JointStateInterface:
         """Return positions and velocities of exactly these joints. Raises ParameterError."""
         return by_name(message, "position", self._names), velocity_of(message, self._names)
 
-    def send(self, now: float, message: JointState, answer: Answer) -> JointState:
+    def send(self, now: float, message: JointState, answer: Compensation) -> JointState:
         """Publish the answer to the joint states of `message`, and return it."""
         self._command.header.stamp = message.header.stamp
         self._command.effort = answer.effort or ()
@@ -199,7 +199,7 @@ class MultiArrayInterface(PeriodicThread):
             self._applied = by_name(message, "effort", self._names, exact=False)
         return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
 
-    def send(self, now: float, message: JointState, answer: Answer) -> None:
+    def send(self, now: float, message: JointState, answer: Compensation) -> None:
         """Send the answer to a joint state, or begin the fade."""
         with self._lock:
             if self._is_late:

@@ -18,8 +18,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation.compensator import Answer, Compensator
-from exo_gravity.core.compensation.settings import Settings, UrdfSettings
+from exo_gravity.core.compensation.compensator import Compensation, Compensator
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import TOPIC as SUPPORT_REQUEST
 from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.compensation.weighing import Weighing, refusal
@@ -73,8 +73,8 @@ class CompensatorNode(Node):
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
-        self._answer = Answer(None)
-        self._changes: deque[Answer] = deque(maxlen=MAX_CHANGES)
+        self._answer = Compensation.withdrawn("")
+        self._changes: deque[Compensation] = deque(maxlen=MAX_CHANGES)
         self._last_answer = -math.inf
         self._answers = self._rides = 0
         self._rate = Rate()
@@ -153,15 +153,15 @@ class CompensatorNode(Node):
         try:
             theta, velocity = self._interface.read(message)
             if self._interface.problem:  # no step: the torque must ramp in from zero
-                answer = Answer(None, self._interface.problem)
+                answer = Compensation.withdrawn(self._interface.problem)
             else:
                 with self._lock:
                     self._control.applied = message.effort if message.name == self._names else None
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
-            answer = Answer(None, self._refused(self._interface.topic, error))
+            answer = Compensation.withdrawn(self._refused(self._interface.topic, error))
         if problem := second_publisher(self._sources):
-            answer = Answer(None, problem)
+            answer = Compensation.withdrawn(problem)
         efforts = self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -199,14 +199,14 @@ class CompensatorNode(Node):
         self._refusal = f"{topic}: {error}"
         return f"{topic}: {error.name} must be {error.expected}"
 
-    def _apply(self, settings: Settings | UrdfSettings, _changed: set[str]) -> None:
+    def _apply(self, settings: Settings, _changed: set[str]) -> None:
         with self._lock:
             self._control.apply(settings)
         self.get_logger().info(sentence(settings))
 
     def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         settings, terms, last = self._control.settings, self._control.terms, self._weighing
-        assert isinstance(settings, Settings) and terms
+        assert terms  # else there is no such service
         rate = self._rate.value
         weighing = Weighing(settings, self._names, rate, last.empty if last else None)
         with self._lock:
@@ -216,7 +216,7 @@ class CompensatorNode(Node):
         response.success, response.message = not problem, problem or "relax: `weighing` in /diagnostics has the result"
         return response
 
-    def _values(self, now: float, answer: Answer) -> dict[str, object]:
+    def _values(self, now: float, answer: Compensation) -> dict[str, object]:
         return {
             **self._interface.values,
             "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
@@ -244,11 +244,11 @@ class CompensatorNode(Node):
         self._report_changes()
         self._report(self._answer)
 
-    def _report(self, answer: Answer) -> None:
+    def _report(self, answer: Compensation) -> None:
         now = time.monotonic()
         self._diagnostics.report(*self._headline(now, answer), self._values(now, answer))
 
-    def _headline(self, now: float, answer: Answer) -> tuple[bytes, str]:
+    def _headline(self, now: float, answer: Compensation) -> tuple[bytes, str]:
         if self._interface.problem:
             return ERROR, self._interface.problem
         if now - self._last_answer > SILENCE:

@@ -93,7 +93,7 @@ export class Sections {
   }
 }
 
-const FREE = Array.from({ length: 8 }, (_, n) => (n % 2 ? 3.15 : -3.15)); // rad, a workspace without edges
+const FREE = { "limits.lower": Array(4).fill(-3.15), "limits.upper": Array(4).fill(3.15) }; // rad: no edges
 const OFF = ["disabled", "fault"];
 const reportAt = (name) => `/report/${name.split("/").map(encodeURIComponent).join("/")}`;
 
@@ -150,7 +150,7 @@ class Session {
     for (const name of ["subject", "protocol", "note"]) this.form.elements[name].value = session[name];
     const wearer = session.wearer;
     if (isFirst && !session.subject) return;
-    this.sections.workspace = { "limits.range": wearer["limits.range"] ?? FREE };
+    this.sections.workspace = Object.fromEntries(Object.entries(FREE).map(([name, free]) => [name, wearer[name] ?? free]));
     if (!wearer["wearer.segment_length"]) return;
     this.sections.fill(wearer);
     this.sections.edited = true; // until it is applied

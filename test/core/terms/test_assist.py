@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.compensation.terms.assist import FADE, MAX_RATE, RAMP, RECOVERY, Assist, AssistInput
+from exo_gravity.core.compensation.terms.assist import ASSIST as TUNING
+from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 
 NAMES = ["rotation", "abduction", "flexion", "elbow"]
 ASSIST = Assist((1.0, 2.0, 1.0, 1.0))
@@ -59,8 +60,8 @@ def assisting(rate: float = 100.0, **changes: float) -> OuterLoop:
 @pytest.mark.parametrize("rate", RATES)
 def test_at_any_rate_sound_efforts_are_ramped_in_clamped_and_followed_without_a_gap(rate):
     loop = OuterLoop(rate, jitter=0.3)
-    loop.run(RAMP)
-    assert np.abs(loop.torques[round(0.5 * RAMP / CYCLE)]).max() < 0.6
+    loop.run(TUNING.ramp)
+    assert np.abs(loop.torques[round(0.5 * TUNING.ramp / CYCLE)]).max() < 0.6
     assert loop.run(0.3) == pytest.approx(FOLLOWED)
     loop.torques.clear()
     loop.run(3.0)
@@ -76,7 +77,7 @@ def test_when_messages_stop_the_torque_is_zero_100_ms_after_the_next_one_was_due
     assert loop.torques[-1] == (0.0,) * 4
     assert loop.input.state == "waiting" and loop.input.reason == "assist_efforts stopped"
     largest = np.abs(np.diff(loop.torques, axis=0)).max()
-    assert largest <= 1.001 * CYCLE / FADE  # 1 Nm in FADE
+    assert largest <= 1.001 * CYCLE / TUNING.fade  # 1 Nm in TUNING.fade
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -115,10 +116,10 @@ def test_a_wrong_message_fades_the_torque_at_once_and_sound_ones_bring_it_back(n
     loop.run(0.1)
     assert loop.torques[-1] == (0.0,) * 4
     assert loop.input.state == "refused" and reason in loop.input.reason
-    loop.run(RECOVERY - 0.1)
+    loop.run(TUNING.recovery - 0.1)
     assert loop.torques[-1] == (0.0,) * 4
     assert loop.run(2.0) == pytest.approx(FOLLOWED)
-    assert np.abs(np.diff(loop.torques, axis=0)).max() <= 1.001 * CYCLE / FADE
+    assert np.abs(np.diff(loop.torques, axis=0)).max() <= 1.001 * CYCLE / TUNING.fade
 
 
 @pytest.mark.parametrize(
@@ -173,7 +174,7 @@ def test_the_torque_of_an_outer_loop_that_died_never_returns(goes_on, pause):
     if pause > 0.2:
         assert not np.any(torque)
     assert np.all(np.diff(torque) <= 0.0) and torque[-1] == 0.0  # what is left of it fades and nothing else comes
-    assert np.abs(np.diff(torque)).max() <= 5.0 * 1.001 * CYCLE / FADE
+    assert np.abs(np.diff(torque)).max() <= 5.0 * 1.001 * CYCLE / TUNING.fade
 
 
 def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
@@ -183,7 +184,7 @@ def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
     loop.input.assist = Assist((1.0,) * 4)
     loop.sending = False
     loop.run(0.04)  # the newest message is still valid
-    assert loop.torques[-1] == pytest.approx((5.0 - 0.04 * MAX_RATE, -5.0 + 0.04 * MAX_RATE, 0.0, 0.0))
+    assert loop.torques[-1] == pytest.approx((5.0 - 0.04 * TUNING.max_rate, -5.0 + 0.04 * TUNING.max_rate, 0.0, 0.0))
     loop.sending = True
     assert loop.run(1.0) == (1.0, -1.0, 0.0, 0.0)
 
@@ -241,5 +242,5 @@ def test_no_sequence_of_messages_exceeds_the_bound_or_steps(sequence):
     torques = np.array(loop.torques).reshape(-1, 4)
     assert np.all(np.abs(torques) <= ASSIST.max_effort)
     # Fading from the bound, or following at the permitted rate while it ramps in.
-    most = np.array(ASSIST.max_effort) * (CYCLE / FADE + CYCLE / RAMP) + MAX_RATE * CYCLE
+    most = np.array(ASSIST.max_effort) * (CYCLE / TUNING.fade + CYCLE / TUNING.ramp) + TUNING.max_rate * CYCLE
     assert np.all(np.abs(np.diff(torques, axis=0)) <= most)

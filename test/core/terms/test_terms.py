@@ -11,13 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
-from exo_gravity.core.compensation.guidance import LONGEST_STEP
+from exo_gravity.core.compensation.guidance import RAMP
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
-    MAX_SPEED,
-    SLIDING,
-    STANDSTILL,
-    TANK,
+    FRICTION,
+    INERTIA,
     Coupling,
     Damping,
     EnergyTank,
@@ -27,14 +25,7 @@ from exo_gravity.core.compensation.terms.catalogue import (
     Spring,
     TermState,
 )
-from exo_gravity.core.compensation.terms.terms import (
-    MAX_EFFORT,
-    MAX_EFFORT_RATE,
-    Terms,
-    TermSettings,
-    term_parameters,
-    term_settings_of,
-)
+from exo_gravity.core.compensation.terms.terms import SUM, Terms, TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -42,36 +33,36 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ZERO = (0.0,) * 4
 STATE = TermState(0.002, (0.2, 0.7, 0.6, 0.5), ZERO, ZERO, 0.0)
-EDGES = (-1.5, 1.5, 0.0, 1.6, -0.6, 1.6, 0.0, 2.5)
+LOWER, UPPER = (-1.5, 0.0, -0.6, 0.0), (1.5, 1.6, 1.6, 2.5)
 four = st.tuples(*[st.floats(-40.0, 40.0)] * 4)
 ALL = TermSettings(
-    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2, 0.02, 0.02, 0.02, 0.02)),
+    friction=Friction(0.7, (0.2, 0.4, 0.2, 0.2), (0.02,) * 4),
     inertia=Inertia(0.7),
     damping=Damping((0.05, 0.1, 0.05, 0.05)),
     spring=Spring((2.0, 4.0, 2.0, 1.0)),
     coupling=Coupling((0.0, -0.75, 1.5, 0.0)),
-    limits=SoftLimits(EDGES, (2.0,) * 4),
+    limits=SoftLimits(LOWER, UPPER, (2.0,) * 4),
 )
 
 
 @settings(deadline=None)
 @given(four, st.floats(0.0, 0.85))
 def test_friction_is_along_the_motion_and_below_what_the_joint_loses(velocity, share):
-    friction = Friction(share, (0.2, 0.4, 0.2, 0.1, 0.02, 0.05, 0.02, 0.0))
+    friction = Friction(share, (0.2, 0.4, 0.2, 0.1), (0.02, 0.05, 0.02, 0.0))
     for v, tau, coulomb, viscous in zip(
         velocity, friction.torque(STATE._replace(velocity=velocity)), friction.coulomb, friction.viscous, strict=True
     ):
         assert tau * v >= 0.0
-        assert abs(tau) <= share * (coulomb + viscous * min(abs(v), MAX_SPEED))
+        assert abs(tau) <= share * (coulomb + viscous * min(abs(v), FRICTION.fastest))
 
 
 def test_friction_is_zero_at_standstill_and_does_not_step():
-    friction = Friction(0.8, (*(0.2,) * 4, *(0.0,) * 4))
-    speeds = np.linspace(-2.0 * SLIDING, 2.0 * SLIDING, 400)
+    friction = Friction(0.8, (0.2,) * 4)
+    speeds = np.linspace(-2.0 * FRICTION.sliding, 2.0 * FRICTION.sliding, 400)
     torque = np.array([friction.torque(STATE._replace(velocity=(v, 0.0, 0.0, 0.0)))[0] for v in speeds])
     one_code = 2.0 * 45.0 / 4095.0
-    assert one_code < STANDSTILL  # standstill reads as half a code, and may flicker to the next
-    assert not torque[np.abs(speeds) <= STANDSTILL].any()
+    assert one_code < FRICTION.standstill  # standstill reads as half a code, and may flicker to the next
+    assert not torque[np.abs(speeds) <= FRICTION.standstill].any()
     assert np.abs(np.diff(torque)).max() < 0.01
     assert torque[-1] == pytest.approx(0.16)
 
@@ -87,7 +78,7 @@ def test_coupling_pulls_both_joints_so_that_no_way_around_gives_energy():
 
 
 def test_the_workspace_is_free_inside_and_pushes_back_outside():
-    limits = SoftLimits((-1.0, 1.0, 0.2, 1.0, 0.0, 1.0, 0.0, 1.0), (3.0,) * 4, (0.5,) * 4)
+    limits = SoftLimits((-1.0, 0.2, 0.0, 0.0), (1.0,) * 4, (3.0,) * 4, (0.5,) * 4)
     inside = STATE._replace(position=(0.9, 0.3, 0.5, 0.99), velocity=(1.0,) * 4)
     assert limits.torque(inside) == ZERO
     outside = STATE._replace(position=(1.1, 0.1, 9.0, -0.1))
@@ -105,8 +96,8 @@ def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
 
 
 def test_viscous_friction_in_another_unit_is_refused():
-    with pytest.raises(ParameterError, match=r"^friction.identified = .* at most 1 if viscous"):
-        Friction(0.5, (0.2, 0.4, 0.2, 0.2, 0.02, 0.05, 0.02, 2.0))
+    with pytest.raises(ParameterError, match=r"^viscous = .* from 0 to 1 Nm s/rad"):
+        Friction(0.5, (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -129,7 +120,7 @@ def test_the_tank_gives_what_it_holds_and_no_more():
     tank, given = EnergyTank(), 0.0
     for _ in range(4000):
         given += tank.pass_on((1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)[0] * 0.002
-    assert 0.9 * TANK < given <= TANK
+    assert 0.9 * INERTIA.tank < given <= INERTIA.tank
     taken = tank.pass_on((-1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.002, 0.0)
     assert taken[0] == -1.0  # a torque that takes energy always passes
 
@@ -156,7 +147,7 @@ def test_without_terms_nothing_is_added():
 def test_what_the_terms_before_a_change_would_give_stays_known():
     driven = Driven(TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4)))
     expected = driven.run(0.1)
-    before = driven.terms.now
+    before = driven.terms.in_force
     driven.terms.apply(TermSettings(), DEFAULT_LINKS)
     assert driven.run(0.002) == ZERO
     assert driven.terms.torque_of(before) == pytest.approx(expected)
@@ -190,9 +181,9 @@ def test_whatever_the_terms_give_their_sum_is_bounded_and_rate_limited(sums):
     for total, dt in sums:
         now, given[0] = now + dt, total
         after = terms.torque(now, STATE.position, ZERO)
-        assert all(abs(tau) <= limit for tau, limit in zip(after, MAX_EFFORT, strict=True))
+        assert all(abs(tau) <= limit for tau, limit in zip(after, SUM.effort, strict=True))
         steps = np.abs(np.subtract(after, before))
-        assert steps.max() <= MAX_EFFORT_RATE * min(dt, LONGEST_STEP) + 1e-9
+        assert steps.max() <= SUM.rate * min(dt, RAMP.longest_step) + 1e-9
         assert bool(terms.problem) is not math.isfinite(sum(total))
         before = after
 
@@ -204,7 +195,7 @@ def test_all_terms_together_stay_bounded_in_any_state(states):
     for position, velocity, dt in states:
         now += dt
         torque = terms.torque(now, position, velocity)
-        assert all(abs(tau) <= limit for tau, limit in zip(torque, MAX_EFFORT, strict=True))
+        assert all(abs(tau) <= limit for tau, limit in zip(torque, SUM.effort, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +213,7 @@ def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the
 
 
 def test_soft_limits_are_no_stiffer_than_is_stable():
-    stiff = TermSettings(limits=SoftLimits(EDGES)).on_arm(DEFAULT_LINKS).limits.stiffness
+    stiff = TermSettings(limits=SoftLimits(LOWER, UPPER)).on_arm(DEFAULT_LINKS).limits.stiffness
     most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 
@@ -236,6 +227,10 @@ def test_parameters_make_settings_and_name_their_group_in_errors():
     assert (built.friction.share, built.coupling.stiffness, built.spring.pose) == (0.5, tuple(coupling), (0.1,) * 4)
     with pytest.raises(ParameterError, match=r"^coupling.stiffness = .* two joints or more"):
         term_settings_of({**values, "coupling.stiffness": [0.0, 1.0, 0.0, 0.0]})
-    with pytest.raises(ParameterError, match=r"^limits.range"):
-        term_settings_of({**values, "limits.range": [-3.0] * 8})
-    assert not any(getattr(TermSettings(), param.name.split(".")[0]) is None for param in table)
+    with pytest.raises(ParameterError, match=r"^limits.lower = .* below limits.upper"):
+        term_settings_of({**values, "limits.lower": [0.5] * 4, "limits.upper": [0.5] * 4})
+
+
+@pytest.mark.parametrize("edge", [{"lower": (-3.15, 0.2, -3.15, -3.15)}, {"upper": (3.15, 3.15, 1.0, 3.15)}])
+def test_one_edge_of_the_workspace_switches_the_limits_on(edge):
+    assert SoftLimits(**edge).on and not SoftLimits().on

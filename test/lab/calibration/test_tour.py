@@ -12,7 +12,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.gravity import load_moments, moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import ACCELERATION, MAX_SPEED, Line, Station, Sweep, average
+from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
@@ -85,7 +85,7 @@ def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
     run, _, _ = wrong_file
     positions = np.array(run.log)[:, 1:5]
     assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
-    assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MAX_SPEED
+    assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MOTION.speed
     assert not run.acted
 
 
@@ -186,8 +186,8 @@ def test_a_line_keeps_speed_and_acceleration_and_arrives():
     line = Line(np.zeros(4), np.array((1.0, -0.5, 0.0, 0.2)))
     times = np.arange(0.0, line.duration, 0.001)
     positions, speeds = (np.array(column) for column in zip(*map(line.at, times), strict=True))
-    assert np.abs(speeds).max() <= MAX_SPEED + 1e-9
-    assert np.abs(np.diff(speeds, axis=0)).max() <= ACCELERATION * 0.001 + 1e-9
+    assert np.abs(speeds).max() <= MOTION.speed + 1e-9
+    assert np.abs(np.diff(speeds, axis=0)).max() <= MOTION.acceleration * 0.001 + 1e-9
     np.testing.assert_allclose(np.diff(positions, axis=0)[500:-500], 0.001 * speeds[500:-501], atol=1e-5)
     np.testing.assert_allclose(line.at(math.inf)[0], (1.0, -0.5, 0.0, 0.2))
 

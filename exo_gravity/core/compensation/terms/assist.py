@@ -2,10 +2,10 @@
 
     off        `max_effort` is 0
     waiting    no messages yet, or they stopped; no torque
-    refused    the last ones were wrong; no torque until they have been sound for RECOVERY
-    assisting  the efforts are followed: clamped to `max_effort`, limited to MAX_RATE, ramped in over RAMP
+    refused    the last ones were wrong; no torque until they have been sound for `recovery`
+    assisting  the efforts are followed: clamped to `max_effort`, limited to `max_rate`, ramped in within `ramp`
 
-An effort is valid for PERIODS observed periods, so that a single late message costs nothing. The input remembers only
+An effort is valid for `periods` observed periods, so that a single late message costs nothing. The input remembers only
 the torque that it applies, which moves towards the newest message and never past it: docs/terms.md.
 """
 
@@ -14,21 +14,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
-from exo_gravity.core.compensation.guidance import BREAK
+from exo_gravity.core.compensation.guidance import RAMP
 from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
 
-SLOWEST = 0.1  # s between two messages
-MIN_VALID = 0.05  # s from its stamp for which an effort is valid at any rate
-PERIODS = 1.5  # observed periods for which it is valid
-PERIOD_SMOOTHING = 0.2  # share of a new interval in the observed period
-MAX_LEAD = 0.02  # s that a stamp may be ahead
-FADE = 0.05  # s from full assistance to none
-MAX_RATE = 10.0  # Nm/s, the fastest change of the torque
-RAMP = 0.5  # s from none to full
-RECOVERY = 0.5  # s without a wrong message, after which efforts are believed again
+
+@dataclass(frozen=True)
+class AssistTuning:
+    """How long an effort of the outer loop is valid, and how fast it acts."""
+
+    slowest: float = 0.1  #: s between two messages
+    min_valid: float = 0.05  #: s from its stamp for which an effort is valid at any rate
+    periods: float = 1.5  #: observed periods for which it is valid
+    smoothing: float = 0.2  #: share of a new interval in the observed period
+    max_lead: float = 0.02  #: s that a stamp may be ahead
+    fade: float = 0.05  #: s from full assistance to none
+    max_rate: float = 10.0  #: Nm/s, the fastest change of the torque
+    ramp: float = 0.5  #: s from none to full
+    recovery: float = 0.5  #: s without a wrong message, after which efforts are believed again
+
+
+ASSIST = AssistTuning()
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class AssistInput:
         self._target = NO_TORQUE  # the newest efforts
         self._torque = NO_TORQUE  # as applied
         self._ramp = 0.0  # share of the target that may be applied
-        self._period = SLOWEST
+        self._period = ASSIST.slowest
         self._stamp = self._arrival = -math.inf
         self._refused = -math.inf
         self._last = -math.inf  # the last call of `torque`
@@ -65,7 +73,7 @@ class AssistInput:
             return "off"
         if not self.reason:
             return "assisting"
-        return "refused" if self._last - self._refused < RECOVERY else "waiting"
+        return "refused" if self._last - self._refused < ASSIST.recovery else "waiting"
 
     @property
     def idle(self) -> bool:
@@ -80,7 +88,7 @@ class AssistInput:
     @property
     def valid(self) -> float:
         """Time in s from its stamp for which an effort is valid, by the observed period."""
-        return max(MIN_VALID, PERIODS * self._period)
+        return max(ASSIST.min_valid, ASSIST.periods * self._period)
 
     def receive(
         self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, is_another: bool = False
@@ -90,9 +98,10 @@ class AssistInput:
         is_another: whether its publisher is another than that of the message before.
         """
         interval, self._arrival = now - self._arrival, now
-        if interval < SLOWEST * PERIODS:
-            self._period += PERIOD_SMOOTHING * (min(interval, SLOWEST) - self._period)
-        problem = self._problem(now, names, efforts, stamp, is_another and interval < SLOWEST * PERIODS)
+        is_stream = interval < ASSIST.slowest * ASSIST.periods
+        if is_stream:
+            self._period += ASSIST.smoothing * (min(interval, ASSIST.slowest) - self._period)
+        problem = self._problem(now, names, efforts, stamp, is_another and is_stream)
         if problem:
             self._refused, self.reason = now, problem
             return
@@ -107,30 +116,30 @@ class AssistInput:
             return f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm"
         if second:
             return "more than one publisher of assist_efforts"
-        if not now - self.valid <= stamp <= now + MAX_LEAD:
+        if not now - self.valid <= stamp <= now + ASSIST.max_lead:
             return "assist_efforts are late by their stamp, or their clock differs"
         return ""
 
     def torque(self, now: float) -> Torque:
         """Return the torque (4,) in Nm at `now`; call it in every cycle."""
         dt = now - self._last
-        if not 0.0 <= dt <= BREAK:
+        if not 0.0 <= dt <= RAMP.pause:
             self._ramp, self._torque, dt = 0.0, NO_TORQUE, 0.0
         self._last, before = now, self._ramp
         if self._is_sound(now):
-            self._ramp = ramp = min(1.0, before + dt / RAMP)
-            step = MAX_RATE * min(dt, FADE)
+            self._ramp = ramp = min(1.0, before + dt / ASSIST.ramp)
+            step = ASSIST.max_rate * min(dt, ASSIST.fade)
             columns = zip(self._target, self._torque, self.assist.max_effort, strict=True)
             self._torque = tuple([last + clamp(ramp * clamp(tau, most) - last, step) for tau, last, most in columns])
         else:
-            self._ramp = max(0.0, before - dt / FADE)
+            self._ramp = max(0.0, before - dt / ASSIST.fade)
             left = self._ramp / before if before else 0.0
             self._torque = tuple([left * last for last in self._torque])
         return self._torque
 
     def _is_sound(self, now: float) -> bool:
         """Return whether the newest efforts are to be followed at `now`; note why not."""
-        if now - self._refused < RECOVERY:
+        if now - self._refused < ASSIST.recovery:
             return False  # `reason` says what was wrong
         if not self.assist.on:
             self.reason = "assist.max_effort is 0"

@@ -5,15 +5,15 @@ without harm; the tests vary it from 0 to 10 ms. A stiffness or viscosity that t
 
 Friction: the term gives at most `share` (below 1) of the friction that takes energy from the same motion. So joint and
 term together always take energy, however late the term acts, and at rest, where it is 0, friction holds the arm as
-before. This is true as long as `identified` is not above the joint's real friction. Motors report speed in codes of
-0.022 rad/s (AK60-6) and 0.024 rad/s (AK80-9); standstill reads as half a code.
+before. This is true as long as the friction that was identified is not above the joint's real friction. Motors report
+speed in codes of 0.022 rad/s (AK60-6) and 0.024 rad/s (AK80-9); standstill reads as half a code.
 
 Inertia: acceleration that is measured late gives more energy than it takes back. Two bounds keep that harmless:
 - The share is below 1 and the low-pass never amplifies, so on a free arm the loop has a gain below 1 (small gain
   theorem) and cannot oscillate, however late it acts. On an elastic arm, such as a wearer's, it can: the tank ends it.
-- An energy tank: the term gives no more than it took, plus TANK, plus a share of what the joints' own friction takes
-  (`friction.identified`). What `friction.share` gave back is not spent twice. If the tank is empty, the term fades.
-  On simulated arms with torques 10 ms late the excess was 0.76 J at most, with a TANK of 0.5 J.
+- An energy tank: the term gives no more than it took, plus the tank's size, plus a share of what the joints' own
+  friction takes (`friction.coulomb`). What `friction.share` gave back is not spent twice. If the tank is empty, the
+  term fades. On simulated arms with torques 10 ms late the excess was 0.76 J at most, with a tank of 0.5 J.
 At standstill there is no torque: 12-bit velocities alternate between two codes, and the acceleration that this feigns
 moved the shoulder's rotation against its friction, by up to 1 degree a minute.
 """
@@ -34,27 +34,49 @@ from exo_gravity.core.params import check_owned, owned, params_of
 
 DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held
 LATE = 2.0 * DELAY  # s: a spring of k Nm/rad needs the damping LATE k, in Nm s/rad, to be passive despite the delay
-SPRING_EFFORT = (1.0, 2.0, 1.0, 1.0)  # Nm that a spring may give: a hand overcomes it
-COUPLING_EFFORT = 1.0  # Nm on the joint that follows
-EDGE_STIFFNESS = (10.0,) * JOINT_COUNT  # Nm/rad: the whole torque 0.1 and 0.2 rad beyond the edge
-EDGE = 0.05  # rad beyond the edge over which the damping rises, so that it does not set in with a jolt
-FREE = 3.15  # rad: no edge
-MAX_PATH_SPEED = 2.0  # rad/s between two poses of a path
+FREE = 3.15  # rad: no edge of the workspace
 
+# Bounds of the parameters
 MAX_COULOMB, MAX_VISCOUS = 3.0, 1.0  # Nm, Nm s/rad
 MAX_FRICTION_SHARE = 0.85  # leaves a friction that is 15 % smaller than identified
-STANDSTILL = 0.03  # rad/s, below which a joint is considered to stand: more than one code of 12-bit velocity
-SLIDING = 0.12  # rad/s, from which on friction is given its full share
-MAX_SPEED = 3.0  # rad/s, beyond which viscous friction no longer grows
-
 MAX_INERTIA_SHARE = 0.8  # leaves a fifth for masses that are not known exactly
-TANK = 0.5  # J, the kinetic energy of the robot and an arm of 3.7 kg at 1.3 rad/s of abduction
-FADING = 0.2  # of TANK, below which the term fades
-MOVING = 0.06  # rad/s of the fastest joint: inertia sets in from STANDSTILL to here
-FAST, TOO_FAST = 4.0, 5.0  # rad/s of any joint, between which it fades: `can_bridge` trips a fault at 5
-# rad/s of the acceleration's low-passes. One code of 12-bit velocity, 0.022 rad/s, moves the acceleration by
-# 0.022 BANDWIDTH / e = 0.65 rad/s^2 at most: 0.06 Nm on 0.1 kg m^2. It lags by 2 / BANDWIDTH = 25 ms.
-BANDWIDTH = 80.0
+
+
+@dataclass(frozen=True)
+class SpringTuning:
+    """What the springs of `spring`, `coupling` and `limits` give at most."""
+
+    effort: Sequence[float] = (1.0, 2.0, 1.0, 1.0)  #: Nm that a spring may give: a hand overcomes it
+    coupling_effort: float = 1.0  #: Nm on the joint that follows
+    edge_stiffness: Sequence[float] = (10.0,) * JOINT_COUNT  #: Nm/rad: the whole torque 0.1 and 0.2 rad beyond the edge
+    edge: float = 0.05  #: rad beyond the edge over which the damping rises, so that it does not set in with a jolt
+    path_speed: float = 2.0  #: rad/s, the fastest between two poses of a path
+
+
+@dataclass(frozen=True)
+class FrictionTuning:
+    """Where a joint shows its friction."""
+
+    standstill: float = 0.03  #: rad/s, below which a joint is considered to stand: more than one 12-bit velocity code
+    sliding: float = 0.12  #: rad/s, from which on friction is given its full share
+    fastest: float = 3.0  #: rad/s, beyond which viscous friction no longer grows
+
+
+@dataclass(frozen=True)
+class InertiaTuning:
+    """Where the inertia acts, and what bounds its energy."""
+
+    tank: float = 0.5  #: J, the kinetic energy of the robot and an arm of 3.7 kg at 1.3 rad/s of abduction
+    fading: float = 0.2  #: of the tank, below which the term fades
+    moving: float = 0.06  #: rad/s of the fastest joint: inertia sets in from standstill to here
+    fast: float = 4.0  #: rad/s of any joint, from which on it fades
+    too_fast: float = 5.0  #: rad/s, at which it is gone: `can_bridge` trips a fault there
+    #: rad/s of the acceleration's low-passes. One code of 12-bit velocity, 0.022 rad/s, moves the acceleration by
+    #: 0.022 bandwidth / e = 0.65 rad/s^2 at most: 0.06 Nm on 0.1 kg m^2. It lags by 2 / bandwidth = 25 ms.
+    bandwidth: float = 80.0
+
+
+SPRING, FRICTION, INERTIA = SpringTuning(), FrictionTuning(), InertiaTuning()
 
 
 class TermState(NamedTuple):
@@ -108,7 +130,7 @@ class Spring(TermParameters):
         unit="rad",
         any_length=True,
     )
-    max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque, (4,) Nm
+    max_effort: Sequence[float] = SPRING.effort  #: largest torque, (4,) Nm
     times: tuple[float, ...] = field(init=False, repr=False, compare=False)  #: (n,) s of the path's rows, from 0 on
     ways: np.ndarray = field(init=False, repr=False, compare=False)  #: (4, n) rad, each joint's angles
 
@@ -123,8 +145,8 @@ class Spring(TermParameters):
         if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
         speed = max((np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)).tolist(), default=0.0)
-        if speed > MAX_PATH_SPEED:
-            raise ParameterError("speed of the path in spring.pose", speed, f"at most {MAX_PATH_SPEED:g} rad/s")
+        if speed > SPRING.path_speed:
+            raise ParameterError("speed of the path in spring.pose", speed, f"at most {SPRING.path_speed:g} rad/s")
         for name, value in (("pose", numbers), ("times", tuple(times.tolist())), ("ways", poses.T)):
             object.__setattr__(self, name, value)
 
@@ -152,7 +174,7 @@ class Coupling(TermParameters):
         (-50.0, 50.0),
         "Nm/rad",
     )
-    max_effort: float = COUPLING_EFFORT  #: largest torque on the follower, Nm
+    max_effort: float = SPRING.coupling_effort  #: largest torque on the follower, Nm
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -185,25 +207,29 @@ class SoftLimits(TermParameters):
     Raises ParameterError.
     """
 
-    range: Sequence[float] = owned(
-        (-FREE, FREE) * 4, f"lower and upper edge of each joint's workspace; {FREE:g}: none", (-FREE, FREE), "rad"
+    lower: Sequence[float] = owned(
+        (-FREE,) * JOINT_COUNT, f"lower edge of each joint's workspace; {-FREE:g}: none", (-FREE, FREE), "rad"
     )
-    stiffness: Sequence[float] = EDGE_STIFFNESS  #: of the springs beyond the edges, (4,) Nm/rad
-    max_effort: Sequence[float] = SPRING_EFFORT  #: largest torque of the springs, (4,) Nm
+    upper: Sequence[float] = owned(
+        (FREE,) * JOINT_COUNT, f"upper edge of each joint's workspace; {FREE:g}: none", (-FREE, FREE), "rad"
+    )
+    stiffness: Sequence[float] = SPRING.edge_stiffness  #: of the springs beyond the edges, (4,) Nm/rad
+    max_effort: Sequence[float] = SPRING.effort  #: largest torque of the springs, (4,) Nm
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not all(low < high for low, high in zip(self.range[0::2], self.range[1::2], strict=True)):
-            raise ParameterError("limits.range", list(self.range), "lower and upper edge of each joint, rising")
+        if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ParameterError("limits.lower", list(self.lower), f"below limits.upper = {list(self.upper)}")
+        object.__setattr__(self, "on", max(self.lower) > -FREE or min(self.upper) < FREE)
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
         torque = []
-        edges = self.range[0::2], self.range[1::2]
+        edges = self.lower, self.upper
         columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
         for k, low, high, q, v, most in columns:
             depth = max(q - high, 0.0) + min(q - low, 0.0)
-            damping = LATE * k * min(1.0, abs(depth) / EDGE)
+            damping = LATE * k * min(1.0, abs(depth) / SPRING.edge)
             torque.append(clamp(-k * depth, most) - damping * v)
         return tuple(torque)
 
@@ -220,49 +246,35 @@ class Friction(TermParameters):
     share: float = owned(
         0.0, "share of the joints' friction that the motors take over; 0: off", (0.0, MAX_FRICTION_SHARE)
     )
-    identified: Sequence[float] = owned(
-        (0.0,) * 8,
-        "Coulomb friction of the four joints in Nm, then their viscous friction in Nm s/rad, by `calibrate friction`",
-        (0.0, MAX_COULOMB),
+    coulomb: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "Coulomb friction of each joint, by `calibrate friction`", (0.0, MAX_COULOMB), "Nm"
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if max(self.viscous) > MAX_VISCOUS:
-            raise ParameterError("friction.identified", list(self.identified), f"at most {MAX_VISCOUS:g} if viscous")
-
-    @property
-    def coulomb(self) -> Sequence[float]:
-        """Coulomb friction (4,) in Nm."""
-        return self.identified[:JOINT_COUNT]
-
-    @property
-    def viscous(self) -> Sequence[float]:
-        """Viscous friction (4,) in Nm s/rad."""
-        return self.identified[JOINT_COUNT:]
+    viscous: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "viscous friction of each joint, by `calibrate friction`", (0.0, MAX_VISCOUS), "Nm s/rad"
+    )
 
     def torque(self, state: TermState) -> Torque:
         """Return the torque (4,) in Nm, along the motion."""
         torque = []
         for v, coulomb, viscous in zip(state.velocity, self.coulomb, self.viscous, strict=True):
-            whole = self.share * (coulomb + viscous * min(abs(v), MAX_SPEED))
+            whole = self.share * (coulomb + viscous * min(abs(v), FRICTION.fastest))
             torque.append(math.copysign(sliding(v) * whole, v))
         return tuple(torque)
 
 
 def sliding(speed: float) -> float:
     """Return the share of its friction that a joint at `speed` rad/s shows: 0 where it stands, 1 where it slides."""
-    return max(0.0, min(1.0, (abs(speed) - STANDSTILL) / (SLIDING - STANDSTILL)))
+    return max(0.0, min(1.0, (abs(speed) - FRICTION.standstill) / (FRICTION.sliding - FRICTION.standstill)))
 
 
 class EnergyTank:
-    """The energy in J that a term may give away; what it takes fills the tank again, up to TANK.
+    """The energy in J that a term may give away; what it takes fills the tank again, up to its size.
 
     The torque may act at once or DELAY later; whichever gives more energy is counted.
     """
 
     def __init__(self) -> None:
-        self.level = TANK
+        self.level = INERTIA.tank
         self._given: deque[tuple[float, Torque]] = deque()  # time in s and torque; the first one acts now at the latest
         self._time = 0.0
 
@@ -272,15 +284,15 @@ class EnergyTank:
         velocity: (4,) rad/s. income: W that flows into the tank, from the joints' friction.
         """
         power = _dot(torque, velocity)
-        if power > 0.0 and self.level < FADING * TANK:
-            share = max(0.0, self.level) / (FADING * TANK)
+        if power > 0.0 and self.level < INERTIA.fading * INERTIA.tank:
+            share = max(0.0, self.level) / (INERTIA.fading * INERTIA.tank)
             torque, power = tuple([share * tau for tau in torque]), share * power
         self._time += dt
         given = self._given
         given.append((self._time, torque))
         while given[0][0] < self._time - DELAY:
             given.popleft()
-        self.level = min(TANK, self.level + (income - max(power, _dot(given[0][1], velocity))) * dt)
+        self.level = min(INERTIA.tank, self.level + (income - max(power, _dot(given[0][1], velocity))) * dt)
         return torque
 
 
@@ -297,8 +309,9 @@ class Inertia(TermParameters):
         """
         velocity = state.velocity
         fastest = max(map(abs, velocity))
-        fading = min((fastest - STANDSTILL) / (MOVING - STANDSTILL), (TOO_FAST - fastest) / (TOO_FAST - FAST))
-        share = self.share * max(0.0, min(1.0, fading))
+        slow, fast = FRICTION.standstill, INERTIA.too_fast
+        rising, falling = (fastest - slow) / (INERTIA.moving - slow), (fast - fastest) / (fast - INERTIA.fast)
+        share = self.share * max(0.0, min(1.0, rising, falling))
         whole = links.torque(state.position, velocity, state.acceleration)
         income = _dot(friction, map(abs, velocity))
         return tank.pass_on(tuple([share * tau for tau in whole]), velocity, state.dt, income)
@@ -323,7 +336,7 @@ class AccelerationFilter:
         if dt <= 0.0 or not self._once:
             self._once, self._twice = list(velocity), list(velocity)
             return [0.0] * len(velocity)
-        share = dt * BANDWIDTH / (1.0 + dt * BANDWIDTH)
+        share = dt * INERTIA.bandwidth / (1.0 + dt * INERTIA.bandwidth)
         once = [a + share * (v - a) for v, a in zip(velocity, self._once, strict=True)]
         rate = share / dt
         acceleration = [rate * (a - b) for a, b in zip(once, self._twice, strict=True)]

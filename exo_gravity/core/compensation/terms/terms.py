@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
-from exo_gravity.core.compensation.guidance import LONGEST_STEP, limited
+from exo_gravity.core.compensation.guidance import RAMP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -33,10 +33,18 @@ from exo_gravity.core.compensation.terms.catalogue import (
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param, params_of
 
-MAX_GAP = 0.2  # s between two cycles, beyond which the terms begin again from no torque
-MAX_EFFORT = (2.0, 4.0, 2.0, 2.0)  # Nm of all terms: well below the motors' rated torque, which gravity needs
-MAX_EFFORT_RATE = 50.0  # Nm/s
-EDGE_SHARE = 0.8  # of the stiffness that the arm can bear, for `limits` where that is less
+
+@dataclass(frozen=True)
+class SumLimits:
+    """What bounds all terms together."""
+
+    effort: Sequence[float] = (2.0, 4.0, 2.0, 2.0)  #: Nm: well below the motors' rated torque, which gravity needs
+    rate: float = 50.0  #: Nm/s
+    pause: float = 0.2  #: s between two cycles, beyond which the terms begin again from no torque
+    edge_share: float = 0.8  #: of the stiffness that the arm can bear, for `limits` where that is less
+
+
+SUM = SumLimits()
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,7 @@ class TermSettings:
             if any(value > limit for value, limit in zip(values, most, strict=True)):
                 expected = f"at most {[round(limit, 3) for limit in most]} {unit}, which"
                 raise ParameterError(name, list(values), f"{expected} {1000 * DELAY:.0f} ms late is stable")
-        stiffness = tuple(min(k, EDGE_SHARE * most) for k, most in zip(self.limits.stiffness, springs, strict=True))
+        stiffness = tuple(min(k, SUM.edge_share * most) for k, most in zip(self.limits.stiffness, springs, strict=True))
         return replace(self, limits=replace(self.limits, stiffness=stiffness))
 
 
@@ -95,18 +103,18 @@ def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
     })  # fmt: skip
 
 
-class Active(NamedTuple):
+class TermsInForce(NamedTuple):
     """The terms of some settings."""
 
-    terms: Sequence[Callable[[TermState], Torque]] = ()  #: each returns (4,) Nm that the motors add
-    since: float = -math.inf  #: s, when the spring's settings came into force
+    terms: Sequence[Callable[[TermState], Torque]]  #: each returns (4,) Nm that the motors add
+    since: float  #: s, when the spring's settings came into force
 
 
 class Terms:
     """What one compensator adds to gravity compensation.
 
     names: of the joints (4,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input,
-    `tank` the energy of `inertia`. now: the terms in force.
+    `tank` the energy of `inertia`. in_force: the present terms.
     """
 
     def __init__(self, names: Sequence[str], settings: TermSettings, arm: ArmModel) -> None:
@@ -119,7 +127,7 @@ class Terms:
         self._time = -math.inf
         self._state = TermState(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
         self._has_inertia = self._has_changed = False
-        self.now = Active(self._built(settings, arm))
+        self.in_force = TermsInForce(self._built(settings, arm), -math.inf)
 
     @property
     def active(self) -> list[str]:
@@ -135,9 +143,9 @@ class Terms:
 
     def apply(self, settings: TermSettings, arm: ArmModel) -> None:
         """Use new settings and a new arm at once: it is for the caller to guide the change (`guidance`)."""
-        since = self.now.since if settings.spring == self.settings.spring else self._time
+        since = self.in_force.since if settings.spring == self.settings.spring else self._time
         self.settings, self.assist.assist, self._has_changed = settings, settings.assist, True
-        self.now = Active(self._built(settings, arm), since)
+        self.in_force = TermsInForce(self._built(settings, arm), since)
 
     def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the torque (4,) in Nm on top of gravity compensation at `now` (s, monotonic).
@@ -145,28 +153,28 @@ class Terms:
         theta, velocity: (4,) rad and rad/s.
         """
         dt, self._time = now - self._time, now
-        if not 0.0 <= dt <= MAX_GAP:
+        if not 0.0 <= dt <= SUM.pause:
             self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
-        self._state = TermState(dt, theta, velocity, acceleration, now - self.now.since)
-        total = _sum(self.now.terms, self._state)
+        self._state = TermState(dt, theta, velocity, acceleration, now - self.in_force.since)
+        total = _sum(self.in_force.terms, self._state)
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
             total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
-        step = math.inf if self._has_changed else MAX_EFFORT_RATE * min(dt, LONGEST_STEP)
+        step = math.inf if self._has_changed else SUM.rate * min(dt, RAMP.longest_step)
         self._has_changed = False
-        columns = zip(total, self._output, MAX_EFFORT, strict=True)
+        columns = zip(total, self._output, SUM.effort, strict=True)
         self._output = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
         self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
         return tuple(map(operator.add, self._assisted, self._output))
 
-    def torque_of(self, active: Active) -> Torque:
+    def torque_of(self, other: TermsInForce) -> Torque:
         """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
-        state = self._state._replace(dt=0.0, elapsed=self._time - active.since)
-        total = _sum(active.terms, state)
+        state = self._state._replace(dt=0.0, elapsed=self._time - other.since)
+        total = _sum(other.terms, state)
         if not math.isfinite(sum(total)):
             total = NO_TORQUE
-        return tuple(map(operator.add, self._assisted, map(clamp, total, MAX_EFFORT)))
+        return tuple(map(operator.add, self._assisted, map(clamp, total, SUM.effort)))
 
     def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Callable[[TermState], Torque]]:
         """Return the terms that are on."""
