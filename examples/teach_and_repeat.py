@@ -38,9 +38,9 @@ def cycle():
     global torque
     commands = [motor.command(effort, 0.0) for motor, effort in zip(motors, torque, strict=True)]
     frames = [device.exchange(motor.can_id, command)[1] for motor, command in zip(motors, commands, strict=True)]
-    replies = [motor.joint_reply(frame) for motor, frame in zip(motors, frames, strict=True)]
-    angles = [reply.position for reply in replies]
-    torque = compensator.step(device.time, angles, [reply.velocity for reply in replies]).effort
+    samples = [motor.sample(frame, device.time) for motor, frame in zip(motors, frames, strict=True)]
+    angles = [sample.position for sample in samples]
+    torque = compensator.step(device.time, angles, [sample.velocity for sample in samples]).effort
     device.advance(PERIOD)
     return angles
 

@@ -200,11 +200,11 @@ def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_r
 @given(joints(), BYTES)
 def test_a_joint_decodes_any_bytes_to_finite_numbers_or_rejects_them(motor, data):
     try:
-        reply = motor.joint_reply(data)
+        reply = motor.sample(data, 0.0)
     except FrameError:
         assert len(data) not in ((6, 8) if motor.wire_format is MIT else (8,))
         return
-    assert all(map(math.isfinite, reply[1:4]))
+    assert all(map(math.isfinite, reply[:3]))
     limit = motor.spec.position_range if motor.wire_format is MIT else math.radians(0.1) * 0x8000
     assert abs(reply.position) <= limit + abs(motor.zero) + 1e-9
 
@@ -213,7 +213,7 @@ def test_a_joint_decodes_any_bytes_to_finite_numbers_or_rejects_them(motor, data
 @given(joints(), st.floats(-3.0, 3.0))
 def test_a_joint_angle_survives_a_round_trip(motor, angle):
     reply = MotorReply(motor.can_id, motor.motor_position(angle), 0.0, 0.0, 30, 0)
-    got = motor.joint_reply(motor.wire_format.pack_reply(motor.spec, reply))
+    got = motor.sample(motor.wire_format.pack_reply(motor.spec, reply), 0.0)
     assert got.position == pytest.approx(angle, abs=0.001)
 
 
@@ -221,8 +221,8 @@ def test_a_reversed_motor_has_reversed_angle_and_torque():
     motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
     commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
     assert commanded == pytest.approx(-2.0, abs=0.004)
-    reply = motor.joint_reply(pack_reply(AK60, 1, 0.2, 1.0, commanded))
-    assert reply[1:4] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
+    reply = motor.sample(pack_reply(AK60, 1, 0.2, 1.0, commanded), 0.0)
+    assert reply[:3] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
 
 
 @SPECS

@@ -123,7 +123,7 @@ MUTATIONS = (
         ("joint 2 jumps by a motor turn, then clear and enable",),
         (Edit(SAFETY, "if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):",
               "if False:"),
-         Edit(SAFETY, "        if code.casts_doubt:\n", "        if False:\n")),
+         Edit(SAFETY, "        if code.needs_recheck:\n", "        if False:\n")),
     ),
     Mutation(
         "motors are switched off while damping still holds the arm",

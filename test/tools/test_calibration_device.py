@@ -69,7 +69,7 @@ def recorded_by(run, folder, torque_scale=1.0):
     """
     table = np.array(run.log)
     nothing = np.full((len(table), 4), np.nan)
-    efforts = table[:, 5:9] * torque_scale
+    efforts = table[:, 9:13] * torque_scale
     states = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], nothing, nothing, efforts)
     tilts = ((TILT_TOPIC, TILT_TYPE, START + round(now * 1e9), vector(run.tilt)) for now in table[::10, 0])
     return write_bag(folder, sorted((*messages(states), *tilts), key=lambda entry: entry[2]))

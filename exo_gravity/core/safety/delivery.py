@@ -11,8 +11,9 @@ import math
 from collections import deque
 from collections.abc import Sequence
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Drive, Fault, FaultCode
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 
 ABSOLUTE = 0.25  # Nm
 RELATIVE = 0.25  # of the expected torque

@@ -25,8 +25,9 @@ and has received these, they go on; else s continues from the torque that it rep
 import math
 from collections.abc import Sequence
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.delivery import ABSOLUTE, RELATIVE
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, JointSample
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 REST_TIME = 2.0  # s at rest with nothing holding the arm, until it is down
 LONGEST_REST = 7.5  # s with nothing holding the arm, after which it is down even if the wearer moves it

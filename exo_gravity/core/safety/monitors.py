@@ -8,9 +8,11 @@ import math
 import operator
 from collections.abc import Sequence
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import MISSED, UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import MISSED, Limits
 
 # s without a reply, while the motors hold the arm and while they are off, for which a motor's turn count stays trusted
 # if its angle is then within `home_tolerance` of the one before: a lost turn is twice as large, less what the joint has
@@ -115,8 +117,8 @@ class SupplyMonitor:
     """
 
     def __init__(self) -> None:
-        self._times = list(NOTHING)  # s, of each motor's last reply
-        self.doubt(NOTHING)
+        self._times = list(NO_TORQUE)  # s, of each motor's last reply
+        self.doubt(NO_TORQUE)
         self.settle()
 
     @property
@@ -134,8 +136,8 @@ class SupplyMonitor:
         """Doubt every motor; they apply `held` (4,) Nm if they are on."""
         self._held = held
         self.unsure: tuple[bool, ...] = (True,) * len(held)
-        self._torque = list(NOTHING)  # smoothed, since the motor replies again
-        self._heard = list(NOTHING)  # s for which it has replied again
+        self._torque = list(NO_TORQUE)  # smoothed, since the motor replies again
+        self._heard = list(NO_TORQUE)  # s for which it has replied again
         self._were_silent = [False] * len(held)
 
     def settle(self, may_differ: Sequence[bool] = (False,) * JOINT_COUNT) -> None:

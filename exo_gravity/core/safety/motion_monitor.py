@@ -15,8 +15,10 @@ g M, is a speed of about g PATIENCE / l = 0.4 rad/s.
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import MAX_COMMAND, JointSample, Limits
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import MAX_COMMAND, Limits
 
 GRAVITY = 9.81  # m/s^2
 UPRIGHT = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
@@ -46,7 +48,7 @@ class MotionMonitor:
 
     def reset(self) -> None:
         """Forget the past."""
-        self.impulse = list(NOTHING)
+        self.impulse = list(NO_TORQUE)
         self._slow: list[float] = []  # the torque, low-passed, (4,) Nm
 
     def step(

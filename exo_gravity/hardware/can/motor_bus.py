@@ -26,11 +26,11 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
-from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -39,22 +39,25 @@ UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since t
 OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
-SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
+LATE_REPLIES = 0.02  # s of it in which replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-UNREACHED = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
+AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
 
 class MotorBus:
-    """Four motors with different IDs. Not thread-safe: one thread owns it.
+    """The motors of one arm, with different IDs. Not thread-safe: one thread owns it.
 
     bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
-    torque, and is sent nothing. powered: whether the motors are already on. note: called with each drive before its
-    frames are sent. reopen: opens `bus` again after a failure. clock: of all times.
+        torque, and is sent nothing.
+    powered: whether the motors are already on.
+    note: called with each drive, and whether a motor may be on, before its frames are sent.
+    reopen: opens `bus` again after a failure.
+    clock: of all times.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class MotorBus:
         bus: can.BusABC | Sequence[CanPort | None],
         motors: Sequence[JointMotor],
         powered: bool = False,
-        note: Callable[[Drive], None] = lambda drive: None,
+        note: Callable[[Drive, bool], None] = lambda drive, powered: None,
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
@@ -110,7 +113,7 @@ class MotorBus:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
         self._failed.clear()
         end = self._now() + LISTEN_TIME
-        self.receive_until(end - LISTEN_TIME + SETTLING_TIME)
+        self.receive_until(end - LISTEN_TIME + LATE_REPLIES)
         self._answered.clear()
         self.foreign_commands = 0
         self.receive_until(end)
@@ -131,7 +134,7 @@ class MotorBus:
         if drive.powered:
             self._unsure = drive.unsure
             self._unconfirmed.update(joint for joint in self._joints if not drive.unsure[joint])
-        self._note(drive._replace(powered=self.may_be_powered))
+        self._note(drive, self.may_be_powered)
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
         for port in self._buses:  # replies that arrived after their cycle are not replies to this one
             try:
@@ -155,7 +158,7 @@ class MotorBus:
             if port not in self._failed:
                 port.confirm()
         if count < JOINT_COUNT:
-            missing = UNREACHED._replace(time=max(self.samples[joint].time for joint in self._joints))
+            missing = AT_REST._replace(time=max(self.samples[joint].time for joint in self._joints))
             self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(JOINT_COUNT))
         self._raise_failure()
         return len(self._answered) == count
@@ -203,7 +206,7 @@ class MotorBus:
             with contextlib.suppress(BusError):
                 self.receive_until(end, lambda: not self._unconfirmed)
         if not self._unconfirmed:
-            self._note(OFF)
+            self._note(OFF, False)
         self.close()
 
     def close(self) -> None:
@@ -276,19 +279,19 @@ class MotorBus:
                 self._oppose(self._joint_of[can_id], bytes(message.data))
             return
         joint = self._joint_of[can_id]
-        reply = self._motors[joint].joint_reply(message.data)
+        sample = self._motors[joint].sample(message.data, self._now())
         self._answered.add(joint)
-        if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
+        if self._is_confirming and (joint in self._asked or abs(sample.effort) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        now = self._now()
-        self._follow(joint, reply.position, now)
-        self.samples[joint] = JointSample(*reply[1:], now)
+        self._follow(joint, sample)
+        self.samples[joint] = sample
 
-    def _follow(self, joint: int, position: float, now: float) -> None:
+    def _follow(self, joint: int, sample: JointSample) -> None:
         """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
-        if self._hold(joint, now):
+        position = sample.position
+        if self._hold(joint, sample.time):
             away = position - self._held[joint]
-            step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
+            step = max(HOLD_SPEED * (sample.time - self.samples[joint].time), abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 

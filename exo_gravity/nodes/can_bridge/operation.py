@@ -19,7 +19,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, JointMotor, Traffic
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
+from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -97,7 +97,7 @@ class BridgeServices:
         if any(self._zero):
             return f"zero = {self._zero}: must be all 0 when the motors store the zero"
         is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
-        if safety.state is not State.DISABLED or is_silent or not safety.settled(now):
+        if safety.state is not State.DISABLED or is_silent or not safety.is_at_rest(now):
             return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
         loop.bus.set_zero()
         return ""
@@ -198,7 +198,7 @@ class BridgeReport:
         self._slow = SLOW / arm.period  # Hz
         self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
 
-    def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
+    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: str) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
         operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
