@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -66,8 +66,8 @@ class CanPort:
 
     def send(self, *frames: Frame) -> None:
         """Send frames. Raises BusError."""
-        bus = self._open_bus
         for frame in frames:
+            bus = self._bus or self._reopening()
             self._awaited.append(frame)
             try:
                 bus.send(message_of(frame))
@@ -76,7 +76,7 @@ class CanPort:
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
-        bus = self._open_bus
+        bus = self._bus or self._reopening()
         try:
             return bus.recv(timeout)
         except Exception as error:
@@ -118,12 +118,9 @@ class CanPort:
         if self._bus is not None:
             _close(self._bus)
 
-    @property
-    def _open_bus(self) -> can.BusABC:
-        """The bus. Raises BusError while it is opened again."""
-        if self._bus is None:
-            raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
-        return self._bus
+    def _reopening(self) -> NoReturn:
+        """Raise BusError, because the bus is being opened again."""
+        raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
 
     def _failed(self, bus: can.BusABC, error: Exception) -> BusError:
         """Return the error to raise for any `error` of `bus`; if it has failed for a while, open it again."""
@@ -138,7 +135,7 @@ class CanPort:
 
     def _has_lines(self) -> bool:
         """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
-        bus = self._open_bus
+        bus = self._bus or self._reopening()
         serial_port = getattr(bus, "serialPortOrig", None)
         try:
             return serial_port is not None and serial_port.in_waiting > 0

@@ -146,8 +146,8 @@ class MotorBus:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
                 self._send_commands(OFF)
-                for joint, motor in enumerate(self._motors):
-                    self._send(joint, *motor.enter)
+                for port, motor in zip(self._ports, self._motors, strict=True):
+                    self._send(port, *motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -184,8 +184,8 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        for joint, own in enumerate(frames):
-            self._send(joint, *own)
+        for port, own in zip(self._ports, frames, strict=True):
+            self._send(port, *own)
         self._raise_failure()
 
     def stop(self) -> None:
@@ -199,7 +199,7 @@ class MotorBus:
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
                     self._failed.clear()  # each is tried
-                    self._send(joint, frame)
+                    self._send(self._ports[joint], frame)
             self._failed.clear()
             self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
@@ -214,9 +214,8 @@ class MotorBus:
         for port in self._buses:
             port.close()
 
-    def _send(self, joint: int, *frames: Frame) -> None:
-        """Send frames on the bus of a motor, unless that has failed in this cycle."""
-        port = self._ports[joint]
+    def _send(self, port: CanPort | None, *frames: Frame) -> None:
+        """Send frames on a bus, unless it is not open or has failed in this cycle."""
         if port and port not in self._failed:
             try:
                 port.send(*frames)
@@ -231,7 +230,8 @@ class MotorBus:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                self._send(joint, *(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+                zero = () if joint in self._asked else self._zero_command(joint)
+                self._send(self._ports[joint], *zero, *motor.exit)
             if self._failed:
                 return  # no reply confirms an EXIT that was not sent
             self._exit_sent = self._now()
@@ -246,13 +246,14 @@ class MotorBus:
     def _send_commands(self, drive: Drive) -> None:
         self._drive = drive
         now = self._now()
+        frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
             command = self._command(joint, now)
-            if drive.enter[joint]:
-                self._send(joint, command, *motor.enter)
-            self._send(joint, command)
+            frames[self._ports[joint]] += (command, *motor.enter, command) if drive.enter[joint] else (command,)
+        for port, own in frames.items():
+            self._send(port, *own)
 
     def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -283,11 +284,14 @@ class MotorBus:
         self._answered.add(joint)
         if self._is_confirming and (joint in self._asked or abs(sample.effort) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        self._follow(joint, sample)
+        if sample.time - self._contested[joint] < CONTEST_TIME:
+            self._follow(joint, sample)
+        else:
+            self._held[joint] = sample.position
         self.samples[joint] = sample
 
     def _follow(self, joint: int, sample: JointSample) -> None:
-        """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
+        """Let the held position of a contested joint follow it slowly, or at once if its motor does not hold it."""
         position = sample.position
         if self._hold(joint, sample.time):
             away = position - self._held[joint]
@@ -302,7 +306,7 @@ class MotorBus:
     def _command(self, joint: int, now: float) -> Frame:
         """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
         motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
-        if hold := self._hold(joint, now):
+        if now - self._contested[joint] < CONTEST_TIME and (hold := self._hold(joint, now)):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
                 data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint])
@@ -324,5 +328,5 @@ class MotorBus:
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send(joint, *((command, *motor.enter) if is_exit else ()), command)
+            self._send(self._ports[joint], *((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now
