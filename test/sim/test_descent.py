@@ -7,7 +7,7 @@ import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import NO_EFFORTS, OFF, State
 from exo_gravity.core.safety.limits import Limits
@@ -74,8 +74,7 @@ class Lowered:
         self.speed_after_exit = self._advance(3.0)
 
     def _take(self, motor, reply):
-        _, *reading = motor.joint_reply(reply[1])
-        self._samples[motor.can_id - 1] = JointSample(*reading, self._now)
+        self._samples[motor.can_id - 1] = motor.sample(reply[1], self._now)
 
     def _advance(self, duration):
         fastest = 0.0

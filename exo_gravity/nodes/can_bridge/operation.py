@@ -41,7 +41,7 @@ FOLLOWS = {
     State.CHECKING: "torque follows in 3 s, at the first start in 10 s; if not, /diagnostics says what is missing",
     State.LETTING_DOWN: "the motors are switched off once the arm is down; /diagnostics shows the state",
 }
-UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
+MOTOR_UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
 
 
 def refuse_simulated_time(node: Node, interface: str) -> None:
@@ -249,7 +249,7 @@ def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:
     if loop.failure:
         return ERROR, f"the control thread has ended: {loop.failure}"
     if safety.is_unreached:
-        return ERROR, f"{safety.state.value}: {UNREACHED}"
+        return ERROR, f"{safety.state.value}: {MOTOR_UNREACHED}"
     if safety.fault:
         return ERROR, f"{safety.state.value}: {safety.fault.code}: {safety.fault.reason}"
     if safety.state is State.CHECKING:
