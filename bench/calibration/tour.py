@@ -60,6 +60,7 @@ class Player:
         self.safety = arm.safety
         arm.enable()
         arm.run_until(lambda: self._is_over(arm.now, controller.efforts(arm.now).effort), LONGEST)
+        arm.check_controller()
         arm.loop.stop()
         return self.safety
 

@@ -192,6 +192,7 @@ class OrdinaryArm:
         """Run until the state is one of these; return whether it is, within `timeout` s and without a new fault."""
         safety, starts = self.safety, State.ACTIVE in states
         self._arm.run_until(lambda: safety.state in states or (starts and safety.fault), timeout)
+        self._arm.check_controller()
         return safety.state in states
 
     def _send_samples(self, timing: Timing) -> None:

@@ -102,6 +102,11 @@ class VirtualArm:
                 return False
         return True
 
+    def check_controller(self) -> None:
+        """Raise RuntimeError if the controller has failed: the loop would only let the arm down."""
+        if self.loop.cycle_errors:
+            raise RuntimeError(f"the controller failed: {self.loop.cycle_error}")
+
     def catch_up(self) -> None:
         """Let the device's time pass until now, e.g. before its motion is read."""
         self._played.catch_up()

@@ -93,6 +93,7 @@ class OfflineTrial:
         while safety.state not in (State.DISABLED, State.FAULT):
             now = carrier.now
             carrier.loop.cycle()
+            carrier.check_controller()
             if safety.state in CARRIED:
                 self._carried = ((self._carried[0][0] if self._carried else now, now),)
             if now >= second:
