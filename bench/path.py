@@ -60,7 +60,7 @@ class Trace:
             return
         if code.co_filename.startswith(PATH):
             if code.co_name not in INLINE:
-                self.calls[code.co_filename, code.co_firstlineno, code.co_qualname] += 1
+                self.calls[code.co_filename, code.co_firstlineno, code.co_name] += 1
         elif code.co_filename == "<string>":  # made by namedtuple or dataclass
             kind = frame.f_locals.get("_cls") or type(frame.f_locals.get("self"))
             if kind.__module__.startswith("exo_gravity."):

@@ -146,8 +146,8 @@ class MotorBus:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
                 self._send_commands(OFF)
-                for port, motor in zip(self._ports, self._motors, strict=True):
-                    self._send(port, *motor.enter)
+                for joint, motor in enumerate(self._motors):
+                    self._send(self._ports[joint], *motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -184,8 +184,8 @@ class MotorBus:
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
-        for port, own in zip(self._ports, frames, strict=True):
-            self._send(port, *own)
+        for joint, own in enumerate(frames):
+            self._send(self._ports[joint], *own)
         self._raise_failure()
 
     def stop(self) -> None:
