@@ -61,7 +61,6 @@ class Player:
         arm.enable()
         arm.run_until(lambda: self._is_over(arm.now, controller.efforts(arm.now).effort), LONGEST)
         arm.check_controller()
-        arm.loop.stop()
         return self.safety
 
     def _is_over(self, now: float, effort: Sequence[float] | None) -> bool:
