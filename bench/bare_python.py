@@ -11,9 +11,9 @@ import signal
 import sys
 import time
 
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE
-from exo_gravity.core.safety.drive import NOTHING, Drive
-from exo_gravity.core.safety.limits import UNKNOWN
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
+from exo_gravity.core.safety.drive import NO_MOTOR, Drive
 from exo_gravity.hardware.clock import favour
 
 from .direct_arm import DirectArm, run_paced
@@ -32,8 +32,8 @@ def main() -> None:
     def cycle() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NOTHING
-        bus.exchange(Drive(effort, NOTHING, powered=all_replied), now + REPLY_SHARE * period)
+        effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NO_TORQUE
+        bus.exchange(Drive(effort, NO_TORQUE, all_replied, NO_MOTOR, NO_MOTOR), now + REPLY_SHARE * period)
 
     try:
         run_paced(period, cycle, stopping)

@@ -32,13 +32,14 @@ from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NOTHING, FaultCode
+from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MOTION
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_arm import TrunkReading
 from exo_gravity.sim.virtual_wearer import path_between
 
 RATE = 100.0  # Hz
@@ -272,7 +273,7 @@ def settings_of(body_mass: float = 0.0, **changes: Any) -> Settings:
     return replace(Settings("right", ROBOT), **{**worn, **changes})
 
 
-def arm_of(settings: Any, worn: bool, moment: Sequence[float], addition: Sequence[float] = NOTHING) -> ArmSetup:
+def arm_of(settings: Any, worn: bool, moment: Sequence[float], addition: Sequence[float] = NO_TORQUE) -> ArmSetup:
     """Return the right arm that hangs; worn: with the passive arm of a wearer in it.
 
     moment, addition: (4,), `largest_moment` and `largest_addition`.
@@ -301,7 +302,7 @@ def quiet(
     duration: float,
     seed: int,
     moment: Sequence[float],
-    addition: Sequence[float] = NOTHING,
+    addition: Sequence[float] = NO_TORQUE,
 ) -> Quiet:
     """Let a fast wearer of 75 kg, who also walks, bows, leans and sits down, use the arm for `duration` s."""
     count = int(duration / TRUNK_TIME * len(TRUNK))
@@ -333,9 +334,9 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
     )
     moment, everything = full.arm.first_moment, Lively(replace(full, terms=added, inertial=True), ())
     addition = tuple(map(operator.add, SUM.effort, added.assist.max_effort))
-    yield "One-G", Compensator(settings_of()), settings_of().arm.first_moment, NOTHING
-    yield "Zero-G, 75 kg", Compensator(full), moment, NOTHING
-    yield "with changes of load", Lively(full, (half, settings_of())), moment, NOTHING
+    yield "One-G", Compensator(settings_of()), settings_of().arm.first_moment, NO_TORQUE
+    yield "Zero-G, 75 kg", Compensator(full), moment, NO_TORQUE
+    yield "with changes of load", Lively(full, (half, settings_of())), moment, NO_TORQUE
     yield "with all terms, assistance, `inertial`", everything, moment, addition
 
 

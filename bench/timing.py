@@ -103,7 +103,7 @@ def _expected_answer(cycle: Cycle, motors: Sequence[JointMotor], law: Law) -> An
     """Return the commands that answer a cycle's replies, None if a reply is missing."""
     if len(cycle.replies) != len(motors):
         return None
-    angles = [motor.joint_reply(cycle.replies[joint][1]).position for joint, motor in enumerate(motors)]
+    angles = [motor.sample(cycle.replies[joint][1], 0.0).position for joint, motor in enumerate(motors)]
     return tuple(motor.command(torque, 0.0) for motor, torque in zip(motors, law(angles), strict=True))
 
 

@@ -17,10 +17,11 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.report.html import HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, resting
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.virtual_arm import resting
 
 POSE = [0.3, 0.45, 0.10, 0.4]  # rad; carrying the whole arm of the wearer takes less than rated torque here
 HELD, RELEASED = 30.0, 10.0  # s, how long the hand holds the arm in the pose, and how long the arm is alone

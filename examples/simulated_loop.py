@@ -31,7 +31,7 @@ while device.time < 10.0:
     angles = []
     for motor, effort in zip(motors, torque, strict=True):
         _, reply = device.exchange(motor.can_id, motor.command(effort, damping=0.0))
-        angles.append(motor.joint_reply(reply).position)
+        angles.append(motor.sample(reply, device.time).position)
     torque = gravity_torque(model, angles)
     times.append(device.time)
     poses.append([degrees(angle) for angle in angles])

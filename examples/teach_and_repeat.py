@@ -13,13 +13,17 @@ import matplotlib.pyplot as plt
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, MOTORS
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.virtual_arm import VirtualArm
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 PERIOD = 0.004  # s
@@ -30,23 +34,18 @@ robot = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585,
 motors = [JointMotor(MOTORS[name], can_id) for can_id, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(motor) for motor in motors])
 compensator = Compensator(settings := Settings("right", robot, use_imu=False))
-torque = [0.0] * 4
+limits = Limits(JOINTS, sign_check_torque=0.0)
+arm = VirtualArm(device, DirectController(compensator, limits), motors, limits, 1.0 / PERIOD)
 
 
 def cycle():
-    """Exchange frames with the motors and compute the next torque; return the joint angles."""
-    global torque
-    commands = [motor.command(effort, 0.0) for motor, effort in zip(motors, torque, strict=True)]
-    frames = [device.exchange(motor.can_id, command)[1] for motor, command in zip(motors, commands, strict=True)]
-    replies = [motor.joint_reply(frame) for motor, frame in zip(motors, frames, strict=True)]
-    angles = [reply.position for reply in replies]
-    torque = compensator.step(device.time, angles, [reply.velocity for reply in replies]).effort
-    device.advance(PERIOD)
-    return angles
+    """Run one cycle of the control loop; return the joint angles."""
+    arm.loop.cycle()
+    return device.arm.positions
 
 
-for motor in motors:
-    device.exchange(motor.can_id, ENTER)
+arm.enable()
+arm.run_until(lambda: arm.safety.state is State.ACTIVE)
 script = TrialScript.parse({"name": "teach", "steps": [{"move": pose, "over": 2.0} for pose in LED]})
 device.start(VirtualWearer(script), delay=1.0)
 poses = [cycle() for _ in range(round((1.0 + script.duration) / PERIOD))]

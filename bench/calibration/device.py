@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import yaml
 
+from bench.calibration.random_device import off_axis_of
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from test.support.random_device import off_axis_of
 
 BRIDGE, SIMULATOR = "/right/can_bridge", "/right/simulator"
 SPREAD = 0.3  # of masses, centres of gravity and torque scales

@@ -1,14 +1,12 @@
-"""A tour of `calibrate` without nodes: the tour, the bridge's safety machine and the device, cycle by cycle.
+"""A tour of `calibrate` without nodes: the tour carries the simulated device in virtual time.
 
-`run_tour` takes the place of `tools.calibration.live.run_tour`. It reads the same parameters, and torques and angles
-pass through CAN frames with the motors of the file; only nothing is ever late.
+`run_tour` takes the place of `lab.calibration.live.run_tour`, and reads the same parameters.
 """
 
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,20 +14,19 @@ from typing import Any
 import numpy as np
 import yaml
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
-from exo_gravity.core.motors.specs import ENTER, EXIT
-from exo_gravity.core.safety.drive import Drive, EffortCommand, State
-from exo_gravity.core.safety.limits import CAN_BRIDGE, UNKNOWN, JointSample, Limits, limits_of
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
-from exo_gravity.lab.calibration.tour import CALIBRATOR, Tour, tour_of
+from exo_gravity.lab.calibration.tour import CALIBRATOR, Tour, TourController, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of
+from exo_gravity.sim.virtual_arm import VirtualArm
 
 LONGEST = 420.0  # s
 HANDS, SINKING = 1.0, 5.0  # Nm s/rad of the hands that let the arm hang, and s that it takes
@@ -37,64 +34,43 @@ HANDS, SINKING = 1.0, 5.0  # Nm s/rad of the hands that let the arm hang, and s 
 
 @dataclass
 class Player:
-    """Plays `tour` on `device`; motors, limits: those of the parameter file. tilt: as the IMU measures it.
+    """Plays `tour` on `device`.
 
-    speeds: rad/s, of the fastest joint in each cycle of the tour. acted: the bridge's limits that acted.
+    motors, limits, rate: as the bridge assumes them.
+    tilt: as the IMU measures it.
+    on_carried: called once the bridge carries the arm.
+
+    safety: the bridge's, once played. log: rows of s, true angles (4,) in rad, true speeds (4,) in rad/s, and the
+    efforts (4,) in Nm that answer them, in each cycle in which the tour moves the arm.
     """
 
     tour: Tour
     device: SimulatedDevice
-    motors: tuple[JointMotor, ...]
+    motors: Sequence[JointMotor]
     limits: Limits
     rate: float
     tilt: Tilt
-    fault: str = ""
-    speeds: list[float] = field(default_factory=list)
-    _samples: list[JointSample] = field(default_factory=lambda: [UNKNOWN] * 4)
-    _powered: bool = False
+    on_carried: Callable[[], object] = lambda: None
+    log: list[tuple[float, ...]] = field(default_factory=list)
 
-    def play(self) -> None:
-        """Play until the motors are off."""
-        safety = SafetyMachine(self.limits, 1.0 / self.rate, self.motors)
-        safety.enable(0.0)
-        effort: Torque | None = None
-        answered, began = -math.inf, False
-        for cycle in range(round(LONGEST * self.rate)):
-            now = cycle / self.rate
-            self._exchange(safety.step(now, tuple(self._samples), EffortCommand(effort, answered)), now)
-            if not any(self.limits.is_silent(now, joint) for joint in self._samples):
-                began = began or safety.state is State.ACTIVE
-                effort = self._answer(now, began)
-                answered = now
-            if self.tour.done:
-                safety.disable(now)
-            if safety.state in (State.DISABLED, State.FAULT) and now > 1.0:
-                break
-            self.device.advance(1.0 / self.rate)
-        self.fault = safety.fault.reason if safety.fault else ""
+    def play(self) -> SafetyMachine:
+        """Play until the motors are off; return the bridge's safety machine."""
+        controller = TourController(self.tour, self.limits, self.tilt, lambda: self.safety.state is State.ACTIVE)
+        arm = VirtualArm(self.device, controller, self.motors, self.limits, self.rate)
+        self.safety = arm.safety
+        arm.enable()
+        arm.run_until(lambda: self._is_over(arm.now, controller.efforts(arm.now).effort), LONGEST)
+        arm.check_controller()
+        return self.safety
 
-    def _answer(self, now: float, began: bool) -> Torque | None:
-        position = [row.position for row in self._samples]
-        if not began:
-            return self.tour.wait(position, self.tilt)
-        effort = self.tour.step(now, position, [row.velocity for row in self._samples], self.tilt)
-        self.tour.plan()
-        if effort is not None and not self.tour.done:
-            self.speeds.append(max(map(abs, self.device.arm.velocities)))
-        return effort
-
-    def _exchange(self, drive: Drive, now: float) -> None:
-        send = self.device.exchange
-        for i, motor in enumerate(self.motors):
-            if drive.powered and (drive.enter[i] or not self._powered):
-                send(motor.can_id, motor.command(0.0, 0.0))
-                send(motor.can_id, ENTER)
-            reply = send(motor.can_id, motor.command(drive.effort[i], drive.damping[i]))
-            if self._powered and not drive.powered:
-                reply = send(motor.can_id, EXIT)
-            if reply:
-                self._samples[i] = JointSample(*motor.joint_reply(reply[1])[1:], now)
-        self._powered = drive.powered
+    def _is_over(self, now: float, effort: Sequence[float] | None) -> bool:
+        if self.safety.state is State.ACTIVE and effort and not self.tour.done:
+            if not self.log:
+                self.on_carried()
+            self.log.append((now, *self.device.arm.positions, *self.device.arm.velocities, *effort))
+        if self.tour.done:
+            self.safety.disable(now)
+        return self.safety.state in (State.DISABLED, State.FAULT)
 
 
 def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -> Player:
@@ -127,15 +103,14 @@ def run_tour(players: list[Player], prepare: Callable[[Player], None] = lambda p
         player = player_of(nodes, options.output.with_suffix(f".nodes{len(players)}.yaml"))
         players.append(player)
         prepare(player)
-        player.play()
-        tour = player.tour
-        trouble = tour.trouble or ("" if tour.done else player.fault or "the tour did not end")
+        fault, tour = player.play().fault, player.tour
+        trouble = tour.trouble or ("" if tour.done else fault.reason if fault else "the tour did not end")
         return LiveTour(list(tour.measured), trouble, tour.done)
 
     return run
 
 
 def speed_quantiles(players: list[Player]) -> tuple[float, float]:
-    """Return the 99.9th percentile and the largest of the joints' true speeds during the tours, in rad/s."""
-    speeds = np.concatenate([player.speeds for player in players])
+    """Return the 99.9th percentile and the largest of the fastest joint's true speeds in the tours, in rad/s."""
+    speeds = np.concatenate([np.abs(np.array(player.log)[:, 5:9]).max(axis=1) for player in players])
     return float(np.quantile(speeds, 0.999)), float(speeds.max())

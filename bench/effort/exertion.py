@@ -231,7 +231,7 @@ def perform(
     angles, speeds = [], []
     for _ in range(round(wearer.task.duration * rate)):
         frames = [device.exchange(m.can_id, m.command(tau, 0.0)) for m, tau in zip(motors, torque, strict=True)]
-        replies = [motor.joint_reply(frame[1]) for motor, frame in zip(motors, frames, strict=True) if frame]
+        replies = [motor.sample(frame[1], device.time) for motor, frame in zip(motors, frames, strict=True) if frame]
         if compute:
             torque = compute(device.time, [reply.position for reply in replies], [reply.velocity for reply in replies])
         angles.append(device.arm.positions)

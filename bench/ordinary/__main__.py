@@ -45,11 +45,13 @@ def main() -> int:
             results[row] = result
             causes = "; ".join(result.refused_starts + result.let_downs) or "quiet"
             console.print(f"{len(results)} of {len(rows)}: {row.name}: {causes}", markup=False)
-    table = Table("", "minutes", "starts", "refused", "let down", "samples %", "no tilt s", "error Nm", box=None)
+    table = Table(
+        "", "minutes", "starts", "refused", "let down", "rides", "samples %", "no tilt s", "error Nm", box=None
+    )
     for row in rows:
         one = results[row]
         refused = 100.0 * one.refused_samples / max(1, one.samples)
-        figures = (f"{one.time / 60.0:.1f}", one.starts, len(one.refused_starts), len(one.let_downs))
+        figures = (f"{one.time / 60.0:.1f}", one.starts, len(one.refused_starts), len(one.let_downs), one.rides)
         others = (f"{refused:.1f}", f"{one.without_tilt:.2f}", f"{one.largest_error:.2f}")
         table.add_row(row.name, *map(str, figures), *others)
     console.print(table)

@@ -1,7 +1,7 @@
 """One arm with ordinary motors, sensors and computers, in virtual time: is it carried, and how well.
 
-Everything between frames and samples is what the nodes use: MotorBus, ControlLoop, SafetyMachine, TrunkEstimator and
-Compensator. The simulated device gives the truth.
+What carries it is what the nodes use: `VirtualArm`, Compensator and TrunkEstimator. The simulated device gives the
+truth.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ import random
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import cast
 
 import numpy as np
 
 from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
-from exo_gravity.core.safety.drive import EffortCommand, State
-from exo_gravity.core.safety.limits import JointSample, Limits
-from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.clock import Clock
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.control_loop import Controller
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.sim.script import TrialScript
-from test.hardware.virtual_time import VirtualClock, Wire
-from test.support.imu_drivers import Timing
-from test.support.simulated_device import joints_of
+from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
+from exo_gravity.sim.virtual_time import VirtualClock, Wire
 
+from .drivers import Timing
 from .motors import Electronics, motor_of
 
 LATE = 0.02  # s by which a busy computer is late
+TILT_TIMEOUT = 0.08  # s
 LOOK_PERIOD = 0.01  # s between two comparisons with the truth
 SETTLED = 1.5  # s until a tilt must be there
 DAY = TrialScript.parse(  # what the wearer does while the arm is carried
@@ -88,6 +88,37 @@ class Result:
     refused_samples: int = 0
     without_tilt: float = 0.0
     largest_error: float = 0.0
+    rides: int = 0  #: through late efforts or a late tilt
+
+
+class LateController:
+    """A controller on a computer that is late now and then, by LATE.
+
+    controller: what answers the samples.
+    clock: of the loop, which is late too.
+    late: share of the cycles in which the loop is late, and of the answers that are.
+    """
+
+    def __init__(self, controller: Controller, clock: VirtualClock, late: float, seed: int) -> None:
+        self._controller, self._clock, self._late = controller, clock, late
+        self._random = random.Random(seed)
+        self._answers: deque[tuple[float, Efforts]] = deque()  # on their way, by the time of their arrival
+        self._newest = NO_EFFORTS
+
+    def efforts(self, latest: float) -> Efforts:
+        """Return the newest efforts that have arrived."""
+        if self._random.random() < self._late:
+            self._clock.stall(LATE)
+        while self._answers and self._answers[0][0] <= self._clock.monotonic():
+            self._newest = self._answers.popleft()[1]
+        return self._newest
+
+    def take(self, now: float, samples: Sequence[JointSample]) -> None:
+        """Answer the samples, perhaps late; answers arrive in order."""
+        self._controller.take(now, samples)
+        due = now + (LATE if self._random.random() < self._late else 0.0)
+        due = max(due, self._answers[-1][0]) if self._answers else due
+        self._answers.append((due, self._controller.efforts(now)))
 
 
 class OrdinaryArm:
@@ -95,30 +126,27 @@ class OrdinaryArm:
 
     def __init__(self, equipment: Equipment, is_v3: bool, rate: float, timing: Timing, seed: int = 0) -> None:
         self.result = Result()
-        self._random = random.Random(seed)
-        self._late = equipment.late / (0.01 * rate)  # of each cycle
-        settings = replace(read_arm(load(packaged_config("sim.yaml")), "/right").settings(), tilt_timeout=0.08)
+        arm = read_arm(load(packaged_config("sim.yaml")), "/right")
+        settings = replace(arm.settings(), tilt_timeout=TILT_TIMEOUT)
         robot = settings.robot_by_mass
         assert robot
-        motors = joints_of((MIT_V3 if is_v3 else MIT,) * 4)
+        board = MIT_V3 if is_v3 else MIT
+        motors = [replace(motor, spec=board.ranged(motor.spec), wire_format=board) for motor in arm.motors]
         coulomb, stribeck = equipment.friction
         config = ArmConfig(robot, coulomb_friction=(coulomb,) * 4, stribeck_friction=(stribeck,) * 4)
         boards = [motor_of(joint, equipment.electronics) for joint in motors]
         self.device = SimulatedDevice(SimulatedArm(config), boards)
-        self.clock = VirtualClock()
         self._robot = robot
-        wire = Wire(self.clock)
+        wire = Wire()
         wire.loss, wire.batch = equipment.loss, equipment.batch
-        self._played = wire.play(self.device)
+        limits = Limits(arm.joint_names)
         self._compensator = Compensator(settings)
+        controller = DirectController(self._compensator, limits)
+        late = LateController(controller, wire.clock, equipment.late / (0.01 * rate), seed)
+        self._arm = VirtualArm(self.device, late, motors, limits, rate, wire)
+        self.clock, self.safety, self.loop = wire.clock, self._arm.safety, self._arm.loop
         self._estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))
         self._imu = SimulatedImu()
-        self._answers: deque[tuple[float, EffortCommand]] = deque()  # on their way, by the time of their arrival
-        self._efforts = EffortCommand(None, -np.inf)
-        limits = Limits(("rotation", "abduction", "flexion", "elbow"))
-        self.safety = SafetyMachine(limits, 1.0 / rate, motors)
-        bus = MotorBus(wire.open(), motors, reopen=wire.open, clock=cast(Clock, self.clock))
-        self.loop = ControlLoop(bus, self.safety, 1.0 / rate, self._on_cycle, self._get_efforts)
         self._begin = self._tilted = self.clock.monotonic()
         self.clock.every(LOOK_PERIOD, self._look)
         self._send_samples(timing)
@@ -129,6 +157,7 @@ class OrdinaryArm:
         while self.clock.monotonic() < end:
             self._start(carried)
         self.result.time = self.clock.monotonic() - self._begin
+        self.result.rides = self.safety.ride.rides
         self.loop.bus.close()
         return self.result
 
@@ -160,28 +189,11 @@ class OrdinaryArm:
         return self.safety.state is State.ACTIVE
 
     def _run_until(self, states: Sequence[State], timeout: float) -> bool:
-        end = self.clock.monotonic() + timeout
-        while self.safety.state not in states:
-            is_over = self.safety.fault and State.ACTIVE in states
-            if self.clock.monotonic() > end or is_over or not self.loop.cycle():
-                return False
-        return True
-
-    def _get_efforts(self, latest: float) -> EffortCommand:
-        if self._random.random() < self._late:
-            self.clock.stall(LATE)
-        while self._answers and self._answers[0][0] <= self.clock.monotonic():
-            self._efforts = self._answers.popleft()[1]
-        return self._efforts
-
-    def _on_cycle(self, now: float, joints: Sequence[JointSample]) -> None:
-        """Answer the readings as the compensator does."""
-        if any(self.safety.limits.is_silent(now, joint) for joint in joints):
-            return
-        answer = self._compensator.step(now, [joint.position for joint in joints], [joint.velocity for joint in joints])
-        due = now + (LATE if self._random.random() < self._late else 0.0)
-        due = max(due, self._answers[-1][0]) if self._answers else due
-        self._answers.append((due, EffortCommand(answer.effort, min(joint.time for joint in joints))))
+        """Run until the state is one of these; return whether it is, within `timeout` s and without a new fault."""
+        safety, starts = self.safety, State.ACTIVE in states
+        self._arm.run_until(lambda: safety.state in states or (starts and safety.fault), timeout)
+        self._arm.check_controller()
+        return safety.state in states
 
     def _send_samples(self, timing: Timing) -> None:
         """Let the driver take its samples, and deliver them."""
@@ -194,7 +206,7 @@ class OrdinaryArm:
                 self.clock.later(begin + taken - self.clock.monotonic(), lambda: take(stamp, arrival))
 
         def take(stamp: float, arrival: float) -> None:
-            self._played.catch_up()
+            self._arm.catch_up()
             rate, force = self._imu.sample(self.device.trunk)
             sample = ImuSample(begin + stamp, rate.tolist(), force.tolist())
             self.clock.later(begin + arrival - self.clock.monotonic(), lambda: self._arrive(sample))
@@ -207,10 +219,8 @@ class OrdinaryArm:
         result.samples += 1
         try:
             if answer := self._estimator.update(sample, now):
-                assert sample.angular_velocity
-                self._compensator.tilt.set_gravity(
-                    now, answer.gravity.tolist(), sample.angular_velocity, now - sample.time
-                )
+                reading = TrunkReading(answer.gravity.tolist(), sample.acceleration, sample.angular_velocity or ZERO)
+                self._arm.tell(self._compensator, reading, sample.time)
                 self._note_tilt(now)
         except ParameterError:
             result.refused_samples += 1

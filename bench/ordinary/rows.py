@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from test.support.imu_drivers import ordinary_drivers
-
 from .arm import Equipment, OrdinaryArm, Result
+from .drivers import ordinary_drivers
 from .motors import Electronics
 
 MARGIN = 120.0  # s; the last start may take that long

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
+from bench.calibration.random_device import LEANING, LENGTH, Device, off_axis_of
 from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque, moments_of
@@ -33,7 +34,6 @@ from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from test.support.random_device import LEANING, LENGTH, Device, off_axis_of
 
 STRIBECK = 0.05  # Nm
 LEANT = Tilt.of("right", -0.15, 0.22).direction  # the stand while the weight hangs

@@ -27,12 +27,13 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
 from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_arm import TrunkReading
 
 from .devices import Worn, turned
 from .muscles import Muscles, Phase, phase_at

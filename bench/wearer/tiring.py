@@ -115,7 +115,7 @@ def tire(worn: Worn, adapts: bool) -> Tired:
     compensator = Adapting(settings)
     setup = ArmSetup(worn.side, device, worn.motors, limits, settings, RATE, imu)
     trial = OfflineTrial(setup, script, DELAY, compensator, wearer)
-    compensator.read = lambda: [joint.effort for joint in trial._samples]
+    compensator.read = lambda: [joint.effort for joint in trial.samples]
     compensator.trunk = lambda: Tilt.of_felt(worn.side, imu.log[-2][4:])
     recording = trial.run()
     start = recording.steps[0].start + MOVE + RESTED

@@ -1,4 +1,4 @@
-"""What is asked of the computer: the time, and to be run in time. A test gives the logic a clock with virtual time."""
+"""What is asked of the computer: the time, and to be run in time. sim/virtual_time.py has a clock of virtual time."""
 
 import contextlib
 import ctypes
@@ -7,31 +7,52 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 PR_SET_TIMERSLACK = 29  # prctl(2), in <sys/prctl.h>
 # Flags of mlockall(2), in <sys/mman.h>: pages mapped now, pages mapped later, and only once they are used.
 MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
 
 
-class Clock:
-    """The computer's monotonic clock, in s. Another clock has the same four methods."""
+class Clock(Protocol):
+    """A monotonic clock, in s."""
+
+    def monotonic(self) -> float:
+        """Return the time in s."""
+        ...
+
+    def sleep(self, duration: float) -> None:
+        """Return after `duration` s."""
+        ...
+
+    def suspended(self) -> float:
+        """Return the time in s for which the computer has been suspended so far, which `monotonic` does not count."""
+        ...
+
+    def later(self, delay: float, function: Callable[[], None]) -> None:
+        """Call `function` in `delay` s."""
+        ...
+
+
+class ComputerClock:
+    """The computer's clock. `later` uses another thread, which does not keep the process alive."""
 
     monotonic = staticmethod(time.monotonic)
     sleep = staticmethod(time.sleep)
 
     def suspended(self) -> float:
-        """Return the time in s for which the computer has been suspended so far, which `monotonic` does not count."""
+        """Return the time in s for which the computer has been suspended so far."""
         now = time.clock_gettime(time.CLOCK_MONOTONIC)
         return time.clock_gettime(time.CLOCK_BOOTTIME) - now
 
     def later(self, delay: float, function: Callable[[], None]) -> None:
-        """Call `function` in `delay` s, on another thread, which does not keep the process alive."""
+        """Call `function` in `delay` s, on another thread."""
         timer = threading.Timer(delay, function)
         timer.daemon = True
         timer.start()
 
 
-COMPUTER_CLOCK = Clock()
+COMPUTER_CLOCK = ComputerClock()
 
 
 def favour(priority: int) -> None:

@@ -1,10 +1,11 @@
 """The control loop of one arm: get the efforts, decide, command all motors, collect replies; at a fixed rate.
 
-Each cycle fetches the newest efforts from `get_efforts`. Other threads use `call` to run a function between two cycles.
-The loop is paced by absolute deadlines on the clock of its bus, so that the rate does not drift.
+What turns samples into efforts is a `Controller`: over ROS, in this process, or the tour of a calibration. Each cycle
+asks it for the newest efforts, and gives it the samples that follow. Other threads use `call` to run a function between
+two cycles. The loop is paced by absolute deadlines on the clock of its bus, so that the rate does not drift.
 
-An exception anywhere lets the arm down: one in `get_efforts` is treated as withdrawn efforts, one of the bus as a
-silent bus, one in the state machine as a fault. If the state machine keeps failing, the watchdog takes over from the
+An exception anywhere lets the arm down: a controller without efforts has withdrawn them, an exception of the bus is a
+silent bus, one in the state machine a fault. If the state machine keeps failing, the watchdog takes over from the
 last noted drive; without a watchdog, the loop lowers the arm without the state machine (`lower`).
 """
 
@@ -15,12 +16,12 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, Protocol
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE
-from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, OFF, Drive, EffortCommand, FaultCode, State
-from exo_gravity.core.safety.limits import DAMPING, JointSample
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
+from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, OFF, Drive, Efforts, FaultCode, State
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -38,16 +39,46 @@ REST_TIME = 10.0  # s for which the joints must be at rest
 REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
 
 
+class Controller(Protocol):
+    """Turns samples into efforts. Both methods are called on the thread of the loop."""
+
+    def efforts(self, latest: float) -> Efforts:
+        """Return the newest efforts; called before each exchange of frames.
+
+        latest: until when it may wait for those that answer the last samples, s on the clock of the bus.
+        """
+        ...
+
+    def take(self, now: float, samples: Sequence[JointSample]) -> None:
+        """Take the newest sample of each joint; called after each exchange. An exception does not stop the control.
+
+        now: s on the clock of the bus.
+        """
+        ...
+
+
+class NoController:
+    """Asks for nothing: of an arm that is only let down."""
+
+    def efforts(self, latest: float) -> Efforts:
+        """Return no efforts."""
+        return NO_EFFORTS
+
+    def take(self, now: float, samples: Sequence[JointSample]) -> None:
+        """Ignore the samples."""
+
+
 class ControlLoop:
     """Owns `bus` and `safety` until it has ended. Its clock is that of the bus.
 
-    It begins by finding out whether a motor is on (`SafetyMachine.meet`), unless `safety` already lets an arm down.
+    It begins by finding out whether a motor is on (`SafetyMachine.probe`), unless `safety` already lets an arm down.
 
     `start` repeats `cycle` on a thread. A loop that was not started is run by its owner, one `cycle` after another.
 
-    get_efforts(latest) is called before every exchange and returns the newest efforts, for which it may wait until
-    `latest` (s). on_cycle(now, samples) is called after every exchange; its errors do not stop the control.
-    hand_over(reason) requests the watchdog to end this process and let the arm down; it returns whether one is there.
+    period: s of a cycle.
+    controller: what the arm is carried by.
+    hand_over: requests the watchdog, for a reason, to end this process and let the arm down; returns whether one is
+        there.
     """
 
     def __init__(
@@ -55,8 +86,7 @@ class ControlLoop:
         bus: MotorBus,
         safety: SafetyMachine,
         period: float,
-        on_cycle: Callable[[float, Sequence[JointSample]], None] = lambda now, samples: None,
-        get_efforts: Callable[[float], EffortCommand] = lambda latest: NO_COMMAND,
+        controller: Controller,
         hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
         #: The state machine. It starts in its present state, DISABLED unless a `call` changed it.
@@ -66,7 +96,7 @@ class ControlLoop:
         #: Counts of all cycles, of those that began more than a period late, and of those in which not every motor
         #: replied in time.
         self.cycles = self.late = self.incomplete = 0
-        #: Count of exceptions in on_cycle, and the last one.
+        #: Count of exceptions in the controller's `take`, and the last one.
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
@@ -76,11 +106,10 @@ class ControlLoop:
         self.bus = bus
         self._clock = bus.clock
         self._now = bus.clock.monotonic
-        self._on_cycle = on_cycle
-        self._get_efforts = get_efforts
+        self.controller = controller
         self._hand_over = hand_over
         if safety.state is State.DISABLED:
-            safety.meet(self._now())
+            safety.probe(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
         self._drive = OFF  # last decided
@@ -170,11 +199,11 @@ class ControlLoop:
         # While another sender commands the motors, receiving comes first.
         latest = due if self.bus.is_contested else due + EFFORT_WAIT * (self.period - self._work)
         try:
-            efforts = self._get_efforts(latest)
+            efforts = self.controller.efforts(latest)
         except Exception as error:
             reason = f"efforts cannot be received: {type(error).__name__}: {error}"
             self.safety.trip(FaultCode.INTERNAL_ERROR, reason, self._now())
-            efforts = NO_COMMAND
+            efforts = NO_EFFORTS
         while not self._calls.empty():  # only this thread takes from it
             function, future = self._calls.get()
             if not future.set_running_or_notify_cancel():
@@ -204,7 +233,7 @@ class ControlLoop:
         self.cycles += 1
         self.incomplete += not complete
         try:
-            self._on_cycle(self._now(), self.bus.samples)
+            self.controller.take(self._now(), self.bus.samples)
         except Exception as error:
             self.cycle_errors += 1
             self.cycle_error = f"{type(error).__name__}: {error}"
@@ -252,7 +281,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             faded += period
         supply.step(period, joints, silent)
         unsure = tuple(map(operator.or_, silent, supply.unsure))
-        lowered = Drive(effort, (DAMPING,) * len(effort), True, unsure=unsure)
+        lowered = Drive(effort, (DAMPING,) * len(effort), True, (False,) * len(effort), unsure)
         with contextlib.suppress(Exception):
             bus.exchange(OFF if is_down else lowered, time + period)
         clock.sleep(max(0.0, time + period - clock.monotonic()))

@@ -1,7 +1,7 @@
 """The simulated device: a MuJoCo arm, four AK motors that exchange real CAN frames, a trunk IMU and a virtual wearer.
 
 It knows nothing of the compensator: CAN frames and IMU samples are the only connection. `SimulatedDevice.run` plays it
-in real time on any python-can bus; examples/simulated_loop.py plays it without a bus, as fast as possible.
+in real time on any python-can bus. `virtual_arm.VirtualArm` carries it in virtual time, with the loop of a real arm.
 
 The names are imported when they are used: `sim.script` is read by trials and reports of real arms too, on computers
 without MuJoCo.

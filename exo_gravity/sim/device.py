@@ -20,8 +20,9 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
+from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.hardware.can.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
 from exo_gravity.sim.motor import SimulatedMotor
 from exo_gravity.sim.script import IDLE
@@ -32,7 +33,6 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
-TURN = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 
 
 class SimulatedDevice:
@@ -247,13 +247,12 @@ def _next(buses: list[can.BusABC], timeout: float) -> tuple[can.BusABC, float]:
     try:
         ready = select.select(buses, (), (), timeout)[0]
     except (OSError, ValueError, NotImplementedError):  # one has no socket
-        return buses[0], min(timeout, TURN)
+        return buses[0], min(timeout, POLL_TIME)
     return (ready or buses)[0], 0.0
 
 
 def _send(bus: can.BusABC, frame: Frame) -> None:
-    frame_id, data = frame
     try:
-        bus.send(can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED))
+        bus.send(message_of(frame))
     except can.CanError as error:
         raise BusError(f"sending on {bus.channel_info} failed: {error}") from error

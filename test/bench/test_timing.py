@@ -30,7 +30,7 @@ def true_angles(k: int) -> tuple[float, ...]:
 
 def measured_angle(angle: float, motor: JointMotor) -> float:
     """Return `angle` rounded to the position code of a reply."""
-    return motor.joint_reply(pack_reply(motor.spec, motor.can_id, angle, 0.0, 0.0, 30, 0)).position
+    return motor.sample(pack_reply(motor.spec, motor.can_id, angle, 0.0, 0.0, 30, 0), 0.0).position
 
 
 def loop_frames(

@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, MotorLoad
-from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.gate import SwitchOnCheck
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample
 
 from ..support.safety_run import LIMITS, PERIOD
+from ..support.simulated_device import drive_of
 
 PEAK = (9.0, 18.0, 9.0, 9.0)
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
@@ -120,7 +120,7 @@ def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
 def test_a_silent_motor_applies_what_it_last_replied_to():
     replies = Replies()
     replies.take(EFFORT)
-    later = Drive((0.0,) * 4, (5.0,) * 4, True)
+    later = drive_of((0.0,) * 4, (5.0,) * 4)
     effort, damping = replies.monitor.applied(later, (False, True, False, False))
     assert effort == (0.0, EFFORT[1], 0.0, 0.0)
     assert damping == (5.0, 0.0, 5.0, 5.0)

@@ -11,10 +11,11 @@ import pytest
 
 from bench.motion_monitor import HANGING, bounded, caught, flipped, misread, quiet, settings_of, sound
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.safety.drive import NOTHING, FaultCode
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 
 ROBOT = settings_of().robot
@@ -31,7 +32,7 @@ def torque_of(theta: Sequence[float], load: float = 1.0) -> tuple[float, ...]:
     return tuple(load * gravity_torque(ROBOT, theta))
 
 
-def judge(torque: Sequence[float], theta: Sequence[float] = RAISED, addition: Sequence[float] = NOTHING) -> float:
+def judge(torque: Sequence[float], theta: Sequence[float] = RAISED, addition: Sequence[float] = NO_TORQUE) -> float:
     """Return the time in s until the monitor finds a fault in a constant torque; infinity if it finds none."""
     monitor = MotionMonitor(replace(LIMITS, largest_addition=addition))
     for cycle in range(500):

@@ -134,7 +134,7 @@ def test_a_reply_survives_a_round_trip_and_is_a_reply(motor, shares, temperature
         assert abs(value - wanted) <= ((0.5 + 1e-6) * bounds(spec, field)[2] if wire_format is MIT else 0.02)
     assert wire_format.classify(wire_format.reply_id(can_id), data, frozenset((can_id,))) == (REPLY, can_id)
     turned = wire_format.pack_reply(spec, sent._replace(position=motor.motor_position(angle)))
-    assert motor.joint_reply(turned).position == pytest.approx(angle, abs=0.001)
+    assert motor.sample(turned, 0.0).position == pytest.approx(angle, abs=0.001)
 
 
 @seeded
@@ -149,7 +149,7 @@ def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(mo
     assert (reply.temperature is None) == (reply.error is None) == (len(data) == 6)
     if is_mit:
         assert_within(motor.spec, OF_REPLY, reply[1:4])
-    assert all(map(math.isfinite, motor.joint_reply(data)[1:4]))
+    assert all(map(math.isfinite, motor.sample(data, 0.0)[:3]))
 
 
 @seeded
@@ -198,8 +198,8 @@ def test_a_reversed_motor_has_reversed_angle_and_torque():
     motor = JointMotor(AK60, 1, direction=-1, zero=0.5, torque_scale=0.75)
     commanded = unpack_command(AK60, motor.command(1.5, 0.0)).torque
     assert commanded == pytest.approx(-2.0, abs=0.004)
-    reply = motor.joint_reply(pack_reply(AK60, 1, 0.2, 1.0, commanded))
-    assert reply[1:4] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
+    reply = motor.sample(pack_reply(AK60, 1, 0.2, 1.0, commanded), 0.0)
+    assert reply[:3] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
 
 
 @SPECS

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from exo_gravity.core.safety.limits import UNKNOWN
+from exo_gravity.core.motors.joint_motor import UNKNOWN
 from exo_gravity.core.safety.monitors import Readings
 
 from ..support.safety_run import LIMITS, reading

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.safety.descent import DESCENT
-from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Fault, FaultCode, State
+from exo_gravity.core.safety.drive import CARRYING, OFF, Fault, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING, GUIDE, MAX_EFFORT_RATE
 from exo_gravity.core.safety.monitors import RIDE
 
@@ -294,7 +295,7 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
     run.damped = False
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
-    assert run.drive.damping == NOTHING
+    assert run.drive.damping == NO_TORQUE
     largest = np.abs(np.diff(steps, axis=0)).max()
     assert largest <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE

@@ -12,10 +12,12 @@ import time
 from pathlib import Path
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.drive import Drive
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+
+from ..support.simulated_device import drive_of
 
 
 def log(text: str) -> None:
@@ -43,4 +45,4 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
 
 if __name__ == "__main__":
     arm, effort = pickle.loads(Path(sys.argv[1]).read_bytes())
-    main(arm, Drive(effort, NOTHING, True))
+    main(arm, drive_of(effort))

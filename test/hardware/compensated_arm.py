@@ -7,22 +7,20 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensator
+from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import EffortCommand, State
+from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.virtual_arm import VirtualArm
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.simulated_device import joints_of, make_device
-from .virtual_time import Wire
 
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
 CYCLE = 0.004  # s
@@ -47,10 +45,10 @@ class Person(VirtualWearer):
         return self.hand is None and super().idle(elapsed, duration)
 
 
-class CompensatedArm:
+class CompensatedArm(DirectController, VirtualArm):
     """The arm of a 75 kg wearer, carried in `pose`; settings: what differs from exact Zero-G.
 
-    top_speed: rad/s, the largest true speed of a joint since the arm was raised. efforts: (n, 4) Nm, what the motors
+    top_speed: rad/s, the largest true speed of a joint since the arm was raised. torques: (n, 4) Nm, what the motors
     applied since then. is_damped: whether the bridge damps while the load changes.
     """
 
@@ -61,66 +59,41 @@ class CompensatedArm:
         formats: Sequence[WireFormat] = (MIT,) * JOINT_COUNT,
         friction: float = 0.1,
         has_wearer: bool = True,
-        cycle: float = CYCLE,
         **settings: Any,
     ) -> None:
         mass, cog = WEARER
-        worn = {"wearer_mass": mass, "wearer_cog": cog} if has_wearer else {}
-        self.settings = Settings(
-            **{
-                "side": "right",
-                "robot": DEFAULT_LINKS,
-                "mode": "zero_g",
-                "wearer_mass": mass,
-                "wearer_cog": cog,
-                "max_effort": limit,
-                "use_imu": False,
-                **settings,
-            }
-        )
+        worn = {"wearer_mass": mass, "wearer_cog": cog}
+        given = {"mode": "zero_g", "max_effort": limit, "use_imu": False, **worn, **settings}
+        self.settings = Settings("right", DEFAULT_LINKS, **given)
         self.is_damped = True
-        self.compensator = Compensator(self.settings, JOINTS)
-        self.answer = Compensation.withdrawn("")
-        self.wire = Wire()
-        self.clock = self.wire.clock
-        motors = joints_of(formats)
-        self.device = make_device(config=ArmConfig(coulomb_friction=(friction,) * 4, **worn), formats=formats)
         self.top_speed = 0.0
         self.torques: list[list[float]] = []
-        self.wire.play(self.device, self._look)
-        low, high = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
-        limits = Limits(JOINTS, low, high, (5.0, 5.0, 5.0, 6.0), limit, sign_check_torque=0.0)
-        bus = MotorBus(self.wire.open(), motors, reopen=self.wire.open, clock=self.clock)
-        self.safety = SafetyMachine(limits, cycle, motors)
-        self.loop = ControlLoop(bus, self.safety, cycle, get_efforts=self._get_efforts)
+        limits = Limits(JOINTS, max_effort=limit, sign_check_torque=0.0)
+        config = ArmConfig(coulomb_friction=(friction,) * JOINT_COUNT, **(worn if has_wearer else {}))
+        device = make_device(config=config, formats=formats)
+        DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
+        VirtualArm.__init__(self, device, self, joints_of(formats), limits, 1.0 / CYCLE, look=self._look)
         self.person = Person(pose)
-        self.device.start(self.person, START)
-        self.safety.enable(self.clock.monotonic())
+        device.start(self.person, START)
+        self.enable()
         self.run(START + MOVE + 0.5)
         assert self.safety.state is State.ACTIVE, (self.safety.fault, self.safety.waiting_for)
         self.top_speed = 0.0
         self.torques.clear()
 
-    def _look(self) -> None:
-        self.top_speed = max(self.top_speed, *map(abs, self.device.arm.velocities))
+    def efforts(self, latest: float) -> Efforts:
+        """Return the compensator's newest efforts."""
+        efforts = super().efforts(latest)
+        return efforts if self.is_damped else efforts._replace(damped=False)
 
-    def _get_efforts(self, _latest: float) -> EffortCommand:
-        samples = self.loop.samples
-        theta, velocity = [s.position for s in samples], [s.velocity for s in samples]
-        self.answer = self.compensator.step(self.clock.monotonic(), theta, velocity)
-        damped = self.answer.damped and self.is_damped
-        return EffortCommand(self.answer.effort, min(s.time for s in samples), damped)
+    def _look(self) -> None:
+        arm = self.device.arm
+        position, velocity = arm.positions, arm.velocities
+        self.top_speed = max(self.top_speed, *map(abs, velocity))
+        joints = zip(self.device.motors, position, velocity, strict=True)
+        self.torques.append([motor.torque(angle, speed) for motor, angle, speed in joints])
 
     def change(self, **settings: Any) -> None:
         """Change the compensator's settings live."""
         self.settings = replace(self.settings, **settings)
         self.compensator.apply(self.settings)
-
-    def run(self, duration: float) -> None:
-        """Let `duration` s pass."""
-        end = self.clock.monotonic() + duration
-        while self.clock.monotonic() < end:
-            self.loop.cycle()
-            arm = self.device.arm
-            torque = [m.torque(p, v) for m, p, v in zip(self.device.motors, arm.positions, arm.velocities, strict=True)]
-            self.torques.append(torque)

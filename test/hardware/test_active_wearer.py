@@ -7,7 +7,7 @@ import pytest
 from exo_gravity.core.arm.gravity import gravity_torque
 
 from ..support.active_wearer import attach, hold_still, lift, push, reach, shake, throw
-from .virtual_rig import POSE, VirtualRig
+from .rig import POSE, VirtualRig
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import (
@@ -22,14 +22,16 @@ from exo_gravity.hardware.ownership.bus_lock import (
     notes_file,
 )
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, take_over
+from exo_gravity.sim.virtual_time import VirtualClock
 
-from .simulated_rig import MOTORS_OF_ARM, NoWatchdog
-from .virtual_rig import VirtualRig
-from .virtual_time import Responder, VirtualClock
+from ..support.simulated_device import drive_of
+from .rig import MOTORS_OF_ARM, VirtualRig
+from .simulated_rig import NoWatchdog
+from .wires import Responder
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
-DRIVE = Drive((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0), True)
+DRIVE = drive_of((0.0, 3.0, 1.0, 0.5), (0.0, 5.0, 0.0, 0.0))
 ENDED = "the last can_bridge on this bus and its watchdog ended with the motors on: letting the arm down"
 FIRST = f"/right/can_bridge (PID {os.getpid()})"
 # Prints why a process of another session, with other folders, may not have the bus.
@@ -92,7 +94,7 @@ def test_a_bus_is_asked_for_only_while_someone_waits_for_it(asks):
 
 def test_a_refused_owner_leaves_the_notes_unchanged():
     lock = lock_of("first")
-    lock.notes.note(DRIVE)
+    lock.notes.note(DRIVE, True)
     with pytest.raises(BusError):
         lock_of("second")
     assert (lock.notes.drive, lock.notes.owner) == (DRIVE, "first")
@@ -103,11 +105,11 @@ def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     lock = lock_of("first")
     assert lock.notes.drive == OFF and not lock.problem
     assert stat.S_IMODE(notes_file(CAN0).stat().st_mode) == 0o666  # the next owner may be another user
-    lock.notes.note(DRIVE)
+    lock.notes.note(DRIVE, True)
     lock.release()
     lock = lock_of("second")
     assert lock.notes.drive == DRIVE
-    lock.notes.note(OFF)
+    lock.notes.note(OFF, False)
     lock.release()
     assert not list(lock_folder.iterdir())
 
@@ -227,5 +229,5 @@ def test_a_watchdog_stays_with_an_arm_that_the_next_owner_cannot_reach(monkeypat
 def leave_on(rig: VirtualRig) -> None:
     """Note that the arm of `rig` is carried, and release its bus."""
     lock = BusLock(rig.arm.address, "/right/can_bridge (PID 1)")
-    lock.notes.note(rig.drive)
+    lock.notes.note(rig.drive, True)
     lock.release()

@@ -5,17 +5,17 @@ from __future__ import annotations
 import can
 import pytest
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import EXIT
-from exo_gravity.core.safety.drive import NOTHING, State
+from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop
+from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop, NoController
 
 from ..support.simulated_device import frame
-from .simulated_rig import LIMITS, MOTORS_OF_ARM
-from .virtual_rig import CYCLE, Carried, VirtualRig
-from .virtual_time import Responder
+from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig
+from .wires import Responder
 
 OPPOSED_SPEED = 0.5  # rad/s, of 6 unopposed
 
@@ -24,22 +24,16 @@ def fail(*_: object) -> None:
     raise ZeroDivisionError("division by zero")
 
 
-def loop_of(rig: VirtualRig) -> ControlLoop:
-    """Return a loop of an arm whose motors are off."""
-    bus = MotorBus(rig.wire.open(), MOTORS_OF_ARM, clock=rig.clock)
-    return ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
-
-
 def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
-    arm = Carried()
+    arm = CarriedArm()
     assert arm.loop.stop()
     arm.rig.assert_let_down()
-    assert not arm.drives[-1].powered
+    assert not arm.drives[-1][1]
     assert not arm.loop.cycle()
 
 
 def test_an_arm_is_let_down_after_its_computer_was_suspended():
-    arm = Carried()
+    arm = CarriedArm()
     arm.clock.slept += 0.9  # less may be a thread that was not run
     arm.run(0.1)
     assert arm.safety.state is State.ACTIVE
@@ -51,7 +45,7 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
 
 @pytest.mark.parametrize("error", [ValueError("garbled line"), OSError("no device")])
 def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
-    arm = Carried()
+    arm = CarriedArm()
     arm.wire.break_down(error)
     arm.run_until(lambda: arm.wire.opened == 2)
     assert arm.safety.fault.code == "bus_error"
@@ -60,35 +54,37 @@ def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_agai
 
 
 def test_a_bus_that_stays_away_is_tried_again_and_the_torque_continues_from_what_the_motors_hold():
-    arm = Carried()
-    held = arm.drives[-1].effort[1]
+    arm = CarriedArm()
+    held = arm.drives[-1][0].effort[1]
     arm.wire.refusal = BusError("no such device")
     arm.wire.break_down(OSError("no such device"))
     arm.run_until(lambda: arm.safety.is_unreached)
     arm.run(1.0)
     assert arm.rig.motors_on == [True] * 4
     assert not arm.loop.is_off
-    assert arm.drives[-1].powered
+    assert arm.drives[-1][1]
     count = len(arm.drives)
     arm.wire.refusal = None
     arm.run_until(lambda: arm.wire.opened == 2)
     arm.run_until(lambda: len(arm.drives) > count + 10)
-    first = [drive.effort[1] for drive in arm.drives[count:]]
+    first = [drive.effort[1] for drive, _ in arm.drives[count:]]
     assert max(abs(effort - held) for effort in first[:5]) < 0.3
     arm.assert_let_down()
 
 
-def test_a_failing_publisher_never_stops_the_control():
-    arm = Carried(on_cycle=fail)
+def test_a_controller_that_fails_at_samples_never_stops_the_control():
+    arm = CarriedArm()
+    arm.controller.failures["take"] = ZeroDivisionError("division by zero")
+    before = arm.loop.cycles
     arm.run(0.2)
-    assert arm.loop.cycle_errors == arm.loop.cycles > 20
+    assert arm.loop.cycle_errors == arm.loop.cycles - before > 20
     assert arm.safety.state is State.ACTIVE
     assert arm.loop.cycle_error == "ZeroDivisionError: division by zero"
 
 
 def test_failing_efforts_let_the_arm_down():
-    arm = Carried()
-    arm.failure_of_efforts = RuntimeError("no middleware")
+    arm = CarriedArm()
+    arm.controller.failures["efforts"] = RuntimeError("no middleware")
     arm.run(2 * CYCLE)
     assert arm.safety.fault.code == "internal_error"
     assert "no middleware" in arm.safety.fault.reason
@@ -98,7 +94,7 @@ def test_failing_efforts_let_the_arm_down():
 
 def test_an_arm_whose_owner_stands_still_is_let_down():
     """Services, the lease and the look at the watchdog are the owner's: without it no one could let the arm down."""
-    arm = Carried()
+    arm = CarriedArm()
     arm.loop.attended = arm.clock.monotonic()
     arm.run(0.9 * LONGEST_ABSENCE)
     arm.loop.attended = arm.clock.monotonic()
@@ -110,7 +106,7 @@ def test_an_arm_whose_owner_stands_still_is_let_down():
 
 
 def test_an_owner_that_waits_until_its_arm_is_down_causes_no_fault():
-    arm = Carried()
+    arm = CarriedArm()
     arm.loop.attended = arm.clock.monotonic()
     arm.safety.disable(arm.clock.monotonic())
     arm.assert_let_down()
@@ -134,18 +130,18 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
     def kill() -> None:
         raise Killed
 
-    arm = Carried(hand_over=hand_over)
+    arm = CarriedArm(hand_over=hand_over)
     arm.safety.step = fail
     with pytest.raises(Killed):
         arm.run(1.0)
     assert all(len(message.data) == 8 and message.data[0] < 5 for message in listeners[0].received)  # replies
     assert arm.rig.motors_on == [True] * 4
-    assert arm.drives[-1].powered
+    assert arm.drives[-1][1]
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
 def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down():
-    arm = Carried()
+    arm = CarriedArm()
     arm.safety.step = fail
     while arm.loop.cycle():
         pass
@@ -153,8 +149,8 @@ def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until
 
 
 def test_a_failing_state_machine_ends_the_loop_of_an_arm_whose_motors_are_off():
-    rig = VirtualRig(pose=NOTHING, carried=False)
-    loop = loop_of(rig)
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
+    loop = rig.loop_with().loop
     loop.safety.step = fail
     assert loop.cycle() and loop.cycle() and not loop.cycle()
     assert isinstance(loop.failure, ZeroDivisionError)
@@ -162,7 +158,7 @@ def test_a_failing_state_machine_ends_the_loop_of_an_arm_whose_motors_are_off():
 
 
 def test_a_call_runs_between_two_cycles_and_a_cancelled_one_never():
-    loop = loop_of(VirtualRig(pose=NOTHING, carried=False))
+    loop = VirtualRig(pose=NO_TORQUE, carried=False).loop_with().loop
     calls: list[str] = []
     assert loop.call(lambda: calls.append("cancelled")).cancel()
     future, failing = loop.call(lambda: "result"), loop.call(fail)
@@ -176,8 +172,8 @@ def test_a_call_runs_between_two_cycles_and_a_cancelled_one_never():
 
 
 def test_a_cycle_that_took_too_long_is_counted_and_not_made_up():
-    rig = VirtualRig(pose=NOTHING, carried=False)
-    loop = loop_of(rig)
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
+    loop = rig.loop_with().loop
     loop.cycle()
     loop.call(lambda: rig.clock.sleep(5.0 * CYCLE))
     loop.cycle()
@@ -189,7 +185,7 @@ def test_a_cycle_that_took_too_long_is_counted_and_not_made_up():
 
 def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     wire = can.Bus(interface="virtual", channel="test_control_loop")
-    loop = ControlLoop(MotorBus(wire, MOTORS_OF_ARM), SafetyMachine(LIMITS, CYCLE), CYCLE)
+    loop = ControlLoop(MotorBus(wire, MOTORS_OF_ARM), SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
     loop.start()
     assert loop.call(lambda: loop.cycles).result(10.0) >= 0
     assert loop.stop(10.0)
@@ -205,8 +201,8 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     ids=["EXIT at 10 Hz", "6 Nm at 500 Hz, echoed"],
 )
 def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: bytes, period: float, echoes: bool):
-    arm = Carried(echoes)
-    assert arm.motors.foreign_commands == 0
+    arm = CarriedArm(echoes)
+    assert arm.bus.foreign_commands == 0
     arm.wire.repeat(frame(2, data), period)
     arm.run_until(lambda: arm.safety.fault)
     assert arm.safety.fault.code == "foreign_command"
@@ -218,16 +214,16 @@ def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: byte
 
 @pytest.mark.parametrize("echoes", [False, True])
 def test_our_own_frames_are_never_foreign(echoes: bool):
-    arm = Carried(echoes)
+    arm = CarriedArm(echoes)
     arm.run(1.0)
-    assert arm.motors.foreign_commands == 0
+    assert arm.bus.foreign_commands == 0
     assert arm.safety.state is State.ACTIVE
-    assert ("echo" in arm.motors.ignored) == echoes
+    assert ("echo" in arm.bus.ignored) == echoes
 
 
 def test_a_foreign_command_refuses_the_start():
-    rig = VirtualRig(pose=NOTHING, carried=False)
-    loop = loop_of(rig)
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
+    loop = rig.loop_with().loop
     assert loop.safety.enable(rig.clock.monotonic())
     rig.wire.repeat(frame(2, EXIT), 0.05)
     for _ in range(20):

@@ -6,7 +6,7 @@ import pytest
 from exo_gravity.core.safety.drive import FaultCode, State
 
 from ..support.active_wearer import attach, lift, reach, shake, throw
-from .virtual_rig import POSE, Carried
+from .rig import POSE, CarriedArm
 
 MOVED = 0.6  # rad/s that the motors may cause
 
@@ -21,7 +21,7 @@ WEARERS = {
 
 @pytest.mark.parametrize("wearer", WEARERS.values(), ids=WEARERS)
 def test_an_arm_that_is_let_down_neither_fights_nor_throws_its_wearer(wearer):
-    carried = Carried()
+    carried = CarriedArm()
     arm, motors, behave = carried.rig.device.arm, carried.rig.device.motors, wearer()
     seen = []  # whether a hand was on the arm, its velocities, and the motors' torques
 
@@ -39,13 +39,13 @@ def test_an_arm_that_is_let_down_neither_fights_nor_throws_its_wearer(wearer):
     speed = np.abs(velocity[free:])
     driven = (speed - np.minimum.accumulate(speed))[torque[free:] * velocity[free:] > 0.0]
     assert driven.max(initial=0.0) < MOVED
-    most = [max(abs(drive.effort[joint]) for drive in carried.drives) for joint in range(4)]
+    most = [max(abs(drive.effort[joint]) for drive, _ in carried.drives) for joint in range(4)]
     assert all(np.array(most) <= np.maximum(carried.safety.limits.max_effort, np.abs(carried.rig.carrying)))
     assert arm.positions[1] < POSE[1] + 1.0
 
 
 def test_the_arm_comes_down_after_the_wearer_let_go():
-    carried = Carried()
+    carried = CarriedArm()
     carried.safety.trip(FaultCode.COMMAND_STALE, "for this test", carried.clock.monotonic())
     attach(carried.rig.device, lift(1, 0.5, 1.0), 0.1)
     carried.run_until(lambda: carried.loop.is_off)

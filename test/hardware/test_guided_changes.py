@@ -14,8 +14,9 @@ from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import GUIDE
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.virtual_time import TICK
 
-from .compensated_arm import CYCLE, PEAK, CompensatedArm
+from .compensated_arm import PEAK, CompensatedArm
 
 SAFE_SPEED = 0.6  # rad/s
 CODE = 0.009  # Nm, of a torque of the AK80-9 on the wire
@@ -99,7 +100,7 @@ def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_els
     arm.change(**ONE_G)
     arm.run(4.5)
     assert arm.answer.remainder == ()
-    of_tenth = np.array(arm.torques)[:: round(0.1 / CYCLE)]
+    of_tenth = np.array(arm.torques)[:: round(0.1 / TICK)]
     assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * GUIDANCE.max_rate + 2 * CODE
     assert arm.top_speed < 0.1
 

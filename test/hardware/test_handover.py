@@ -5,15 +5,16 @@ from dataclasses import replace
 
 import pytest
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, MotorCommand, unpack_command
-from exo_gravity.core.safety.drive import NOTHING, Drive
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from exo_gravity.hardware.can.can_port import ArmOnBus
 
-from .simulated_rig import LIMITS, MOTORS_OF_ARM, PERIOD
-from .virtual_rig import VirtualRig
-from .virtual_time import Responder
+from ..support.simulated_device import drive_of
+from .rig import LIMITS, MOTORS_OF_ARM, VirtualRig
+from .simulated_rig import PERIOD
+from .wires import Responder
 
 
 def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
@@ -39,14 +40,14 @@ def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_o
 def test_the_noted_damping_is_kept():
     rig = VirtualRig()
     listener = Responder(rig.wire)
-    assert rig.let_down(Drive(rig.carrying, (5.0,) * 4, True))
+    assert rig.let_down(drive_of(rig.carrying, (5.0,) * 4))
     assert min(command.kd for command in commands(listener, 2)[:50]) == pytest.approx(5.0, abs=0.01)
 
 
 def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
-    rig = VirtualRig(pose=NOTHING, carried=False)
-    assert rig.let_down(Drive((0.0, 6.0, 2.0, 1.0), NOTHING, True))
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
+    assert rig.let_down(drive_of((0.0, 6.0, 2.0, 1.0)))
     assert rig.top_speed < 0.01
     assert rig.motors_on == [False] * 4
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.ordinary.drivers import DURATION, Timing, even, ordinary_drivers, true_stamps
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
-from ..support.imu_drivers import DURATION, Timing, driven, even, ordinary_drivers, swaying_trunk, true_stamps
+from ..support.imu_drivers import driven, swaying_trunk
 from ..support.imu_faults import bowing_trunk, follow, sampled
 
 DRIVERS = ordinary_drivers()

@@ -13,22 +13,22 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, State
+from exo_gravity.core.safety.drive import OFF, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
+from exo_gravity.sim.virtual_time import Wire
 
-from ..support.simulated_device import joints_of, make_device
-from .simulated_rig import LIMITS
+from ..support.simulated_device import drive_of, joints_of, make_device
+from .rig import CYCLE, LIMITS
 from .test_motor_bus import WEIGHTLESS, now
-from .virtual_rig import CYCLE
-from .virtual_time import Wire, wire_for_test
+from .wires import wire_for_test
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 V3 = (MIT_V3,) * 4
-ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
+ON = drive_of((0.0, 0.5, 0.4, 0.0))
 
 
 @pytest.fixture
@@ -185,7 +185,7 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
 def test_another_host_that_drives_motors_which_are_off_is_a_fault_until_it_stops(wire, other, start, formats) -> None:
     device, joint = start(formats), joints_of(formats)[1]
     bus = motor_bus(wire, formats)
-    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
+    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
 
     def run(seconds: float) -> None:
         end = now(bus) + seconds

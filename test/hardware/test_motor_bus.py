@@ -9,24 +9,26 @@ import pytest
 from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import frame
-from .virtual_time import VirtualBus, Wire, wire_for_test
+from ..support.simulated_device import drive_of, frame
+from .wires import wire_for_test
 
 AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
 MOTORS_OF_ARM = tuple(JointMotor(MOTORS[name], n, *mounted) for n, (name, *mounted) in enumerate(MOUNTED, 1))
 LINKS = ArmConfig().links
 WEIGHTLESS = ArmModel(LINKS.length, LINKS.cog, LINKS.mass, gravity=0.0)  # stays in place, however slow the machine is
-ON = Drive(NOTHING, NOTHING, True)
+ON = drive_of(NO_TORQUE)
 
 
 @pytest.fixture
@@ -76,7 +78,7 @@ def test_an_exchange_moves_the_simulated_arm(bus, device):
     before = device.arm.positions[3]
     end = now(bus) + 5.0
     while device.arm.positions[3] < before + 0.2 and now(bus) < end:
-        bus.exchange(Drive((0.0, 0.0, 0.0, 2.0), NOTHING, True), now(bus) + 1.0)
+        bus.exchange(drive_of((0.0, 0.0, 0.0, 2.0)), now(bus) + 1.0)
     assert device.arm.positions[3] > before + 0.2
 
 

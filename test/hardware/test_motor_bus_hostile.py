@@ -14,15 +14,18 @@ from collections import Counter
 import can
 import pytest
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.virtual_time import Wire
 
 from .test_motor_bus import MOTORS_OF_ARM as JOINTS
 from .test_motor_bus import WEIGHTLESS
-from .virtual_time import Responder, Wire, message_of
+from .wires import Responder
 
 IDS = {joint.can_id for joint in JOINTS}
 MASTER = 0
@@ -137,6 +140,6 @@ def test_a_forged_reply_with_random_values_is_nearly_always_a_fault(length, most
     before = [JointSample(angle, 0.0, 0.0, 30, 0, 1.0) for angle in POSE]
     for _ in range(count):
         joint = rng.randrange(4)
-        _, *reading = JOINTS[joint].joint_reply(bytes((joint + 1,)) + rng.randbytes(length - 1))
-        unseen += LIMITS.find_fault(joint, JointSample(*reading, 1.004), before[joint], 1.0) is None
+        sample = JOINTS[joint].sample(bytes((joint + 1,)) + rng.randbytes(length - 1), 1.004)
+        unseen += LIMITS.find_fault(joint, sample, before[joint], 1.0) is None
     assert unseen / count <= most

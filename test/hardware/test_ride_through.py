@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from exo_gravity.core.arm.gravity import gravity_torque
-from exo_gravity.core.safety.drive import NO_COMMAND, EffortCommand, FaultCode, State
+from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
 from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript
@@ -22,13 +22,13 @@ STEP = 0.35  # Nm within 2 ms: a frame may change the torque by 0.2, and the han
 class RidingArm(CompensatedArm):
     """An arm that the loop carries in `pose`; `gap` makes its efforts late.
 
-    records: of each step of the device since the start: angle, speed and Nm of the motors, (4,) each.
+    positions: rad, (4,) at each step of the device, with the `torques`.
     """
 
     def __init__(self, pose: Sequence[float] = RAISED, wearer: bool = False) -> None:
         self.is_late = self.is_withdrawn = self.is_held = False
-        self.records: list[tuple[list[float], ...]] = []
-        self._command = NO_COMMAND
+        self.positions: list[list[float]] = []
+        self._last = NO_EFFORTS
         self.links = DEFAULT_LINKS.with_wearer(*WEARER) if wearer else DEFAULT_LINKS
         super().__init__(pose, has_wearer=wearer, mode="zero_g" if wearer else "one_g")
         self.run(1.0)
@@ -37,44 +37,37 @@ class RidingArm(CompensatedArm):
     def forget(self) -> None:
         """Forget what was seen."""
         self.top_speed = 0.0
-        self.records.clear()
+        self.positions.clear()
+        self.torques.clear()
 
     def move(self, pose: Sequence[float], duration: float) -> None:
         """Let the wearer's hand move the arm."""
         steps = [{"move": list(pose), "over": duration}]
         self.device.start(VirtualWearer(TrialScript.parse({"name": "move", "steps": steps})))
 
-    def run_while(self, state: State) -> None:
-        while self.safety.state is state:
-            self.loop.cycle()
-
     def gap(self, duration: float) -> None:
         self.is_late = True
         self.run(duration)
         self.is_late = False
 
-    def _get_efforts(self, latest: float) -> EffortCommand:
+    def efforts(self, latest: float) -> Efforts:
         if not self.is_late:
-            self._command = super()._get_efforts(latest)._replace(held=self.is_held)
-        return self._command._replace(effort=None) if self.is_withdrawn else self._command
+            self._last = super().efforts(latest)._replace(held=self.is_held)
+        return self._last._replace(effort=None) if self.is_withdrawn else self._last
 
     def _look(self) -> None:
         super()._look()
-        arm = self.device.arm
-        position, velocity = arm.positions, arm.velocities
-        joints = zip(self.device.motors, position, velocity, strict=True)
-        self.records.append((position, velocity, [motor.torque(angle, speed) for motor, angle, speed in joints]))
+        self.positions.append(self.device.arm.positions)
 
     @property
     def largest_step(self) -> float:
         """Nm of a motor between two looks, 2 ms."""
-        return float(np.abs(np.diff([torque for *_, torque in self.records], axis=0)).max())
+        return float(np.abs(np.diff(self.torques, axis=0)).max())
 
     @property
     def felt(self) -> float:
         """The largest torque beyond what gravity takes, in Nm."""
-        positions, _, torques = map(np.array, zip(*self.records, strict=True))
-        return float(np.abs(torques - gravity_torque(self.links, positions)).max())
+        return float(np.abs(self.torques - gravity_torque(self.links, np.array(self.positions))).max())
 
 
 def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down():
@@ -122,7 +115,7 @@ def test_a_bus_that_is_silent_for_a_moment_lets_the_arm_down_and_one_press_carri
     arm.device.bus_silent = False
     arm.run(0.1)
     assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.MOTOR_SILENT)
-    arm.run_while(State.LETTING_DOWN)
+    assert arm.run_until(lambda: arm.safety.state is not State.LETTING_DOWN)
     assert arm.top_speed < SPEED
     arm.forget()
     assert arm.safety.resume(arm.clock.monotonic()), arm.safety.why_not_resumed

@@ -15,13 +15,13 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import MotorReply
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
-from ..support.simulated_device import joints_of, make_device
+from ..support.simulated_device import drive_of, joints_of, make_device
 from ..support.waiting import pause, wait_until
 from .test_motor_bus import WEIGHTLESS
 
@@ -29,7 +29,7 @@ MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 OPTIONS = {"bitrate": 1_000_000, "sleep_after_open": 0.01, "timeout": 0.0002}
 POSE = (0.1, 0.2, 0.3, 0.4)
 FIRST_FRAMES = 6  # to motors that are off: EXIT for each, and a command for those that reply to one
-ON = Drive((0.0, 0.5, 0.4, 0.0), NOTHING, True)
+ON = drive_of((0.0, 0.5, 0.4, 0.0))
 CHANNELS = itertools.count()
 
 

@@ -7,14 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, Drive, State
-from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.core.safety.drive import Drive, State
 
-from .simulated_rig import LIMITS, SAFE_SPEED
-from .virtual_rig import CYCLE, QUICK, Carried, VirtualRig
+from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig
 
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
 CAUSED_SPEED = 0.6  # rad/s that motors may cause
@@ -32,7 +29,7 @@ class OnWatch:
         self.was_on |= any(self._rig.motors_on)
 
 
-def carried_again(arm: Carried) -> None:
+def carried_again(arm: CarriedArm) -> None:
     """Clear the fault, enable the hanging arm, and expect that it is carried."""
     assert arm.safety.clear(arm.clock.monotonic()) or arm.safety.state is State.DISABLED
     assert arm.safety.enable(arm.clock.monotonic())
@@ -44,7 +41,7 @@ def carried_again(arm: Carried) -> None:
 def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     wire_format: WireFormat, duration: float, clears: bool
 ) -> None:
-    arm = Carried(wire_format=wire_format)
+    arm = CarriedArm(wire_format=wire_format)
     arm.rig.switch_supply(False)
     arm.run(duration)
     assert arm.safety.fault.code == "motor_silent"
@@ -59,7 +56,7 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     assert arm.rig.top_speed < 0.05
     assert arm.loop.is_off
     watch.end()
-    arm.rig.device.arm.reset(NOTHING)
+    arm.rig.device.arm.reset(NO_TORQUE)
     arm.run(0.6)
     carried_again(arm)
 
@@ -67,8 +64,8 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
 @FORMATS
 @pytest.mark.parametrize(("first", "others"), [(3.0, 9.0), (7.4, 7.6)])
 def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat, first: float, others: float) -> None:
-    """The way down is over before the last motor returns: that must not settle what the first one applies."""
-    arm = Carried(wire_format=wire_format)
+    """The way down is over before the last motor returns: that must not decide what the first one applies."""
+    arm = CarriedArm(wire_format=wire_format)
     arm.rig.switch_supply(False)
     arm.run(0.5)
     watch = OnWatch(arm.rig)
@@ -81,7 +78,7 @@ def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat
 
 @FORMATS
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
-    arm = Carried(wire_format=wire_format)
+    arm = CarriedArm(wire_format=wire_format)
     arm.rig.device.bus_silent = True
     arm.run(8.0)
     assert arm.safety.state is State.FAULT and arm.safety.is_unreached
@@ -94,7 +91,7 @@ def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_powe
 
 
 def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others() -> None:
-    arm = Carried()
+    arm = CarriedArm()
     motor = arm.rig.device.motors[2]
     motor.unplugged = True
     arm.run(0.1)
@@ -111,7 +108,7 @@ def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
     wire_format: WireFormat, away: float
 ) -> None:
     """A command switches a V3 board on: while it does not reply, none is sent that would carry its joint."""
-    arm = Carried(wire_format=wire_format)
+    arm = CarriedArm(wire_format=wire_format)
     motor, device_arm = arm.rig.device.motors[1], arm.rig.device.arm
     motor.unplugged = True
     arm.run(away)
@@ -142,7 +139,7 @@ def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFo
 
 
 def test_the_last_resort_leaves_motors_off_whose_supply_returns() -> None:
-    arm = Carried()
+    arm = CarriedArm()
 
     def fail(*_: object) -> Drive:
         raise ZeroDivisionError
@@ -162,20 +159,17 @@ def test_the_last_resort_leaves_motors_off_whose_supply_returns() -> None:
 
 
 @pytest.mark.parametrize(("wire_format", "silent_for"), [(MIT, 0.0), (MIT_V3, 3.0)], ids=["at once", "reached late"])
-def test_motors_that_an_owner_without_notes_left_on_are_met_with_damping_and_let_down(
+def test_motors_that_an_owner_without_notes_left_on_are_damped_and_let_down(
     wire_format: WireFormat, silent_for: float
 ) -> None:
     rig = VirtualRig(wire_format=wire_format)
     rig.device.bus_silent = silent_for > 0.0
     rig.clock.later(silent_for, lambda: setattr(rig.device, "bus_silent", False))
-    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
-    bus.listen()
-    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
-    loop.safety.enable(rig.clock.monotonic())  # refused: the arm does not hang
-    end = rig.clock.monotonic() + silent_for + 30.0
-    while rig.clock.monotonic() < end and (rig.clock.monotonic() < end - 29.0 or not loop.is_off):
-        loop.cycle()
-    assert loop.is_off
+    arm = rig.loop_with()
+    arm.bus.listen()
+    arm.enable()  # refused: the arm does not hang
+    arm.run(silent_for + 1.0)
+    assert arm.run_until(lambda: arm.loop.is_off, 29.0)
     assert rig.motors_on == [False] * 4
     rig.clock.sleep(0.5)
     assert rig.top_speed < CAUSED_SPEED  # 5.3 rad/s where the first frame is zero torque
@@ -184,10 +178,9 @@ def test_motors_that_an_owner_without_notes_left_on_are_met_with_damping_and_let
 @FORMATS
 @pytest.mark.parametrize("is_on", [False, True])
 def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(wire_format: WireFormat, is_on: bool) -> None:
-    rig = VirtualRig(pose=NOTHING, carried=is_on, wire_format=wire_format)
+    rig = VirtualRig(pose=NO_TORQUE, carried=is_on, wire_format=wire_format)
     rig.device.bus_silent = True
-    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
-    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE)
+    loop = rig.loop_with().loop
     loop.cycle()
     rig.device.bus_silent = False
     loop.stop()
@@ -196,24 +189,19 @@ def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(wire_format: WireF
 
 @pytest.mark.parametrize("spoil", [lambda rig: rig.switch_supply(False), lambda rig: None], ids=["supply", "efforts"])
 def test_an_enable_expires_and_says_what_was_missing(spoil: Callable[[VirtualRig], None]) -> None:
-    rig = VirtualRig(pose=NOTHING, carried=False)
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
     spoil(rig)
-    bus = MotorBus(rig.wire.open(), rig.motors, clock=rig.clock)
-    loop = ControlLoop(bus, SafetyMachine(QUICK, CYCLE), CYCLE)
-    loop.safety.enable(rig.clock.monotonic())
-    end = rig.clock.monotonic() + QUICK.enable_timeout
-    while rig.clock.monotonic() < end - 0.1:
-        loop.cycle()
+    arm = rig.loop_with(limits=QUICK)
+    loop = arm.loop
+    arm.enable()
+    arm.run(QUICK.enable_timeout - 0.1)
     assert loop.safety.state is State.CHECKING
-    while rig.clock.monotonic() < end + 0.1:
-        loop.cycle()
+    arm.run(0.2)
     assert loop.safety.state is State.DISABLED and not loop.safety.fault
     missing = "no reply for more than 50 ms" if math.isnan(loop.samples[0].position) else "effort commands"
     assert loop.safety.refusal.startswith("not enabled within 10 s: waited for") and missing in loop.safety.refusal
     rig.switch_supply(True)
     watch = OnWatch(rig)
-    end = rig.clock.monotonic() + 3.0
-    while rig.clock.monotonic() < end:
-        loop.cycle()
+    arm.run(3.0)
     assert not watch.was_on
     assert loop.safety.enable(rig.clock.monotonic()) and not loop.safety.refusal

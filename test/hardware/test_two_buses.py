@@ -5,29 +5,30 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import can
 import pytest
 
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive, FaultCode, State
+from exo_gravity.core.safety.drive import OFF, FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
-from exo_gravity.hardware.can.can_port import Address, ArmOnBus
+from exo_gravity.hardware.can.can_port import Address, ArmOnBus, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, DriveNotes, notes_file
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down
+from exo_gravity.sim.virtual_time import TICK, Played, VirtualBus, Wire
 
-from .simulated_rig import LIMITS, SAFE_SPEED
+from ..support.simulated_device import drive_of
+from .rig import CYCLE, LIMITS, SAFE_SPEED, ArmOnWires, CarriedArm, VirtualRig
 from .test_watchdog_decisions import LET_DOWN
-from .virtual_rig import CYCLE, Carried, VirtualRig
-from .virtual_time import Played, Responder, VirtualBus, Wire, message_of
+from .wires import Responder
 
 FIRST, SECOND = f"first{os.getpid()}", f"second{os.getpid()}"
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
@@ -39,7 +40,7 @@ class HalfPlayed(Played):
     def __init__(self, wire: Wire, rig: VirtualRig, joints: tuple[int, ...], other: HalfPlayed | None = None) -> None:
         self._joints, self._other = joints, other
         self.strays: list[can.Message] = []
-        super().__init__(wire, rig.device, rig.note_speed)
+        super().__init__(wire, rig.device, rig.note_speed, TICK)
 
     def deliver(self, message: can.Message) -> None:
         if (message.arbitration_id & 0xFF) - 1 in self._joints:
@@ -58,16 +59,6 @@ class HalfPlayed(Played):
             super()._report(joint)
 
 
-@dataclass(frozen=True)
-class TwoBusArm(ArmOnBus):
-    """An arm on two wires in virtual time."""
-
-    wires: dict[str, Wire]
-
-    def open(self, address: Address) -> can.BusABC:
-        return self.wires[address[1]].open()
-
-
 class TwoBusRig(VirtualRig):
     """Motors 1 and 2 are on the first bus, 3 and 4 on the second."""
 
@@ -78,18 +69,18 @@ class TwoBusRig(VirtualRig):
         self.halves = near, HalfPlayed(self.second, self, (2, 3), near)
         address: Address = ("wire", f"{FIRST},{FIRST},{SECOND},{SECOND}", {})
         limits = replace(LIMITS, channels=channels_of(address[1]))
-        self.arm = TwoBusArm(address, self.motors, limits, CYCLE, self.wires)
+        self.arm = ArmOnWires(address, self.motors, limits, CYCLE, self.wires)
 
     @property
     def damping(self) -> list[float]:
         return [motor.damping for motor in self.device.motors]
 
 
-def carried(wire_format: WireFormat = MIT) -> Carried:
-    return Carried(wire_format=wire_format, kind=TwoBusRig)
+def carried(wire_format: WireFormat = MIT) -> CarriedArm:
+    return CarriedArm(wire_format=wire_format, kind=TwoBusRig)
 
 
-def halves(arm: Carried) -> TwoBusRig:
+def halves(arm: CarriedArm) -> TwoBusRig:
     assert isinstance(arm.rig, TwoBusRig)
     return arm.rig
 
@@ -160,7 +151,7 @@ def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_fo
     """The first bus replies to zero commands as motors do that are still on: that confirms no EXIT."""
     rig = TwoBusRig()
     bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, powered=True, clock=rig.clock)
-    bus.exchange(Drive(NOTHING, NOTHING, True), rig.clock.monotonic() + CYCLE)
+    bus.exchange(drive_of(NO_TORQUE), rig.clock.monotonic() + CYCLE)
     rig.second.break_down(can.CanOperationError("Network is down"))
     for _ in range(3):
         with pytest.raises(BusError, match="Network is down"):
@@ -201,7 +192,7 @@ def notes_of(rig: VirtualRig) -> tuple[DriveNotes, DriveNotes]:
     notes = tuple(DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes))) for _ in range(2))
     for page in notes:
         page.clock = rig.clock
-        page.note(rig.drive)
+        page.note(rig.drive, True)
     return notes[0], notes[1]
 
 
@@ -216,7 +207,7 @@ def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
             rig.device.exchange(*frame)
     near, far = notes_of(rig)
     for page in (near, far):
-        page.note(Drive(carrying, NOTHING, True))
+        page.note(drive_of(carrying), True)
     damped: list[float] = []
     rig.clock.later(0.15, lambda: damped.extend(rig.damping))
     on: list[tuple[bool, bool]] = []
@@ -289,7 +280,7 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
 
     monkeypatch.setattr(bus_lock, "BusLock", Noted)
     rig, (first, second) = TwoBusRig(carried=False), order
-    arm = TwoBusArm(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
+    arm = ArmOnWires(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
     ArmLock(arm, "a test", 0.1, rig.clock).release()
     assert taken == [FIRST, SECOND]
 
@@ -299,7 +290,7 @@ def leave_on(rig: TwoBusRig) -> None:
     for part in rig.arm.parts:
         lock = BusLock(part.address, "a dead bridge")
         own = [torque if joint in part.joints else 7.0 for joint, torque in enumerate(rig.carrying)]
-        lock.notes.note(Drive(tuple(own), NOTHING, True))
+        lock.notes.note(drive_of(own), True)
         lock.release()
 
 

@@ -15,10 +15,11 @@ from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence
 from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
+from exo_gravity.sim.virtual_time import VirtualClock
 
 from ..support.launched_nodes import children
-from .virtual_rig import CYCLE, VirtualRig
-from .virtual_time import Responder, VirtualClock
+from .rig import CYCLE, VirtualRig
+from .wires import Responder
 
 LET_DOWN = ["letting the arm down", "the arm is down, its motors are off"]
 
@@ -59,7 +60,7 @@ class Bridge:
         self.log: list[str] = []
         self.inhibited: list[bool] = []
         self.drive = self.rig.drive
-        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive))
+        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive, True))
         self.listener = Responder(self.rig.wire)
 
     def kill(self) -> None:
@@ -108,7 +109,7 @@ def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_brid
     assert asked < bridge.clock.monotonic() < asked + 0.5
     assert bridge.notes.drive.powered
     lock = BusLock(bridge.rig.arm.address, "left behind")
-    lock.notes.note(bridge.notes.drive)
+    lock.notes.note(bridge.notes.drive, bridge.notes.drive.powered)
     lock.release()
     bridge.clock.later(2.0, lambda: setattr(bridge.rig.device, "bus_silent", False))
     OwnedBus(bridge.rig.arm, "the next bridge", bridge.log.append, bridge.clock).close()

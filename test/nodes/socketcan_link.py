@@ -9,14 +9,17 @@ from functools import partial
 import can
 import pytest
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, pack_reply
-from exo_gravity.core.safety.drive import NOTHING, OFF, Drive
+from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
+
+from ..support.simulated_device import drive_of
 
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]
@@ -31,7 +34,7 @@ def set_link(state: str, name: str = "vcan0") -> None:
 def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once_it_is_up():
     ours, other = (open_bus(*VCAN, {}) for _ in range(2))
     bus = MotorBus(ours, [JointMotor(AK60, can_id) for can_id in IDS])
-    bus.exchange(Drive(NOTHING, NOTHING, True), time.monotonic())
+    bus.exchange(drive_of(NO_TORQUE), time.monotonic())
     set_link("down")
     try:
         for _ in range(3):
@@ -72,7 +75,7 @@ def test_one_of_two_links_that_is_down_is_named_and_the_other_gets_its_commands(
     set_link("down", "vcan1")
     try:
         with pytest.raises(BusError, match=r"vcan1.*Network is down"):
-            bus.exchange(Drive(NOTHING, NOTHING, True), time.monotonic())
+            bus.exchange(drive_of(NO_TORQUE), time.monotonic())
     finally:
         set_link("up", "vcan1")
     sent = [bytes(frame.data) for frame in iter(lambda: listeners[0].recv(0.0), None)]

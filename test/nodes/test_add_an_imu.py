@@ -7,8 +7,7 @@ from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.trunk.params import IMU_SOURCES
 from exo_gravity.hardware.imu_sources import SOURCES, ImuSource
 from exo_gravity.nodes.imu import ImuDevice
-
-from ..hardware.virtual_time import VirtualClock
+from exo_gravity.sim.virtual_time import VirtualClock
 
 
 class LevelImu(ImuSource):

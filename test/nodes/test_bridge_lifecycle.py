@@ -10,9 +10,10 @@ import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety import descent
-from exo_gravity.core.safety.drive import NOTHING, EffortCommand, State
+from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.hardware.ownership import owned_bus
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.nodes.can_bridge import node as can_bridge
@@ -32,7 +33,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setattr(owned_bus, "ATTEMPT_TIME", 0.1)
     monkeypatch.setattr(descent, "REST_TIME", 0.2)
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
-    rig = SimulatedRig(friction=0.5, pose=NOTHING)  # more friction than the pushes of the switch-on check
+    rig = SimulatedRig(friction=0.5, pose=NO_TORQUE)  # more friction than the pushes of the switch-on check
     yield rig
     rig.close()
 
@@ -41,8 +42,8 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
 def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., CanBridge]]:
     """A function that makes a bridge of the simulated arm, which needs no efforts from outside."""
     bridges: list[CanBridge] = []
-    command = EffortCommand(NOTHING, 0.0)
-    monkeypatch.setattr(EffortExchange, "get_efforts", lambda self, latest: command._replace(answered=time.monotonic()))
+    command = Efforts(NO_TORQUE, 0.0, False, False)
+    monkeypatch.setattr(EffortExchange, "efforts", lambda self, latest: command._replace(answered=time.monotonic()))
 
     def make_bridge(autostart: bool = False) -> CanBridge:
         parameters = {

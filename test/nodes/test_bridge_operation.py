@@ -14,11 +14,11 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import JointMotor, Traffic
+from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
 from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
+from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.nodes.can_bridge import operation
@@ -27,7 +27,7 @@ from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, B
 from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
-from ..hardware.virtual_rig import Carried
+from ..hardware.rig import CarriedArm
 from ..support.waiting import wait_until
 
 NAMES = ("a", "b", "c", "elbow")
@@ -58,7 +58,7 @@ def sent(node, monkeypatch):
         arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(NAMES), 0.004)
         report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
         for n in range(count):
-            report.send(loop(n), NO_COMMAND._replace(answered=clock.now if answered is None else answered), "none")
+            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), "none")
             clock.now += 0.1
         return reports
 
@@ -121,7 +121,7 @@ def standing():
         loop.zeroed += 1
 
     loop.call, loop.bus = call, SimpleNamespace(set_zero=set_zero)
-    loop.safety.step(0.0, loop.samples, NO_COMMAND)
+    loop.safety.step(0.0, loop.samples, NO_EFFORTS)
     return loop
 
 
@@ -185,16 +185,16 @@ def await_efforts(exchange, send):
 
     def answer() -> None:
         send()
-        exchange.get_efforts(time.monotonic() + 0.05)
+        exchange.efforts(time.monotonic() + 0.05)
 
-    wait_until(lambda: exchange.command.effort is not None, answer, seen=lambda: exchange.refusal)
-    return exchange.command
+    wait_until(lambda: exchange.newest.effort is not None, answer, seen=lambda: exchange.refusal)
+    return exchange.newest
 
 
 def test_under_a_clock_that_stands_still_efforts_grow_old(node, exchange):
     compensator = node.create_publisher(JointState, "effort_commands", 1)
     for now in (100.0, 100.004, 100.3):
-        exchange.publish(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+        exchange.take(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
     command = await_efforts(exchange, lambda: compensator.publish(JointState(name=NAMES, effort=(0.0,) * 4)))
     assert command.answered == 100.0
 
@@ -202,7 +202,7 @@ def test_under_a_clock_that_stands_still_efforts_grow_old(node, exchange):
 @pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])
 def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
     compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
-    exchange.publish(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
+    exchange.take(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
     command = await_efforts(
         exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, "", (), "", (), False, held))
     )
@@ -212,7 +212,7 @@ def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
 @pytest.fixture
 def operated(node):
     """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
-    arm = Carried()
+    arm = CarriedArm()
     operator = Operator(node, lambda: arm.loop, arm.clock)
 
     def run(seconds, holding=""):

@@ -17,8 +17,8 @@ from rclpy.time import Time
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.imu import ImuDevice, ImuNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
+from exo_gravity.sim.virtual_time import VirtualClock
 
-from ..hardware.virtual_time import VirtualClock
 from ..support.fake_imu.chips import G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
 from ..support.waiting import wait_until

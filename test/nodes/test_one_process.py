@@ -14,14 +14,14 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.compensator.node import CompensatorNode
 
-from ..hardware.simulated_rig import LIMITS
-from ..hardware.virtual_rig import Carried
+from ..hardware.rig import LIMITS, CarriedArm
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU
 from ..support.waiting import wait_until
@@ -56,8 +56,8 @@ class Bridge:
 
     def cycle(self, now=100.0):
         """Publish a joint state; return the efforts that are there before the topic is looked at, and after."""
-        self.exchange.publish(now, [JointSample(0.5, 0.0, 0.0, 40, 0, now)] * 4)
-        return self.exchange.command, self.exchange.get_efforts(time.monotonic())
+        self.exchange.take(now, [JointSample(0.5, 0.0, 0.0, 40, 0, now)] * 4)
+        return self.exchange.newest, self.exchange.efforts(time.monotonic())
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_efforts_that_answer_a_joint_state_are_there_at_once_and_are_not_taken_a
     bridge.efforts = None
     for now in (100.004, 100.008, 100.012):  # the first answer has arrived by its topic meanwhile
         time.sleep(0.02)
-        assert bridge.cycle(now) == (command, command) and bridge.exchange.command is command
+        assert bridge.cycle(now) == (command, command) and bridge.exchange.newest is command
     assert [list(message.position) for message in bridge.answered] == [[0.5] * 4] * 4
     assert not bridge.trips and bridge.exchange.refusal == "none"
 
@@ -99,10 +99,10 @@ def test_an_arm_whose_compensator_has_failed_is_let_down_as_one_whose_compensato
         return JointState(header=message.header, name=message.name, effort=torque[-1])
 
     exchange = EffortExchange(node, LIMITS, lambda: arm and arm.loop, answer)
-    arm = Carried(on_cycle=exchange.publish)
+    arm = CarriedArm()
     torque.append(arm.rig.carrying)
-    arm.run(0.1)
-    arm.get_efforts = exchange.get_efforts
+    exchange.take(arm.clock.monotonic(), arm.loop.samples)
+    arm.loop.controller = exchange
     arm.run(1.0)
     assert arm.safety.state is State.ACTIVE
     torque.append(None)

@@ -6,8 +6,9 @@ import pytest
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.gate import missing_for_a_start
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 
 from ..support.panel_browser import IN_BROWSER, of_arm, wait_for_state
 from ..support.panel_stage import LEAVES

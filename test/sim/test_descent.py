@@ -7,10 +7,10 @@ import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import NO_COMMAND, OFF, State
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.drive import NO_EFFORTS, OFF, State
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
@@ -57,7 +57,7 @@ class Lowered:
             self._take(motor, self.device.exchange(motor.can_id, ENTER))
         self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
         while self._now < 60.0:
-            drive = self.machine.step(self._now, tuple(self._samples), NO_COMMAND)
+            drive = self.machine.step(self._now, tuple(self._samples), NO_EFFORTS)
             if drive == OFF:
                 break
             self.switched_on_again = self.switched_on_again or any(drive.enter)
@@ -74,8 +74,7 @@ class Lowered:
         self.speed_after_exit = self._advance(3.0)
 
     def _take(self, motor, reply):
-        _, *reading = motor.joint_reply(reply[1])
-        self._samples[motor.can_id - 1] = JointSample(*reading, self._now)
+        self._samples[motor.can_id - 1] = motor.sample(reply[1], self._now)
 
     def _advance(self, duration):
         fastest = 0.0

@@ -104,7 +104,7 @@ def test_a_motor_that_is_cut_off_keeps_its_torque_and_does_not_reply(device):
 def test_an_encoder_error_shifts_the_angle_that_a_motor_replies(device):
     device.encoder_error = (0.0, 0.698, 0.0, 0.0)
     _, data = device.exchange(2, JOINTS[1].command(0.0, 0.0))
-    assert JOINTS[1].joint_reply(data).position == pytest.approx(0.698, abs=0.001)
+    assert JOINTS[1].sample(data, 0.0).position == pytest.approx(0.698, abs=0.001)
 
 
 def test_a_file_that_cannot_be_created_is_refused(tmp_path):

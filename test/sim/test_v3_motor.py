@@ -26,7 +26,7 @@ def reported(motor: SimulatedMotor, position: float = 0.5, velocity: float = 0.0
     """Return what the joint reads from the status frame; None without one."""
     frame = motor.status(position, velocity)
     assert frame is None or frame[0] == MIT_V3.reply_id(3)
-    return frame and JOINT.joint_reply(frame[1])
+    return frame and JOINT.sample(frame[1], 0.0)
 
 
 def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_torque():
@@ -35,7 +35,7 @@ def test_the_first_command_switches_it_on_and_its_status_shows_angle_speed_and_t
     assert motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID) is None
     assert motor.entered and motor.torque(0.5, 0.0) == pytest.approx(1.5, abs=0.01)
     reply = reported(motor, 0.5, 1.0)
-    assert reply[1:4] == (pytest.approx(0.5, abs=0.001), pytest.approx(1.0, abs=0.01), pytest.approx(1.5, abs=0.01))
+    assert reply[:3] == (pytest.approx(0.5, abs=0.001), pytest.approx(1.0, abs=0.01), pytest.approx(1.5, abs=0.01))
     assert (reply.temperature, reply.error) == (30, 0)
 
 
@@ -45,7 +45,7 @@ def test_its_exit_frame_switches_it_off_and_a_current_drives_it():
     for frame_id, data in JOINT.exit:
         motor.receive(data, 0.5, 0.0, 0.0, frame_id)
     assert not motor.entered and motor.torque(0.5, 3.0) == 0.0
-    assert reported(motor).torque == 0.0
+    assert reported(motor).effort == 0.0
     motor.receive((2000).to_bytes(4, "big", signed=True), 0.5, 0.0, 0.0, CURRENT_ID)
     assert motor.torque(0.5, 0.0) == pytest.approx(-0.8 * 2.0 * 3.0 / 7.4)
 
@@ -57,7 +57,7 @@ def test_without_power_it_reports_nothing_and_forgets_its_command():
     assert reported(motor) is None and motor.torque(0.5, 0.0) == 0.0
     motor.receive(JOINT.command(1.5, 0.0), 0.5, 0.0, 0.0, COMMAND_ID)
     motor.unplugged = False
-    assert reported(motor).torque == 0.0 and not motor.entered
+    assert reported(motor).effort == 0.0 and not motor.entered
 
 
 def test_on_a_device_it_ignores_frames_of_v1_boards_and_sends_no_reply():

@@ -80,14 +80,10 @@ def carried(given: dict[str, Any]) -> dict[str, Any]:
     from exo_gravity.core.arm.gravity import gravity_torque
     from exo_gravity.core.motors.joint_motor import motors_of
     from exo_gravity.core.params import values_of
-    from exo_gravity.core.safety.drive import EffortCommand, State
+    from exo_gravity.core.safety.drive import Efforts, State
     from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
-    from exo_gravity.core.safety.machine import SafetyMachine
-    from exo_gravity.hardware.can.motor_bus import MotorBus
-    from exo_gravity.hardware.control_loop import ControlLoop
     from exo_gravity.sim.params import SIMULATOR, device_of
-
-    from ..hardware.virtual_time import Wire
+    from exo_gravity.sim.virtual_arm import VirtualArm
 
     given = {"can.interface": "virtual", "can.channel": "wire", **given}
     values = values_of(
@@ -95,33 +91,32 @@ def carried(given: dict[str, Any]) -> dict[str, Any]:
     )
     motors, limits = motors_of(values), limits_of(values)
     check_bridge(values["rate"], motors, limits)
-    device, wire, period = device_of(values_of(SIMULATOR, given)), Wire(), 1.0 / values["rate"]
-    wire.play(device)
-    clock: Any = wire.clock  # it has the methods of a `Clock`
-    bus = MotorBus(wire.open(), motors, clock=clock)
-    safety = SafetyMachine(limits, period, motors)
+    device = device_of(values_of(SIMULATOR, given))
 
-    def efforts(_latest: float) -> EffortCommand:
-        held = gravity_torque(device.arm.config.links, device.arm.positions)
-        return EffortCommand(tuple(held), clock.monotonic())
+    class Holding:
+        """Asks for what holds the device where it is."""
 
-    loop = ControlLoop(bus, safety, period, get_efforts=efforts)
-    safety.enable(clock.monotonic())
-    end = clock.monotonic() + 5.0
-    while safety.state is not State.ACTIVE and clock.monotonic() < end:
-        loop.cycle()
+        def efforts(self, latest: float) -> Efforts:
+            held = gravity_torque(device.arm.config.links, device.arm.positions)
+            return Efforts(tuple(held), arm.now, damped=False, held=False)
+
+        def take(self, now: float, samples: Any) -> None:
+            pass
+
+    arm = VirtualArm(device, Holding(), motors, limits, values["rate"])
+    safety = arm.safety
+    arm.enable()
+    arm.run_until(lambda: safety.state is State.ACTIVE, 5.0)
     state, is_on = safety.state.value, [motor.entered for motor in device.motors]
-    safety.disable(clock.monotonic())
-    end = clock.monotonic() + 20.0
-    while not loop.is_off and clock.monotonic() < end:
-        loop.cycle()
-    bus.stop()
+    safety.disable(arm.now)
+    arm.run_until(lambda: arm.loop.is_off, 20.0)
+    arm.bus.stop()
     return {
         "state": state,
         "fault": safety.fault and safety.fault.reason,
         "on": is_on,
-        "off": loop.is_off and not device.powered,
-        "ignored": dict(bus.ignored),
+        "off": arm.loop.is_off and not device.powered,
+        "ignored": dict(arm.bus.ignored),
         "home_tolerance": limits.home_tolerance,
         "peak": [motor.peak_effort for motor in motors],
         "rotors": list(device.arm.config.rotor_inertia),

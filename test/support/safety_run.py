@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.safety.drive import OFF, EffortCommand, State
-from exo_gravity.core.safety.limits import UNKNOWN, JointSample, Limits
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
+from exo_gravity.core.safety.drive import OFF, Efforts, State
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 
 PERIOD = 0.004  # s
@@ -60,8 +61,8 @@ class SafetyRun:
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
             before = list(self.applied)
-            command = EffortCommand(self.effort, self.now - self.effort_age, self.damped, self.held)
-            self.drive = self.machine.step(self.now, tuple(self.joints), command)
+            efforts = Efforts(self.effort, self.now - self.effort_age, self.damped, self.held)
+            self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
             for i in range(4):
                 if i not in self.silent:
                     self.applied[i] = self.drive.effort[i]

@@ -94,7 +94,7 @@ class TermsRun:
         for joint, motor in enumerate(MOTORS_OF_ARM):
             answer = device.exchange(motor.can_id, motor.command(self._gravity[0][joint] + float(extra[joint]), 0.0))
             assert answer
-            reply = motor.joint_reply(answer[1])
+            reply = motor.sample(answer[1], device.time)
             theta.append(reply.position)
             velocity.append(reply.velocity)
         self._gravity.append(exact_torque(self.links, theta, UPRIGHT))

@@ -68,7 +68,7 @@ def recorded_by(run, folder, torque_scale=1.0):
     """
     table = np.array(run.log)
     unknown = np.full((len(table), 4), np.nan)
-    efforts = table[:, 5:9] * torque_scale
+    efforts = table[:, 9:13] * torque_scale
     states = Recording("right", ARM.joint_names, table[:, 0], table[:, 1:5], unknown, unknown, efforts)
     return write_bag(folder, [*messages(states), *(tilt(now, *run.tilt) for now in table[::10, 0])])
 

@@ -1,6 +1,6 @@
 """A motor on a joint, the parameters of an arm's motors, and the load of their frames on the CAN bus.
 
-A `JointMotor` translates joint angle, effort and damping to the frames of its wire format, and back.
+A `JointMotor` translates a joint's effort and damping to the frames of its wire format, and frames to `JointSample`s.
 """
 
 import math
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorReply, MotorSpec
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
@@ -27,6 +27,20 @@ SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 # python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
 NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
+
+
+class JointSample(NamedTuple):
+    """What a motor's frame says of its joint."""
+
+    position: float  #: rad
+    velocity: float  #: rad/s
+    effort: float  #: Nm
+    temperature: int | None  #: degC, None if the firmware reports none
+    error: int | None  #: a code of MOTOR_ERRORS, None if the firmware reports none
+    time: float  #: s on the clock of the bus, when the frame arrived
+
+
+UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)  # before the first frame
 
 
 @dataclass(frozen=True)
@@ -90,13 +104,12 @@ class JointMotor:
         kp = stiffness / self.torque_scale
         return self.wire_format.pack_command(spec, self.motor_position(position) if kp else 0.0, 0.0, kp, kd, torque)
 
-    def joint_reply(self, data: bytes | bytearray) -> MotorReply:
-        """Return the content of a reply or status frame in the joint's rad, rad/s and Nm. Raises FrameError."""
-        reply = self.wire_format.unpack_reply(self.spec, self.can_id, data)
-        sign, torque = self.direction, self.direction * reply.torque * self.torque_scale
-        return MotorReply(
-            reply.motor_id, sign * (reply.position - self.zero), sign * reply.velocity, torque, *reply[4:]
-        )
+    def sample(self, data: bytes | bytearray, time: float) -> JointSample:
+        """Return what a reply or status frame that arrived at `time` s says of the joint. Raises FrameError."""
+        _, position, velocity, torque, temperature, error = self.wire_format.unpack_reply(self.spec, self.can_id, data)
+        sign = self.direction
+        effort = sign * torque * self.torque_scale
+        return JointSample(sign * (position - self.zero), sign * velocity, effort, temperature, error, time)
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""

@@ -13,8 +13,9 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Drive, Fault, FaultCode
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.safety.limits import Limits
 
 THERMAL_TIME = 60.0  # s; an assumption for motors of this size: the data sheets state none
 

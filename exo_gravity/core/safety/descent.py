@@ -26,8 +26,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.delivery import DELIVERY
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, JointSample
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
 

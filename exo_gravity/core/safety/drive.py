@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
-NOTHING = (0.0, 0.0, 0.0, 0.0)
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.numbers import JOINT_COUNT
 
 
 class State(str, Enum):
@@ -27,16 +28,16 @@ class State(str, Enum):
 CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
 
 
-class EffortCommand(NamedTuple):
-    """What the motors are asked to apply."""
+class Efforts(NamedTuple):
+    """What the motors are asked to apply, in answer to the samples of one cycle."""
 
     effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
     answered: float  #: s, when the joint states that it answers were taken.
-    damped: bool = False  #: whether the load is changing, so that the motors are to damp the joints.
-    held: bool = False  #: Whether it is computed from a tilt that is late.
+    damped: bool  #: Whether the load is changing, so that the motors are to damp the joints.
+    held: bool  #: Whether they are computed from a tilt that is late.
 
 
-NO_COMMAND = EffortCommand(None, -math.inf)
+NO_EFFORTS = Efforts(None, -math.inf, False, False)  # before the first ones
 
 
 class Drive(NamedTuple):
@@ -45,18 +46,18 @@ class Drive(NamedTuple):
     effort: tuple[float, ...]  #: (4,) Nm
     damping: tuple[float, ...]  #: (4,) Nm s/rad
     powered: bool  #: whether the motors are to be on
-    #: (4,) which motors must be switched on again, because they are found off
-    enter: tuple[bool, ...] = (False, False, False, False)
+    enter: tuple[bool, ...]  #: (4,) which motors must be switched on again, because they are found off
     #: (4,) which motors may be on or off: they are sent nothing that could switch them on
-    unsure: tuple[bool, ...] = (False, False, False, False)
+    unsure: tuple[bool, ...]
 
 
-OFF = Drive(NOTHING, NOTHING, False)
+NO_MOTOR = (False,) * JOINT_COUNT
+OFF = Drive(NO_TORQUE, NO_TORQUE, False, NO_MOTOR, NO_MOTOR)
 
 
 # After a fault, zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
 RECHECK = "recheck"
-# After a fault, the operator may carry on at once: a computer, bus or network was late; nothing needs mending.
+# After a fault, the operator may carry on at once: a computer, bus or network was late; nothing needs a repair.
 RESUME = "resume"
 
 
@@ -67,14 +68,14 @@ class FaultCode(str, Enum):
     """
 
     meaning: str
-    casts_doubt: bool
+    needs_recheck: bool
     is_resumable: bool
 
     def __new__(cls, value: str, meaning: str, then: str = "") -> "FaultCode":
         """Create a code from its text, its meaning and what follows."""
         code = str.__new__(cls, value)
         code._value_, code.meaning = value, meaning
-        code.casts_doubt, code.is_resumable = then == RECHECK, then == RESUME
+        code.needs_recheck, code.is_resumable = then == RECHECK, then == RESUME
         return code
 
     def __str__(self) -> str:

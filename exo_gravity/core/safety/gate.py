@@ -4,9 +4,11 @@ import math
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, JointSample, Limits
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 
 # The gate waits for these to pass; other faults refuse the start.
 WAITED_OUT = frozenset({FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED, FaultCode.OUTSIDE_LIMITS})
@@ -103,11 +105,11 @@ class SwitchOnCheck:
         self.done = False
         self._names = limits.joint_names
         self._torque = [min(SWITCH_ON.torque, most) for most in limits.max_effort]
-        self.effort, self.enter = list(NOTHING), [False] * JOINT_COUNT
+        self.effort, self.enter = list(NO_TORQUE), [False] * JOINT_COUNT
         self._last_time = [-math.inf] * JOINT_COUNT
-        self._commanded = list(NOTHING)  # Nm, as the replies show it
-        self._products = list(NOTHING)  # of replied and commanded torque, summed since the last pair of pushes
-        self._squares = list(NOTHING)  # of commanded torque
+        self._commanded = list(NO_TORQUE)  # Nm, as the replies show it
+        self._products = list(NO_TORQUE)  # of replied and commanded torque, summed since the last pair of pushes
+        self._squares = list(NO_TORQUE)  # of commanded torque
         self._is_on = [False] * JOINT_COUNT
         self._elapsed, self._pushes = 0.0, 0
 
@@ -134,7 +136,7 @@ class SwitchOnCheck:
                 if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
                     reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
-            self._products, self._squares = list(NOTHING), list(NOTHING)
+            self._products, self._squares = list(NO_TORQUE), list(NO_TORQUE)
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque

@@ -8,11 +8,18 @@ compares the defaults with those of other systems.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, REPLY_SHARE, JointMotor, channels_of
+from exo_gravity.core.motors.joint_motor import (
+    MAX_STATUS_RATE,
+    MOTOR_PARAMETERS,
+    REPLY_SHARE,
+    JointMotor,
+    JointSample,
+    channels_of,
+)
 from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS, USUAL_MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
@@ -77,20 +84,6 @@ class LoopTiming:
 
 
 WALL, HEAT, GUIDE, READING, LOOP = SoftWall(), Derating(), Guide(), ReadingLimits(), LoopTiming()
-
-
-class JointSample(NamedTuple):
-    """The newest reading of one joint."""
-
-    position: float  #: rad
-    velocity: float  #: rad/s
-    effort: float  #: Nm
-    temperature: int | None  #: degC, None if the firmware reports none
-    error: int | None  #: a code of MOTOR_ERRORS, None if the firmware reports none
-    time: float  #: s on the caller's clock
-
-
-UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)
 
 
 @dataclass(frozen=True)

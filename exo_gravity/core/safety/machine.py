@@ -12,7 +12,7 @@
 - PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
   must move the right way (gate.py).
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
-  the arm and nothing moves it. A motor that cannot be reached stays in this state's care: if it replies again, however
+  the arm and nothing moves it. A motor that cannot be reached is still watched for: if it replies again, however
   late, its joint is lowered from the torque that it then applies. If all were silent at once, their supply may have
   been cut: a motor that returns without torque stays off (`SupplyMonitor`).
 - FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
@@ -21,21 +21,23 @@
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
 Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
-casts doubt on them. Until then `resume` carries an arm on from any pose after a fault that leaves nothing to repair.
+means that they must be checked again. Until then `resume` carries an arm on from any pose after a fault that leaves
+nothing to repair.
 """
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, NOTHING, OFF, Drive, EffortCommand, Fault, FaultCode, State
+from exo_gravity.core.safety.drive import CARRYING, NO_MOTOR, OFF, Drive, Efforts, Fault, FaultCode, State
 from exo_gravity.core.safety.gate import START_GATE, SignCheck, SwitchOnCheck, missing_for_a_start
-from exo_gravity.core.safety.limits import DAMPING, JointSample, Limits, guide_damping
+from exo_gravity.core.safety.limits import DAMPING, Limits, guide_damping
 from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough, SupplyMonitor
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 
@@ -67,7 +69,7 @@ class SafetyMachine:
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NOTHING, NOTHING, NOTHING)
+        self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_found_on = False  # by this cycle's replies
@@ -76,7 +78,7 @@ class SafetyMachine:
         self.motion = MotionMonitor(limits)
         self._supply = SupplyMonitor()
         self._switch_on = SwitchOnCheck(limits)
-        self._signs = SignCheck(limits.joint_names, NOTHING)
+        self._signs = SignCheck(limits.joint_names, NO_TORQUE)
         #: What else CHECKING waits for, set from outside; '' for nothing.
         self.hindrance = ""
 
@@ -122,7 +124,7 @@ class SafetyMachine:
 
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
-        if code.casts_doubt:
+        if code.needs_recheck:
             self._is_trusted = False
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
@@ -134,22 +136,26 @@ class SafetyMachine:
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (4,) Nm and `damping` (4,)."""
-        self._sent = Drive(tuple(effort), tuple(damping), True)
+        self._sent = Drive(tuple(effort), tuple(damping), True, NO_MOTOR, NO_MOTOR)
         self._supply.suspect(effort)
         self._let_down(now)
 
-    def meet(self, now: float) -> None:
+    def probe(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
-        self._descent = ArmDescent(now, NOTHING, (DAMPING,) * JOINT_COUNT, self.limits.max_effort)
-        self._supply.suspect(NOTHING)
+        self._descent = ArmDescent(now, NO_TORQUE, (DAMPING,) * JOINT_COUNT, self.limits.max_effort)
+        self._supply.suspect(NO_TORQUE)
 
-    def settled(self, now: float) -> bool:
+    def is_at_rest(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
         return now - self._rest.since >= REST.time
 
-    def step(self, now: float, joints: Sequence[JointSample], command: EffortCommand) -> Drive:
-        """Return what the motors receive in the cycle at `now` s; joints: the 4 newest readings."""
-        effort, answered, damped, held = command
+    def step(self, now: float, joints: Sequence[JointSample], efforts: Efforts) -> Drive:
+        """Return what the motors receive in the cycle at `now` s.
+
+        joints: the newest sample of each joint, shoulder to elbow.
+        efforts: what the controller asks for.
+        """
+        effort, answered, damped, held = efforts
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         age = now - answered
         self._now, self._dt = now, min(now - self._now, self._period)
@@ -180,8 +186,7 @@ class SafetyMachine:
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
-        drive = self._drive(effort or NOTHING, damped)
-        self._sent = drive._replace(damping=tuple(map(min, drive.damping, self._peak_damping)))
+        self._sent = self._drive(effort or NO_TORQUE, damped)
         return self._sent
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
@@ -193,8 +198,14 @@ class SafetyMachine:
         if self.state is State.PROVING:
             damping = DAMPING * min(1.0, (self._now - self._since) / DESCENT.damping_rise)
             pushed = (self._signs if self._switch_on.done else self._switch_on).effort
-            return Drive(tuple(pushed), (damping,) * 4, True, tuple(self._switch_on.enter))
+            return self._powered(pushed, (damping,) * len(pushed), tuple(self._switch_on.enter), NO_MOTOR)
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
+
+    def _powered(
+        self, effort: Iterable[float], damping: Iterable[float], enter: tuple[bool, ...], unsure: tuple[bool, ...]
+    ) -> Drive:
+        """Return a drive of motors that are on, with no more damping than each of them can apply."""
+        return Drive(tuple(effort), tuple(map(min, damping, self._peak_damping)), True, enter, unsure)
 
     def _check(self, efforts_are_fresh: bool) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
@@ -244,8 +255,8 @@ class SafetyMachine:
         guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
         columns = zip(walls, wanted, self._sent.damping, strict=True)
-        damping = tuple(max(wall, last - step, min(last + step, most)) for wall, most, last in columns)
-        return Drive(shaped, damping, True)
+        damping = [max(wall, last - step, min(last + step, most)) for wall, most, last in columns]
+        return self._powered(shaped, damping, NO_MOTOR, NO_MOTOR)
 
     def _descend(self) -> Drive:
         descent, supply, silent = self._descent, self._supply, self._readings.silent
@@ -263,7 +274,7 @@ class SafetyMachine:
         if any(enter):
             self._is_trusted = False
             self._delivery.reset()
-        return Drive(*descent.applied, True, enter, self._unsure)
+        return self._powered(*descent.applied, enter, self._unsure)
 
     @property
     def _unsure(self) -> tuple[bool, ...]:
@@ -282,7 +293,7 @@ class SafetyMachine:
         if not (self.is_unreached or is_doubtful or self._is_found_on):
             return OFF
         if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
-            return Drive(*self._descent.applied, True, unsure=self._unsure)
+            return self._powered(*self._descent.applied, NO_MOTOR, self._unsure)
         if self.state is State.CHECKING:
             self._refuse("a motor was still on: it is let down")
         self.is_unreached = False

@@ -9,9 +9,11 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import READING, UNKNOWN, JointSample, Limits
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import READING, Limits
 
 
 @dataclass(frozen=True)
@@ -157,8 +159,8 @@ class SupplyMonitor:
     """
 
     def __init__(self) -> None:
-        self._times = list(NOTHING)  # s, of each motor's last reply
-        self.suspect(NOTHING)
+        self._times = list(NO_TORQUE)  # s, of each motor's last reply
+        self.suspect(NO_TORQUE)
         self.clear()
 
     @property
@@ -179,8 +181,8 @@ class SupplyMonitor:
         """
         self._held = held
         self.unsure: tuple[bool, ...] = (True,) * len(held)
-        self._torque = list(NOTHING)  # smoothed, since the motor replies again
-        self._heard = list(NOTHING)  # s for which it has replied again
+        self._torque = list(NO_TORQUE)  # smoothed, since the motor replies again
+        self._heard = list(NO_TORQUE)  # s for which it has replied again
         self._were_silent = [False] * len(held)
 
     def clear(self, still: Sequence[bool] = (False,) * JOINT_COUNT) -> None:

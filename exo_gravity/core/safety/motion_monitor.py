@@ -16,8 +16,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.safety.drive import NOTHING, Fault, FaultCode
-from exo_gravity.core.safety.limits import MAX_COMMAND, JointSample, Limits
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.limits import MAX_COMMAND, Limits
 
 GRAVITY = 9.81  # m/s^2
 ALONG_BASE = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
@@ -56,7 +58,7 @@ class MotionMonitor:
 
     def reset(self) -> None:
         """Forget the past."""
-        self.impulse = list(NOTHING)
+        self.impulse = list(NO_TORQUE)
         self._slow: list[float] = []  # the torque, low-passed, (4,) Nm
 
     def step(

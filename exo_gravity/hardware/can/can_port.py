@@ -14,8 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from operator import methodcaller
-from typing import Any, TypeVar
+from typing import Any, NoReturn
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -31,10 +30,9 @@ from exo_gravity.hardware.clock import Clock
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
 MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
-TURN = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
+POLL_TIME = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
-Result = TypeVar("Result")
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
@@ -69,14 +67,20 @@ class CanPort:
     def send(self, *frames: Frame) -> None:
         """Send frames. Raises BusError."""
         for frame in frames:
+            bus = self._bus or self._reopening()
             self._awaited.append(frame)
-            frame_id, data = frame
-            message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
-            self._guarded(methodcaller("send", message))
+            try:
+                bus.send(message_of(frame))
+            except Exception as error:
+                raise self._failed(bus, error) from error
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
-        return self._guarded(lambda bus: bus.recv(timeout))
+        bus = self._bus or self._reopening()
+        try:
+            return bus.recv(timeout)
+        except Exception as error:
+            raise self._failed(bus, error) from error
 
     def fileno(self) -> int:
         """Return the descriptor of the bus's socket; -1 if it has none, or keeps frames that it has read."""
@@ -89,7 +93,7 @@ class CanPort:
         """
         for _ in range(MAX_STALE_FRAMES):
             while (message := self.receive(0.0)) is None:
-                if not self._guarded(_has_lines):
+                if not self._has_lines():
                     return
             yield message
 
@@ -114,22 +118,29 @@ class CanPort:
         if self._bus is not None:
             _close(self._bus)
 
-    def _guarded(self, use: Callable[[can.BusABC], Result]) -> Result:
-        """Return what `use` returns. Raises BusError for every error, and while the bus is opened again."""
-        bus = self._bus
-        if bus is None:
-            raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
+    def _reopening(self) -> NoReturn:
+        """Raise BusError, because the bus is being opened again."""
+        raise BusError(f"CAN bus {self.name}: {self._error}; opening it again")
+
+    def _failed(self, bus: can.BusABC, error: Exception) -> BusError:
+        """Return the error to raise for any `error` of `bus`; if it has failed for a while, open it again."""
+        now, is_plain = self._clock.monotonic(), isinstance(error, (can.CanError, OSError))
+        self._error = f"{error}" if is_plain else f"{type(error).__name__}: {error}"
+        if self._failing_since is None:
+            self._failing_since = now
+        elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
+            self._bus = None
+            self._clock.later(0.0, partial(self._open_again, self._reopen, bus))
+        return BusError(f"CAN bus {self.name}: {self._error}")
+
+    def _has_lines(self) -> bool:
+        """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
+        bus = self._bus or self._reopening()
+        serial_port = getattr(bus, "serialPortOrig", None)
         try:
-            return use(bus)
+            return serial_port is not None and serial_port.in_waiting > 0
         except Exception as error:
-            now, is_plain = self._clock.monotonic(), isinstance(error, (can.CanError, OSError))
-            self._error = f"{error}" if is_plain else f"{type(error).__name__}: {error}"
-            if self._failing_since is None:
-                self._failing_since = now
-            elif self._reopen is not None and now - self._failing_since > REOPEN_AFTER:
-                self._bus = None
-                self._clock.later(0.0, partial(self._open_again, self._reopen, bus))
-            raise BusError(f"CAN bus {self.name}: {self._error}") from error
+            raise self._failed(bus, error) from error
 
     def _open_again(self, reopen: Callable[[], can.BusABC], failed: can.BusABC | None = None) -> None:
         if failed is not None:
@@ -200,13 +211,13 @@ def awaited(ports: Sequence[CanPort], timeout: float) -> tuple[Sequence[CanPort]
     try:
         return select.select(ports, (), (), timeout)[0], 0.0
     except (OSError, ValueError):  # one has no socket, or is being opened again
-        return ports, min(timeout, TURN)
+        return ports, min(timeout, POLL_TIME)
 
 
-def _has_lines(bus: can.BusABC) -> bool:
-    """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
-    serial_port = getattr(bus, "serialPortOrig", None)
-    return serial_port is not None and serial_port.in_waiting > 0
+def message_of(frame: Frame) -> can.Message:
+    """Return python-can's message of a frame, whose ID contains `EXTENDED` if it has 29 bits."""
+    frame_id, data = frame
+    return can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
 
 
 def _close(bus: can.BusABC) -> None:

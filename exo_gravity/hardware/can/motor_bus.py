@@ -26,11 +26,11 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
-from exo_gravity.core.safety.limits import DAMPING, UNKNOWN, JointSample
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -39,22 +39,25 @@ UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since t
 OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
-SETTLING_TIME = 0.02  # s of it in which late replies to the previous owner may still arrive
+LATE_REPLIES = 0.02  # s of it in which replies to the previous owner may still arrive
 CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correcting hosts must not fill the bus
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
 FOREIGN_COMMAND = "foreign command"
-UNREACHED = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
+AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
 
 class MotorBus:
-    """Four motors with different IDs. Not thread-safe: one thread owns it.
+    """The motors of one arm, with different IDs. Not thread-safe: one thread owns it.
 
     bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
-    torque, and is sent nothing. powered: whether the motors are already on. note: called with each drive before its
-    frames are sent. reopen: opens `bus` again after a failure. clock: of all times.
+        torque, and is sent nothing.
+    powered: whether the motors are already on.
+    note: called with each drive, and whether a motor may be on, before its frames are sent.
+    reopen: opens `bus` again after a failure.
+    clock: of all times.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class MotorBus:
         bus: can.BusABC | Sequence[CanPort | None],
         motors: Sequence[JointMotor],
         powered: bool = False,
-        note: Callable[[Drive], None] = lambda drive: None,
+        note: Callable[[Drive, bool], None] = lambda drive, powered: None,
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
@@ -110,7 +113,7 @@ class MotorBus:
         """Listen before the first frame. Raises BusError if another host commands these motors."""
         self._failed.clear()
         end = self._now() + LISTEN_TIME
-        self.receive_until(end - LISTEN_TIME + SETTLING_TIME)
+        self.receive_until(end - LISTEN_TIME + LATE_REPLIES)
         self._answered.clear()
         self.foreign_commands = 0
         self.receive_until(end)
@@ -131,7 +134,7 @@ class MotorBus:
         if drive.powered:
             self._unsure = drive.unsure
             self._unconfirmed.update(joint for joint in self._joints if not drive.unsure[joint])
-        self._note(drive._replace(powered=self.may_be_powered))
+        self._note(drive, self.may_be_powered)
         self._is_confirming = not self._powered and self._exit_sent > -math.inf
         for port in self._buses:  # replies that arrived after their cycle are not replies to this one
             try:
@@ -144,7 +147,7 @@ class MotorBus:
             if not any(drive.unsure):
                 self._send_commands(OFF)
                 for joint, motor in enumerate(self._motors):
-                    self._send(joint, *motor.enter)
+                    self._send(self._ports[joint], *motor.enter)
         self._send_commands(drive)
         if not drive.powered:
             self._switch_off()
@@ -155,7 +158,7 @@ class MotorBus:
             if port not in self._failed:
                 port.confirm()
         if count < JOINT_COUNT:
-            missing = UNREACHED._replace(time=max(self.samples[joint].time for joint in self._joints))
+            missing = AT_REST._replace(time=max(self.samples[joint].time for joint in self._joints))
             self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(JOINT_COUNT))
         self._raise_failure()
         return len(self._answered) == count
@@ -182,7 +185,7 @@ class MotorBus:
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
         self._send_commands(OFF)
         for joint, own in enumerate(frames):
-            self._send(joint, *own)
+            self._send(self._ports[joint], *own)
         self._raise_failure()
 
     def stop(self) -> None:
@@ -196,14 +199,14 @@ class MotorBus:
             for joint, motor in enumerate(self._motors):
                 for frame in (*self._zero_command(joint), *motor.exit):
                     self._failed.clear()  # each is tried
-                    self._send(joint, frame)
+                    self._send(self._ports[joint], frame)
             self._failed.clear()
             self._powered, self._exit_sent = False, self._now()
             end = self._exit_sent + LAST_REPLIES
             with contextlib.suppress(BusError):
                 self.receive_until(end, lambda: not self._unconfirmed)
         if not self._unconfirmed:
-            self._note(OFF)
+            self._note(OFF, False)
         self.close()
 
     def close(self) -> None:
@@ -211,9 +214,8 @@ class MotorBus:
         for port in self._buses:
             port.close()
 
-    def _send(self, joint: int, *frames: Frame) -> None:
-        """Send frames on the bus of a motor, unless that has failed in this cycle."""
-        port = self._ports[joint]
+    def _send(self, port: CanPort | None, *frames: Frame) -> None:
+        """Send frames on a bus, unless it is not open or has failed in this cycle."""
         if port and port not in self._failed:
             try:
                 port.send(*frames)
@@ -228,7 +230,8 @@ class MotorBus:
         period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
         if self._powered or self._now() - self._exit_sent > period:
             for joint, motor in enumerate(self._motors):
-                self._send(joint, *(() if joint in self._asked else self._zero_command(joint)), *motor.exit)
+                zero = () if joint in self._asked else self._zero_command(joint)
+                self._send(self._ports[joint], *zero, *motor.exit)
             if self._failed:
                 return  # no reply confirms an EXIT that was not sent
             self._exit_sent = self._now()
@@ -243,13 +246,14 @@ class MotorBus:
     def _send_commands(self, drive: Drive) -> None:
         self._drive = drive
         now = self._now()
+        frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
             command = self._command(joint, now)
-            if drive.enter[joint]:
-                self._send(joint, command, *motor.enter)
-            self._send(joint, command)
+            frames[self._ports[joint]] += (command, *motor.enter, command) if drive.enter[joint] else (command,)
+        for port, own in frames.items():
+            self._send(port, *own)
 
     def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -276,19 +280,22 @@ class MotorBus:
                 self._oppose(self._joint_of[can_id], bytes(message.data))
             return
         joint = self._joint_of[can_id]
-        reply = self._motors[joint].joint_reply(message.data)
+        sample = self._motors[joint].sample(message.data, self._now())
         self._answered.add(joint)
-        if self._is_confirming and (joint in self._asked or abs(reply.torque) < OFF_EFFORT):
+        if self._is_confirming and (joint in self._asked or abs(sample.effort) < OFF_EFFORT):
             self._unconfirmed.discard(joint)
-        now = self._now()
-        self._follow(joint, reply.position, now)
-        self.samples[joint] = JointSample(*reply[1:], now)
+        if sample.time - self._contested[joint] < CONTEST_TIME:
+            self._follow(joint, sample)
+        else:
+            self._held[joint] = sample.position
+        self.samples[joint] = sample
 
-    def _follow(self, joint: int, position: float, now: float) -> None:
-        """Let the held position of a contested joint follow it slowly; that of any other joint at once."""
-        if self._hold(joint, now):
+    def _follow(self, joint: int, sample: JointSample) -> None:
+        """Let the held position of a contested joint follow it slowly, or at once if its motor does not hold it."""
+        position = sample.position
+        if self._hold(joint, sample.time):
             away = position - self._held[joint]
-            step = max(HOLD_SPEED * (now - self.samples[joint].time), abs(away) - HOLD_REACH)
+            step = max(HOLD_SPEED * (sample.time - self.samples[joint].time), abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 
@@ -299,7 +306,7 @@ class MotorBus:
     def _command(self, joint: int, now: float) -> Frame:
         """Return the last drive's command to a motor. If the motor is contested, it also holds the joint."""
         motor, effort, damping = self._motors[joint], self._drive.effort[joint], self._drive.damping[joint]
-        if hold := self._hold(joint, now):
+        if now - self._contested[joint] < CONTEST_TIME and (hold := self._hold(joint, now)):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
                 data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint])
@@ -321,5 +328,5 @@ class MotorBus:
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send(joint, *((command, *motor.enter) if is_exit else ()), command)
+            self._send(self._ports[joint], *((command, *motor.enter) if is_exit else ()), command)
             self._corrected[joint] = now

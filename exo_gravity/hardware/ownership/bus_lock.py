@@ -21,9 +21,10 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NOTHING, Drive
+from exo_gravity.core.safety.drive import NO_MOTOR, Drive
 from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -37,7 +38,8 @@ FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a pipe there
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
 NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
-UNKNOWN_DRIVE = Drive(NOTHING, (DAMPING,) * JOINT_COUNT, True)  # of motors that may be on: the first frames hold
+# Of motors that may be on: the first frames hold.
+UNKNOWN_DRIVE = Drive(NO_TORQUE, (DAMPING,) * JOINT_COUNT, True, NO_MOTOR, NO_MOTOR)
 
 
 class DriveNotes(ctypes.Structure):
@@ -55,16 +57,16 @@ class DriveNotes(ctypes.Structure):
         ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
         ("_owner", ctypes.c_char * 512),
     )
-    clock = COMPUTER_CLOCK
+    clock: Clock = COMPUTER_CLOCK
 
-    def note(self, drive: Drive) -> None:
-        """Note what the motors are about to receive."""
-        NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
+    def note(self, drive: Drive, powered: bool) -> None:
+        """Note what the motors are about to receive, and whether one may be on."""
+        NOTE.pack_into(self, 0, self.clock.monotonic(), powered, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
         """What the motors received last."""
-        return Drive(tuple(self._effort), tuple(self._damping), bool(self._powered))
+        return Drive(tuple(self._effort), tuple(self._damping), bool(self._powered), NO_MOTOR, NO_MOTOR)
 
     @property
     def owner(self) -> str:
@@ -107,7 +109,7 @@ class BusLock:
         if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
             self.problem = f"{path}: damaged"
         if self.problem:
-            self.notes.note(UNKNOWN_DRIVE)
+            self.notes.note(UNKNOWN_DRIVE, True)
         self.notes.owner = owner
         self.notes.heartbeat = 0.0
 
@@ -136,17 +138,17 @@ class ArmNotes:
         """Return the notes of the buses of these joints alone."""
         return ArmNotes(self._pages, joints)
 
-    def note(self, drive: Drive) -> None:
-        """Note what the motors are about to receive."""
+    def note(self, drive: Drive, powered: bool) -> None:
+        """Note what the motors are about to receive, and whether one may be on."""
         for page in self.noted:
-            page.note(drive)
+            page.note(drive, powered)
 
     @property
     def drive(self) -> Drive:
         """What the motors received last; powered if they may be on on one bus."""
         drives = [page.drive for page in self._pages]
         effort, damping = zip(*((drive.effort[i], drive.damping[i]) for i, drive in enumerate(drives)), strict=True)
-        return Drive(effort, damping, any(drive.powered for drive in drives))
+        return Drive(effort, damping, any(drive.powered for drive in drives), NO_MOTOR, NO_MOTOR)
 
     @property
     def time(self) -> float:

@@ -21,7 +21,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
 
 
@@ -85,7 +85,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
             effort[i], damping[i] = joint.effort, 0.0
     machine = SafetyMachine(arm.limits, arm.period, arm.motors)
     machine.take_over(effort, damping, clock.monotonic())
-    loop = ControlLoop(motors, machine, arm.period)
+    loop = ControlLoop(motors, machine, arm.period, NoController())
     was_unreached = False
     while not loop.is_off and loop.cycle():
         if machine.is_unreached and not was_unreached:

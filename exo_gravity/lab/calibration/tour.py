@@ -7,7 +7,7 @@ efforts.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,8 +20,10 @@ from exo_gravity.core.arm.tilt import Tilt, angle_between
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param
+from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 
@@ -89,7 +91,7 @@ class Tour:
             return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
             self._first_tilt, self._now, self._position = tilt, now, np.array(position)
-            self._tracker.lines = self._way()
+            self._tracker.lines = self._lines()
         dt, self._now = now - self._now, now
         self.elapsed += dt
         self._undecided = self._undecided + dt if self._awaits_plan else 0.0
@@ -146,7 +148,7 @@ class Tour:
             self._plan = (None, f"the next pose could not be chosen: {type(error).__name__}: {error}")
         self._awaits_plan = False
 
-    def _way(self) -> Iterator[Line]:
+    def _lines(self) -> Iterator[Line]:
         """Yield each line of the tour when it begins; the arm is held until `plan` chose."""
         home = np.array(self._limits.home)
         while True:
@@ -207,6 +209,39 @@ class Tour:
         before = self._guess.torque(theta.tolist())
         self._guess.learn(theta, effort, seen.spread)
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
+
+
+class TourController:
+    """Carries an arm through a tour, in the compensator's place, without messages.
+
+    tour: which is planned and stepped here.
+    limits: of the arm, which say when a motor is silent.
+    tilt: of the trunk or the stand.
+    is_carried: whether the arm is carried; from then on the tour moves it.
+    """
+
+    def __init__(self, tour: Tour, limits: Limits, tilt: Tilt, is_carried: Callable[[], bool]) -> None:
+        self.tour = tour
+        self._limits, self._tilt, self._is_carried = limits, tilt, is_carried
+        self._has_begun = False
+        self._newest = NO_EFFORTS
+
+    def efforts(self, latest: float) -> Efforts:
+        """Return the newest efforts, without waiting."""
+        return self._newest
+
+    def take(self, now: float, samples: Sequence[JointSample]) -> None:
+        """Let the tour answer the samples, unless a motor is silent."""
+        if any(self._limits.is_silent(now, sample) for sample in samples):
+            return
+        position, velocity, *_, times = zip(*samples, strict=True)
+        self._has_begun = self._has_begun or self._is_carried()
+        if self._has_begun:
+            effort = self.tour.step(now, position, velocity, self._tilt)
+            self.tour.plan()
+        else:
+            effort = self.tour.wait(position, self._tilt)
+        self._newest = Efforts(effort, min(times), False, False)
 
 
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's

@@ -19,12 +19,13 @@ from exo_gravity.lab.bag.content import Event
 from exo_gravity.lab.bag.simulated import write_recordings
 from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, TrunkReading, TrunkSensor, resting
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.run import Trial, TrialEnd
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
 from exo_gravity.sim.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_arm import TrunkReading, TrunkSensor, resting
 
 
 def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:

@@ -18,8 +18,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.safety.drive import CARRYING, NO_COMMAND, EffortCommand, FaultCode
-from exo_gravity.core.safety.limits import JointSample, Limits
+from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Efforts, FaultCode
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import SHORT_QUEUE, PolledSubscription, Publishers
@@ -29,7 +30,7 @@ Answer = Callable[[JointState], JointState | None]  # efforts for a joint state,
 
 
 class EffortExchange:
-    """The topics `joint_states` and `effort_commands` of `node`, used on the control thread.
+    """The topics `joint_states` and `effort_commands` of `node`, the controller of the loop.
 
     get_loop returns the present control loop, None while the node is inactive. refusal: why the last message was
     refused, or "none". answer: of a compensator in this process.
@@ -43,7 +44,7 @@ class EffortExchange:
         self._limits = limits
         self._get_loop = get_loop
         self._clock = node.get_clock()
-        self.command = NO_COMMAND  #: the newest from the compensator
+        self.newest = NO_EFFORTS  #: from the compensator
         self._measured = -math.inf  # monotonic s, when the last published joint state was measured
         self._published: OrderedDict[int, float] = OrderedDict()
         self._commander = Publishers()
@@ -55,30 +56,30 @@ class EffortExchange:
             node, JointState, "effort_commands", self._on_efforts, SHORT_QUEUE, raw=answer is not None
         )
 
-    def get_efforts(self, latest: float) -> EffortCommand:
+    def efforts(self, latest: float) -> Efforts:
         """Return the newest efforts; wait until `latest` (monotonic s) for the answer to the last joint state."""
         self._efforts.poll()
-        if self._answer is None and self.command.answered < self._measured:
+        if self._answer is None and self.newest.answered < self._measured:
             self._efforts.poll(latest - time.monotonic())
-        return self.command
+        return self.newest
 
-    def publish(self, now: float, joints: Sequence[JointSample]) -> None:
+    def take(self, now: float, samples: Sequence[JointSample]) -> None:
         """Publish a joint state if every motor has replied recently: an unknown angle is never sent as a number."""
-        if any(self._limits.is_silent(now, joint) for joint in joints):
+        if any(self._limits.is_silent(now, sample) for sample in samples):
             return
-        position, velocity, effort, *_ = zip(*joints, strict=True)
+        position, velocity, effort, *_ = zip(*samples, strict=True)
         # A compensator in this process keeps the message.
         message = JointState(name=self._joint_states.name) if self._answer else self._joint_states
         message.position, message.velocity, message.effort = position, velocity, effort
         message.header.stamp = self._clock.now().to_msg()
-        self._measured = min(joint.time for joint in joints)
+        self._measured = min(sample.time for sample in samples)
         # Of states with one stamp, by a clock that stands still, efforts answer the first: they grow old.
         self._published.setdefault(to_nanoseconds(message.header.stamp), self._measured)
         if len(self._published) > REMEMBERED:
             self._published.popitem(last=False)
         self._publisher.publish(message)
         if self._answer and (loop := self._get_loop()) and (efforts := self._answer(message)):
-            self._take(loop, efforts)
+            self._receive(loop, efforts)
 
     def _on_efforts(self, message: JointState | bytes, info: dict[str, Any]) -> None:
         loop = self._get_loop()
@@ -86,13 +87,13 @@ class EffortExchange:
             return
         if self._commander.note(info):
             self.refusal = "a second publisher of effort_commands"
-            self.command = EffortCommand(None, time.monotonic())  # fails the start gate
+            self.newest = Efforts(None, time.monotonic(), False, False)  # fails the start gate
             if loop.safety.state in CARRYING:
                 loop.trip(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
         elif not isinstance(message, bytes):
-            self._take(loop, message)
+            self._receive(loop, message)
 
-    def _take(self, loop: ControlLoop, message: JointState) -> None:
+    def _receive(self, loop: ControlLoop, message: JointState) -> None:
         answered = self._published.get(to_nanoseconds(message.header.stamp))
         if answered is None:
             self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
@@ -105,4 +106,4 @@ class EffortExchange:
                 effort, self.refusal = None, str(error)
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
             is_late = message.header.frame_id == LATE_TILT
-            self.command = EffortCommand(effort, answered, bool(message.velocity), is_late)
+            self.newest = Efforts(effort, answered, bool(message.velocity), is_late)

@@ -23,7 +23,7 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import BusError, ExoGravityError, ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, motors_of, traffic_of
-from exo_gravity.core.safety.drive import NO_COMMAND, FaultCode, State
+from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
@@ -134,13 +134,12 @@ class CanBridge(LifecycleNode):
     @_transition
     def on_activate(self) -> None:
         """Start the control loop, and enable the arm once it passes the start gate."""
-        self._exchange.command = NO_COMMAND
+        self._exchange.newest = NO_EFFORTS
         assert self._owned, "the node is not configured"
         bus, self._bus = self._bus or self._owned.open(), None
         period = self._arm.period
         safety = SafetyMachine(self._arm.limits, period, self._arm.motors)
-        hand_over = self._owned.watchdog.hand_over
-        loop = ControlLoop(bus, safety, period, self._exchange.publish, self._exchange.get_efforts, hand_over)
+        loop = ControlLoop(bus, safety, period, self._exchange, self._owned.watchdog.hand_over)
         loop.start()
         try:
             request_real_time(self._thread_priority, self.get_logger().warning)
@@ -196,7 +195,7 @@ class CanBridge(LifecycleNode):
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
             self._look_at(self._owned.watchdog, self.loop)
-        self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
+        self._report.send(self.loop, self._exchange.newest, self._exchange.refusal)
 
     def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
@@ -207,7 +206,7 @@ class CanBridge(LifecycleNode):
 
     def _report_descent(self) -> None:
         with contextlib.suppress(Exception):  # whatever the middleware does, the arm comes down
-            self._report.send(self.loop, self._exchange.command, self._exchange.refusal)
+            self._report.send(self.loop, self._exchange.newest, self._exchange.refusal)
 
 
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:

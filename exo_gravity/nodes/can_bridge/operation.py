@@ -19,7 +19,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, JointMotor, Traffic
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
-from exo_gravity.core.safety.drive import EffortCommand, FaultCode, State
+from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -41,7 +41,7 @@ FOLLOWS = {
     State.CHECKING: "torque follows in 3 s, at the first start in 10 s; if not, /diagnostics says what is missing",
     State.LETTING_DOWN: "the motors are switched off once the arm is down; /diagnostics shows the state",
 }
-UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
+MOTOR_UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
 
 
 def refuse_simulated_time(node: Node, interface: str) -> None:
@@ -97,7 +97,7 @@ class BridgeServices:
         if any(self._zero):
             return f"zero = {self._zero}: must be all 0 when the motors store the zero"
         is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
-        if safety.state is not State.DISABLED or is_silent or not safety.settled(now):
+        if safety.state is not State.DISABLED or is_silent or not safety.is_at_rest(now):
             return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
         loop.bus.set_zero()
         return ""
@@ -198,7 +198,7 @@ class BridgeReport:
         self._slow = SLOW / arm.period  # Hz
         self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
 
-    def send(self, loop: ControlLoop | None, newest: EffortCommand, refusal: str) -> None:
+    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: str) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
         operator = {HELD_BY: self._lease.holder or NOBODY}
         if loop is None:
@@ -249,7 +249,7 @@ def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:
     if loop.failure:
         return ERROR, f"the control thread has ended: {loop.failure}"
     if safety.is_unreached:
-        return ERROR, f"{safety.state.value}: {UNREACHED}"
+        return ERROR, f"{safety.state.value}: {MOTOR_UNREACHED}"
     if safety.fault:
         return ERROR, f"{safety.state.value}: {safety.fault.code}: {safety.fault.reason}"
     if safety.state is State.CHECKING:

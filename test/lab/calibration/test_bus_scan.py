@@ -15,8 +15,9 @@ from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration.bus_scan import DAMPED, BusScan
 from exo_gravity.sim import Firmware
+from exo_gravity.sim.virtual_time import Wire
 
-from ...hardware.virtual_time import Responder, Wire
+from ...hardware.wires import Responder
 from ...support.simulated_device import SPECS, frame, make_device
 
 ADDRESS = ("wire", f"of process {os.getpid()}", {})
@@ -130,7 +131,7 @@ def test_a_bus_that_a_bridge_holds_is_refused_with_its_holder_and_free_after_the
 
 def test_a_bus_whose_motors_a_dead_bridge_may_have_left_on_is_refused_and_released(wire: Wire) -> None:
     lock = BusLock(ADDRESS, "a bridge")
-    lock.notes.note(lock.notes.drive._replace(powered=True))
+    lock.notes.note(lock.notes.drive, True)
     lock.release()
     with pytest.raises(BusError, match="may have left the motors on: start can_bridge"):
         scan_of(wire)

@@ -5,6 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.calibration.random_device import (
+    CANDIDATES,
+    CODE,
+    LEANING,
+    LENGTH,
+    UPRIGHT,
+    WEIGHT,
+    Device,
+    best,
+    off_axis_of,
+)
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
@@ -12,8 +23,6 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.pose_fit import FIT, TYPICAL_MOMENTS
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
-
-from ...support.random_device import CANDIDATES, CODE, LEANING, LENGTH, UPRIGHT, WEIGHT, Device, best, off_axis_of
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.calibration.random_device import LEANING, LENGTH, Device, best
 from exo_gravity.core.arm.gravity import regressor
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import check_physical, identify
 from exo_gravity.lab.calibration.pose_fit import COUNT
 from exo_gravity.lab.calibration.poses import missing_pose
-
-from ...support.random_device import LEANING, LENGTH, Device, best
 
 SLIPS = {
     "one pose": {2: (0, 0, 0.3, 0)},

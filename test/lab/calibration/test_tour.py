@@ -86,7 +86,7 @@ def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
     positions = np.array(run.log)[:, 1:5]
     assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
     assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MOTION.speed
-    assert not run.acted
+    assert not run.safety.acted
 
 
 class Grip:

@@ -6,49 +6,51 @@ frames, frames of other senders) happens then, in order. Sending takes no time.
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import itertools
 import math
-import os
 import random
-import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Protocol
 
 import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
-from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.sim import SimulatedDevice
+from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
+from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.sim.device import REPLY_DELAY, SimulatedDevice
 
-INTERFACE = os.environ.get("EXO_TEST_CAN_INTERFACE", "")
-REPLY_DELAY = (200e-6, 400e-6)  # s, as of the simulated device in real time
 TICK = 0.002  # s between two looks at the arm
 
 
 class VirtualClock:
-    """A clock whose time passes in `sleep` and `run`."""
+    """A clock whose time passes in `sleep` and `run`. It is a `Clock` of the hardware.
 
-    def __init__(self) -> None:
-        self._nanoseconds = 100 * 10**9
+    start: its first time, s.
+    """
+
+    def __init__(self, start: float = 100.0) -> None:
+        self._nanoseconds = round(start * 1e9)
         self.slept = 0.0  # s, with the whole computer
         self._events: list[tuple[int, int, Callable[[], None]]] = []  # a heap: when, in which order, what
         self._order = itertools.count()
 
     def monotonic(self) -> float:
+        """Return the time in s."""
         return self._nanoseconds / 1e9
 
     def sleep(self, duration: float) -> None:
+        """Let `duration` s pass."""
         self.run(duration)
 
     def suspended(self) -> float:
+        """Return the time in s for which the computer has slept so far."""
         return self.slept
 
     def later(self, delay: float, function: Callable[[], None]) -> None:
+        """Call `function` in `delay` s."""
         heapq.heappush(self._events, (self._after(delay), next(self._order), function))
 
     def every(self, period: float, function: Callable[[], None]) -> Callable[[], None]:
@@ -82,6 +84,14 @@ class VirtualClock:
         return self._nanoseconds + max(0, math.ceil(duration * 1e9))
 
 
+class End(Protocol):
+    """What is connected to a `Wire`."""
+
+    def deliver(self, message: can.Message) -> None:
+        """Receive a frame that another end has sent."""
+        ...
+
+
 class VirtualBus(can.BusABC):
     """One end of a `Wire`, for python-can's users."""
 
@@ -92,6 +102,7 @@ class VirtualBus(can.BusABC):
         self._is_shutdown = False
 
     def deliver(self, message: can.Message) -> None:
+        """Keep a frame for `recv`."""
         clock, batch = self._wire.clock, self._wire.batch
         if batch:
             clock.later(-clock.monotonic() % batch, partial(self._received.append, message))
@@ -99,16 +110,19 @@ class VirtualBus(can.BusABC):
             self._received.append(message)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send a frame."""
         self._check()
         self._wire.carry(self, msg)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next frame, None if there is none within `timeout` s."""
         self._check()
         if not self._received:
             self._wire.clock.run(timeout or 0.0, lambda: self._received)
         return self._received.popleft() if self._received else None
 
     def shutdown(self) -> None:
+        """Leave the wire."""
         self._is_shutdown = True
         self._wire.leave(self)
 
@@ -123,40 +137,40 @@ class EchoingBus(VirtualBus, UdpMulticastBus):
     """One end of a `Wire` that echoes, known by its type as udp_multicast is."""
 
 
-class Responder:
-    """Answers each frame on `wire` with those that `answer` returns, at once. received: all frames."""
-
-    def __init__(self, wire: Wire, answer: Callable[[can.Message], list[can.Message]] = lambda message: []) -> None:
-        self.received: list[can.Message] = []
-        self._wire, self._answer = wire, answer
-        wire.ends.append(self)
-
-    def deliver(self, message: can.Message) -> None:
-        self.received.append(message)
-        for reply in self._answer(message):
-            self._wire.carry(self, reply)
-
-
 class Played:
-    """A simulated device on `wire`; `look` is called after every step of it."""
+    """A simulated device on `wire`, whose time passes with the clock's.
 
-    def __init__(self, wire: Wire, device: SimulatedDevice, look: Callable[[], None]) -> None:
+    look: called after every step of the device.
+    tick: s between two steps at most; None to step only before a frame is answered.
+    """
+
+    def __init__(self, wire: Wire, device: SimulatedDevice, look: Callable[[], None], tick: float | None) -> None:
         self._wire, self._device, self._look = wire, device, look
         self._last = wire.clock.monotonic()
         self._random = random.Random(0)
         wire.ends.append(self)
-        wire.clock.every(TICK, self.catch_up)
+        if tick:
+            wire.clock.every(tick, self.catch_up)
         for joint, motor in enumerate(device.motors):
             if not motor.joint.wire_format.replies:
                 wire.clock.every(1.0 / motor.firmware.status_rate, partial(self._report, joint))
 
     def deliver(self, message: can.Message) -> None:
+        """Let the device receive a frame, and send its reply."""
         if message.is_error_frame or message.is_fd:
             return
         self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if reply := self._device.exchange(frame_id, bytes(message.data)):
             self._wire.clock.later(self._random.uniform(*REPLY_DELAY), partial(self._send, reply))
+
+    def catch_up(self) -> None:
+        """Let the device's time pass until now."""
+        now = self._wire.clock.monotonic()
+        if now > self._last:
+            self._device.advance(now - self._last)
+            self._last = now
+            self._look()
 
     def _report(self, joint: int) -> None:
         self.catch_up()
@@ -166,24 +180,20 @@ class Played:
     def _send(self, frame: Frame) -> None:
         self._wire.carry(self, message_of(frame))
 
-    def catch_up(self) -> None:
-        """Let the device's time pass until now."""
-        now = self._wire.clock.monotonic()
-        self._device.advance(now - self._last)
-        self._last = now
-        self._look()
-
 
 class Wire:
-    """A CAN bus in virtual time. echoes: whether it returns each frame to its sender too, unmarked, as udp_multicast.
+    """A CAN bus in virtual time.
+
+    clock: by default one of its own, which begins at `start` s.
+    echoes: whether it returns each frame to its sender too, unmarked, as udp_multicast.
 
     refusal: what opening it raises, None if it can be opened. opened: how many ends were opened. loss: share of the
     frames that are lost. batch: s between two deliveries of the CAN adapters, 0 if they deliver at once.
     """
 
-    def __init__(self, clock: VirtualClock | None = None, echoes: bool = False) -> None:
-        self.clock = clock or VirtualClock()
-        self.ends: list[VirtualBus | Responder | Played] = []
+    def __init__(self, clock: VirtualClock | None = None, echoes: bool = False, start: float = 100.0) -> None:
+        self.clock = clock or VirtualClock(start)
+        self.ends: list[End] = []
         self.refusal: Exception | None = None
         self.opened = 0
         self.loss = self.batch = 0.0
@@ -201,9 +211,11 @@ class Wire:
         self.ends.append(bus)
         return bus
 
-    def play(self, device: SimulatedDevice, look: Callable[[], None] = lambda: None) -> Played:
-        """Connect a simulated device; call `look` after every step of it."""
-        return Played(self, device, look)
+    def play(
+        self, device: SimulatedDevice, look: Callable[[], None] = lambda: None, tick: float | None = TICK
+    ) -> Played:
+        """Connect a simulated device; see `Played`."""
+        return Played(self, device, look, tick)
 
     def break_down(self, error: Exception) -> None:
         """Let every end that is open now raise `error` from now on."""
@@ -215,6 +227,7 @@ class Wire:
         return self.clock.every(period, partial(self.carry, None, message))
 
     def carry(self, sender: object, message: can.Message) -> None:
+        """Deliver a frame to every end but its sender's, unless it is lost."""
         if self.loss and self._random.random() < self.loss:
             return
         for end in tuple(self.ends):
@@ -222,57 +235,6 @@ class Wire:
                 end.deliver(message)
 
     def leave(self, end: VirtualBus) -> None:
+        """Disconnect an end."""
         if end in self.ends:
             self.ends.remove(end)
-
-
-class RealWire:
-    """The bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name, used like a `Wire`, in real time."""
-
-    clock = COMPUTER_CLOCK
-
-    def __init__(self) -> None:
-        self._options: dict[str, Any] = {
-            "interface": INTERFACE,
-            "channel": os.environ["EXO_TEST_CAN_CHANNEL"],
-            "fd": True,
-        }
-        self._ends: list[can.BusABC] = []
-        self._stop = threading.Event()
-        self._threads: list[threading.Thread] = []
-
-    def open(self) -> can.BusABC:
-        self._ends.append(can.Bus(**self._options))
-        return self._ends[-1]
-
-    def play(self, device: SimulatedDevice) -> None:
-        self._start(lambda bus: device.run(bus, self._stop.is_set))
-
-    def repeat(self, message: can.Message, period: float) -> None:
-        self._start(lambda bus: [bus.send(message) for _ in iter(lambda: self._stop.wait(period), True)])
-
-    def close(self) -> None:
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
-        for end in self._ends:
-            end.shutdown()
-
-    def _start(self, run: Callable[[can.BusABC], object]) -> None:
-        self._threads.append(threading.Thread(target=run, args=(self.open(),)))
-        self._threads[-1].start()
-
-
-@contextlib.contextmanager
-def wire_for_test() -> Iterator[Wire | RealWire]:
-    """A wire in virtual time, or the bus that the environment names."""
-    wire = RealWire() if INTERFACE else Wire()
-    yield wire
-    if isinstance(wire, RealWire):
-        wire.close()
-
-
-def message_of(frame: Frame) -> can.Message:
-    """Return the message of a frame, whose ID contains `EXTENDED` if it has 29 bits."""
-    frame_id, data = frame
-    return can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
