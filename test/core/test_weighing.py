@@ -44,21 +44,21 @@ class Balance(Compensator):
 
     def __init__(self, settings: Settings, at: float) -> None:
         super().__init__(settings)
-        self.weighing = Weighing(settings, JOINTS, RATE)
+        self._planned = Weighing(settings, JOINTS, RATE)
         self._at = at
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the answer that the bridge gets."""
         if now >= self._at and self.weighing is None:
-            assert self.weigh(self.weighing) == ""
-            assert self.weigh(self.weighing) == "a weighing is under way"
+            assert self.weigh(self._planned) == ""
+            assert self.weigh(self._planned) == "a weighing is under way"
         return super().step(now, theta, velocity)
 
 
 def weigh(mass: float, *after: dict[str, Any]) -> tuple[Weighing, str, np.ndarray]:
     """Weigh `mass` kg; return the weighing, what went wrong with the arm, and its speeds (n, 4) rad/s.
 
-    after: what the wearer does in place of relaxing, from when he has brought the arm to POSE.
+    after: what the wearer does in place of relaxing, from when they have brought the arm to POSE.
     """
     arm = SimulatedArm(ArmConfig(wearer_mass=SETTINGS.wearer_mass, wearer_cog=SETTINGS.wearer_cog))
     arm.carry(mass)

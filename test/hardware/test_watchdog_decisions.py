@@ -60,7 +60,7 @@ class Bridge:
         self.log: list[str] = []
         self.inhibited: list[bool] = []
         self.drive = self.rig.drive
-        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive, True))
+        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive, self.drive.powered))
         self.listener = Responder(self.rig.wire)
 
     def kill(self) -> None:

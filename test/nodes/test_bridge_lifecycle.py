@@ -31,7 +31,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 @pytest.fixture
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setattr(owned_bus, "ATTEMPT_TIME", 0.1)
-    monkeypatch.setattr(descent, "REST_TIME", 0.2)
+    monkeypatch.setattr(descent, "DESCENT", replace(descent.DESCENT, rest_time=0.2))
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     rig = SimulatedRig(friction=0.5, pose=NO_TORQUE)  # more friction than the pushes of the switch-on check
     yield rig

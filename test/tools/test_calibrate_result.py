@@ -85,7 +85,7 @@ def test_a_new_value_joins_the_mapping_that_it_belongs_to(tmp_path: Path) -> Non
     robot = "    robot: {mass: [0.5, 0.4, 0.5, 0.2], cog: [0.04, 0.11, 0.23, 0.12]}"
     assert added == [
         f"    {comments[0]}",
-        f"{robot[:-1]}, moments: [0.1, 0.2, 0.3, 0.05]}}",
+        f"{robot[:-1]}, first_moment: [0.1, 0.2, 0.3, 0.05]}}",
         f"      {comments[1]}",
         "      cog: [0.0, 0.0, 0.1, 0.1]",
         f"    {comments[2]}",

@@ -11,18 +11,18 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
 TRUSTED = "core.safety.machine:SafetyMachine._is_trusted"  # zeros and signs
 ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDescent", "JointDescent.__init__"))
-DESCENT_GROWTH, DESCENT_DRIVEN = (f"core.safety.descent:{name}" for name in ("BRAKE_GROWTH", "DRIVEN_SPEED"))
+DESCENT = "core.safety.descent:DESCENT"  # its tuning
 DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
-SUPPLY = "core.safety.monitors:SupplyMonitor.doubt"
+SUPPLY = "core.safety.monitors:SupplyMonitor.suspect"
 RIDE, RIDING = (f"core.safety.monitors:RideThrough.{name}" for name in ("step", "is_riding"))
-MONITOR, PATIENCE = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:PATIENCE"
+MONITOR, MOTION = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:MOTION"
 SHAPE = "core.safety.limits:Limits.shape"
 LEASE = "core.safety.lease:Lease.lost"
 COMPENSATOR = "core.compensation.compensator:Compensator.step"
@@ -86,6 +86,11 @@ def becomes(value: Any) -> Callable[[Any], Any]:
     return lambda _: value
 
 
+def tuned(**fields: float) -> Callable[[Any], Any]:
+    """Have these values in a record of tuning."""
+    return lambda record: replace(record, **fields)
+
+
 def always(value: Any) -> Callable[[Any], Any]:
     """Be an attribute that has this value, whatever is assigned."""
     return lambda _: property(lambda self: value, lambda self, assigned: None)
@@ -139,9 +144,9 @@ def without_timeout(limits: Any, *others: Any) -> Any:
     return patient, *others
 
 
-def once(doubt: Callable[..., None]) -> Callable[..., None]:
-    """Doubt the motors only when the monitor is made."""
-    return lambda self, held: None if hasattr(self, "unsure") else doubt(self, held)
+def once(suspect: Callable[..., None]) -> Callable[..., None]:
+    """Suspect the motors only when the monitor is made."""
+    return lambda self, held: None if hasattr(self, "unsure") else suspect(self, held)
 
 
 def rides_on(fault: Any, ride: Any, *_: Any) -> None:
@@ -232,14 +237,14 @@ DEFECTS = (
         "the brake of the descent grows without a bound",
         (PRESSED,),
         {
-            DESCENT_GROWTH: becomes(math.inf),
+            DESCENT: tuned(brake_growth=math.inf),
             JOINT_DESCENT: with_arguments(lambda effort, damping, most: (effort, damping, 18.0)),
         },
     ),
     Defect(
         "the descent drives a joint that the wearer pushed down",
         (PRESSED,),
-        {DESCENT_DRIVEN: becomes(math.inf)},
+        {DESCENT: tuned(driven_speed=math.inf)},
     ),
     Defect(
         "the last effort of an outer loop that ended stays",
@@ -286,7 +291,7 @@ DEFECTS = (
     Defect(
         "unexplained torque is passed on, and takes ten times as long",
         (WRONG_SIGN,),
-        {MONITOR: after(lambda result, self, dt, joints, effort, *_: (effort, result[1])), PATIENCE: becomes(0.15)},
+        {MONITOR: after(lambda result, self, dt, joints, effort, *_: (effort, result[1])), MOTION: tuned(patience=0.15)},
     ),
 )  # fmt: skip
 
