@@ -291,7 +291,10 @@ DEFECTS = (
     Defect(
         "unexplained torque is passed on, and takes ten times as long",
         (WRONG_SIGN,),
-        {MONITOR: after(lambda result, self, dt, joints, effort, *_: (effort, result[1])), MOTION: tuned(patience=0.15)},
+        {
+            MONITOR: after(lambda result, self, dt, joints, effort, *_: (effort, result[1])),
+            MOTION: tuned(patience=0.15),
+        },
     ),
 )  # fmt: skip
 
