@@ -158,7 +158,7 @@ def session(tmp_path_factory, request):
 def test_a_node_may_do_exactly_what_it_does(session):
     policy, (found, parameters_read) = read_policy(), session
     arms = [f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator")]
-    requests = {node: found[node]["request"] for node in NODES if not node.endswith("compensator")}
+    requests = {node: found[node]["request"] for node in NODES if not node.endswith("wearer")}
     requests["/recorder"] = reads(parameters_read)
     for node in NODES:
         for kind in ("publish", "subscribe", "reply"):

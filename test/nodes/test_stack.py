@@ -14,7 +14,8 @@ import pytest
 import yaml
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.tools import launcher, train_anfis
+from exo_gravity.lab import processes
+from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes, children
@@ -125,8 +126,8 @@ def kill_bridge_and_watchdog(nodes: LaunchedNodes) -> None:
 
 @pytest.mark.thorough
 def test_the_launcher_states_that_motors_may_still_be_powered(launch, probe, monkeypatch):
-    monkeypatch.setattr(launcher, "DESCENT_TIMEOUT", 5.0)
-    monkeypatch.setattr(launcher, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})
+    monkeypatch.setattr(processes, "DESCENT_TIMEOUT", 5.0)
+    monkeypatch.setattr(processes, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})
     nodes = launch(without=("imu",), compensator=NO_IMU)
     probe.wait_until_carried()
     (watchdog,) = children(nodes.pid("can_bridge"))
