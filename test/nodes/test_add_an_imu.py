@@ -1,7 +1,7 @@
 """CONTRIBUTING, "Add an IMU", followed literally: a class with `read` and `close`, and its name in two places."""
 
 import pytest
-from rclpy.time import Time
+import rclpy
 
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.trunk.params import IMU_SOURCES
@@ -24,31 +24,21 @@ class LevelImu(ImuSource):
         self.is_open = False
 
 
-class Node:
-    """What ImuDevice needs of a node."""
-
-    def __init__(self, clock):
-        self.clock, self.published = clock, []
-
-    def create_publisher(self, msgtype, topic, depth):
-        return self
-
-    def publish(self, message):
-        self.published.append(message)
-
-    def get_clock(self):
-        return self
-
-    def now(self):
-        return Time(nanoseconds=round(self.clock.monotonic() * 1e9))
+@pytest.fixture
+def node():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("imu", context=context)
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
 
 
-def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monkeypatch):
+def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monkeypatch, node):
     monkeypatch.setitem(SOURCES, "level", LevelImu)
     clock, received = VirtualClock(), []
-    device = ImuDevice(
-        Node(clock), {"source": "level", "rate": 100.0}, "/imu/data_raw", lambda m, info: received.append(m), clock
-    )
+    values = {"source": "level", "rate": 100.0}
+    device = ImuDevice(node, values, "/imu/data_raw", lambda message, info: received.append(message), clock)
     for _ in range(3):
         clock.sleep(0.01)
         device.poll()

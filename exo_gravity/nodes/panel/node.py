@@ -39,7 +39,7 @@ from exo_gravity.panel.view import PANEL, LoadChanges, Values, joint_rows, setup
 
 
 @dataclass(frozen=True)
-class Timing:
+class PanelTiming:
     """When the panel looks, and how long it waits."""
 
     state_period: float = 0.1  #: s between two states that the pages get
@@ -50,7 +50,7 @@ class Timing:
     look_period: float = 0.005  #: s between two looks for an answer
 
 
-TIMING = Timing()
+TIMING = PanelTiming()
 
 
 BRIDGE, COMPENSATOR, WEARER = "can_bridge", "compensator", "wearer"

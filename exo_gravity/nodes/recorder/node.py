@@ -49,7 +49,7 @@ UNNAMED = "_NODE_NAME_UNKNOWN_"  # what the RMW calls a publisher whose node it 
 
 
 @dataclass(frozen=True)
-class Timing:
+class RecorderTiming:
     """When the recorder looks and writes, and what it keeps until then."""
 
     drain_period: float = 0.05  #: s between two writes of what has arrived
@@ -62,7 +62,7 @@ class Timing:
     silence: float = 0.5
 
 
-TIMING = Timing()
+TIMING = RecorderTiming()
 
 
 class Recorder(Node):

@@ -34,7 +34,7 @@ COMPENSATOR, BRIDGE = "compensator", "can_bridge"  # the nodes of an arm
 
 
 @dataclass(frozen=True)
-class Timing:
+class ModelTiming:
     """When the arms are looked for and shown, and until when."""
 
     discovery_period: float = 0.5  #: s between two searches for arms
@@ -43,7 +43,7 @@ class Timing:
     stale_state: float = 2.0  #: s; states come twice a second
 
 
-TIMING = Timing()
+TIMING = ModelTiming()
 
 
 KINDS = {ARROW: Marker.ARROW, LINE: Marker.LINE_STRIP, SPHERE: Marker.SPHERE, TEXT: Marker.TEXT_VIEW_FACING}

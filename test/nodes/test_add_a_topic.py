@@ -1,0 +1,55 @@
+"""CONTRIBUTING, "Add a topic", followed literally: a topic of an arm, with an entry in the recorder's table."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rosbags.highlevel import AnyReader
+from std_msgs.msg import Float64
+
+from exo_gravity.lab.bag.content import arm_of, leaf
+
+from ..support.waiting import PATIENCE, wait_until
+
+RECORDER = """
+from std_msgs.msg import Float64
+from exo_gravity.nodes.recorder import node
+node.TYPES["grip_force"] = Float64
+node.main()
+"""
+
+
+@pytest.fixture
+def gripper():
+    """A node of the left arm, and its executor."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = rclpy.create_node("gripper", namespace="/left", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    yield node, executor
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def test_a_new_topic_is_recorded_in_the_arms_namespace(gripper, tmp_path):
+    node, executor = gripper
+    publisher = node.create_publisher(Float64, "grip_force", 1)
+    command = [sys.executable, "-c", RECORDER, "--ros-args", "-p", f"output:={tmp_path / 'bag'}"]
+    recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        wait_until(publisher.get_subscription_count, lambda: executor.spin_once(timeout_sec=0.01))
+        publisher.publish(Float64(data=12.5))
+        wait_until(lambda: publisher.wait_for_all_acked(), lambda: executor.spin_once(timeout_sec=0.01))
+    finally:
+        recorder.send_signal(signal.SIGINT)
+        assert recorder.wait(PATIENCE) == 0
+    with AnyReader([tmp_path / "bag"]) as bag:
+        (connection,) = [each for each in bag.connections if leaf(each.topic) == "grip_force"]
+        messages = [bag.deserialize(data, connection.msgtype) for _, _, data in bag.messages([connection])]
+    assert arm_of(connection.topic) == "left"
+    assert [message.data for message in messages] == [12.5]
