@@ -66,7 +66,7 @@ def quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress
 
 
 def rows_of(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
-    """Yield the table's rows of the loop `name` at `rate` (Hz): runs of `kind` beside those of its peers."""
+    """Yield the table's rows of the loop `name` at `rate` (Hz): runs of `kind` next to those of its peers."""
     period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
     if kind not in runs:
         disturbed = any(run.is_disturbed for run in runs.values())

@@ -107,7 +107,7 @@ class Passive(VirtualWearer):
 class Fast(VirtualWearer):
     """A wearer who reaches, shakes, claps, throws, pushes down and rests, by chance and as fast as is permitted.
 
-    Before and after he rests. Whatever makes a joint faster than FASTEST, he brakes it.
+    They rest before and after. They brake every joint that is faster than FASTEST, whatever drives it.
     """
 
     def __init__(self, script: TrialScript, seed: int) -> None:
@@ -210,7 +210,7 @@ class Fast(VirtualWearer):
 def bounded(joint: int, torque: float, angle: float, velocity: float) -> float:
     """Return the `torque` in Nm of a wearer who drives no joint beyond FASTEST, and brakes one that is faster.
 
-    His body stops the arm softly at the edges of its range.
+    The wearer's body stops the arm softly at the edges of its range.
     """
     excess = max(0.0, abs(velocity) - FASTEST)
     driving = max(0.0, 1.0 - 2.0 * excess) if torque * velocity > 0.0 else 1.0

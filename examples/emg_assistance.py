@@ -3,7 +3,7 @@
 Subscribes to /emg (std_msgs/Float32MultiArray, biceps and triceps in V, sample after sample, 1,000 a second) and
 publishes /right/assist_efforts at 100 Hz. The compensator adds them once `assist.max_effort` is not 0.
 
-Without electrodes: `python examples/emg_assistance.py --pretend` publishes a pretended EMG on /emg as well, biceps and
+Without electrodes: `python examples/emg_assistance.py --pretend` publishes a synthetic EMG on /emg as well, biceps and
 triceps in turn, 2 s each.
 """
 
@@ -94,7 +94,7 @@ class EmgAssistance(Node):
 
 
 def pretend(node):
-    """Publish a pretended EMG: noise on an electrode's offset, as strong as the contraction of the moment."""
+    """Publish a synthetic EMG: noise on an electrode's offset, as strong as the present contraction."""
     publisher = node.create_publisher(Float32MultiArray, "/emg", 10)
     begin = node.get_clock().now()
 

@@ -1,7 +1,7 @@
 """Teach and repeat on a simulated arm, without ROS: a hand leads the weightless arm, then a soft spring leads it back.
 
 The law carries the arm; the term `spring` pulls it along the recorded path with little torque, so that a person in it
-can stop or divert it at any time. A plot shows both ways; with a file's name (.png, .pdf, .svg) it is written there
+can stop or divert it at any time. A plot shows both paths; with a file's name (.png, .pdf, .svg) it is written there
 instead.
 """
 
@@ -27,7 +27,7 @@ from exo_gravity.sim.virtual_arm import VirtualArm
 
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 PERIOD = 0.004  # s
-APPROACH = 12.0  # s for the spring to take effect, a guided change, and to bring the arm to the begin of the path
+APPROACH = 12.0  # s for the spring to take effect, a guided change, and to bring the arm to the start of the path
 LED = [[0.2, 0.6, 0.5, 0.6], [0.3, 0.9, 0.8, 0.9], [0.0, 0.5, 0.4, 0.5]]  # rad, where the hand goes, 2 s each
 
 robot = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -60,7 +60,7 @@ for _ in range(round(APPROACH / PERIOD)):
     cycle()
 repeated = [cycle() for _ in poses]
 errors = [degrees(dist(a, b)) for a, b in zip(poses, repeated, strict=True)]
-print(f"The arm repeats the way within {max(errors):.1f} degrees, on average {sum(errors) / len(errors):.1f}.")
+print(f"The arm repeats the path within {max(errors):.1f} degrees, on average {sum(errors) / len(errors):.1f}.")
 
 axis = plt.figure(layout="constrained").subplots()
 times = [PERIOD * row for row in range(len(poses))]

@@ -77,12 +77,12 @@ def test_without_torque_the_same_simulated_arm_falls(capsys, monkeypatch):
     assert moved(output) > 20.0
 
 
-def test_the_simulated_arm_repeats_the_way_that_a_hand_taught_it(capsys):
+def test_the_simulated_arm_repeats_the_path_that_a_hand_taught_it(capsys):
     variables, output = run("teach_and_repeat.py", capsys)
-    match = re.fullmatch(r"The arm repeats the way within ([0-9.]+) degrees, on average ([0-9.]+)\.\n", output)
+    match = re.fullmatch(r"The arm repeats the path within ([0-9.]+) degrees, on average ([0-9.]+)\.\n", output)
     assert match and float(match[1]) < 15.0 and float(match[2]) < 6.0
     taught, repeated = np.degrees(variables["poses"]), np.degrees(variables["repeated"])
-    assert np.ptp(taught, axis=0).min() > 15.0  # there was a way to repeat
+    assert np.ptp(taught, axis=0).min() > 15.0  # there was a path to repeat
     assert np.abs(repeated[-1] - taught[-1]).max() < 6.0
 
 

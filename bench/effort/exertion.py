@@ -1,8 +1,8 @@
-"""A wearer's exertion: a virtual wearer moves the simulated arm along paths, and his torque is measured.
+"""A wearer's exertion: a virtual wearer moves the simulated arm along paths, and the wearer's torque is measured.
 
-His hand is that of the virtual wearer, and stronger; his passive arm is in the exoskeleton. Without help he carries
-both, and overcomes their friction and inertia. The controller exchanges one CAN frame with each motor a cycle; there is
-no safety machine.
+The hand is that of the virtual wearer, and stronger; the wearer's passive arm is in the exoskeleton. Without help they
+carry both, and overcome their friction and inertia. The controller exchanges one CAN frame with each motor a cycle;
+there is no safety machine.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ The wearer's passive arm is `WEARER_EXCESS` heavier than configured. Motors may 
 wearer of 75 kg is beyond what they are rated for. The terms know ninety per cent of the joints' friction.
 
 Freebal's measure is the workspace that a weak arm reaches. A weak wearer has only a share of the torque that the
-outstretched arm requires. He moves the arm from a low pose straight to each pose of a grid, and reaches it if on the
-whole way, on every joint, his strength exceeds what compensation leaves of the weight, plus friction. The motion is
+outstretched arm requires. They move the arm from a low pose straight to each pose of a grid, and reach it if on the
+whole way, on every joint, their strength exceeds what compensation leaves of the weight, plus friction. The motion is
 slow: inertia is left out.
 """
 
@@ -113,7 +113,7 @@ class Study:
                 yield name, task.name, measure(device, self.arm.motors, self.settings[name], task, rate)
 
     def workspaces(self) -> Iterator[tuple[str, float, float]]:
-        """Yield setting, strength of a weak wearer as a share, and the share of the workspace that he reaches."""
+        """Yield setting, strength of a weak wearer as a share, and the share of the workspace that they reach."""
         bounds = zip(self.arm.low[1:], self.arm.high[1:], GRID, strict=True)
         grid = np.array(list(product((0.0,), *(np.linspace(low, high, count) for low, high, count in bounds))))
         config, wearer = device_of(self.simulator).arm.config, self.settings[ONE_G]

@@ -1,6 +1,6 @@
 """python -m bench.wearer [--devices 20] [--first 0] [--output build/wearer]: the study of `wearer_efforts`.
 
-Random calibrated devices with a virtual wearer go through one trial each, weigh loads in his hand, and adapt to one who
+Random calibrated devices with a virtual wearer go through one trial each, weigh loads in the hand, and adapt to one who
 tires, offline and on one core, 1 to 2 minutes each. It prints a table, writes it and a picture of the first trial, and
 exits with 1 if a limit is missed.
 """

@@ -52,8 +52,8 @@ HANGING = (0.0, 0.05, 0.05, 0.05)  # rad
 class Worn:
     """A device with a wearer in it. settings, motors: as calibrated; the rest is the truth.
 
-    mounting: (3,) rad, the rotation of gravity that calibration leaves. ways: his arm by each of the three ways of
-    `ways.py`.
+    mounting: (3,) rad, the rotation of gravity that calibration leaves. ways: the wearer's arm by each of the three
+    ways of `ways.py`.
     """
 
     seed: int

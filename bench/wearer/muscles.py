@@ -1,8 +1,8 @@
-"""A virtual wearer with muscles: he reaches and holds, rests in the device, lifts a share of his arm, and tires.
+"""A virtual wearer with muscles, who reaches and holds, rests in the device, lifts a share of their arm, and tires.
 
-His torque is the sum of an impedance about the path that he means to follow, which muscles and reflexes give at once,
-and of what he commands: a share of his arm's weight, plus a slow correction. Commands come DELAY late and through
-ACTIVATION, with noise in proportion to the torque (signal-dependent noise, Harris and Wolpert 1998).
+Their torque is the sum of an impedance about the path that they mean to follow, which muscles and reflexes give at
+once, and of what they command: a share of their arm's weight, plus a slow correction. Commands come DELAY late and
+through ACTIVATION, with noise in proportion to the torque (signal-dependent noise, Harris and Wolpert 1998).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ STRENGTH = 30.0  # Nm
 class Phase(NamedTuple):
     """A pose that is reached in `move` s and held for `hold` s.
 
-    lifted: the shares of his arm that he lifts at the start and the end. rests: he lets go while it is held.
+    lifted: the shares of their arm that the wearer lifts at the start and the end. rests: they let go while it is held.
     """
 
     pose: tuple[float, ...]
@@ -46,7 +46,8 @@ class Phase(NamedTuple):
 class Muscles(VirtualWearer):
     """Goes through `phases`, whatever the trunk's `script` does meanwhile.
 
-    arm: his own. tilt: called for the trunk's true tilt. log: s, torque (4,) Nm and weight (4,) Nm at every step.
+    arm: the wearer's own. tilt: called for the trunk's true tilt. log: s, torque (4,) Nm and weight (4,) Nm at every
+    step.
     """
 
     def __init__(
@@ -62,11 +63,11 @@ class Muscles(VirtualWearer):
         self._index, self._end = -1, sum(phase.move + phase.hold for phase in phases)
 
     def idle(self, elapsed: float, duration: float) -> bool:
-        """Return False: he always has a torque."""
+        """Return False: the muscles always have a torque."""
         return False
 
     def strength_at(self, elapsed: float, weight: float) -> float:
-        """Return the most in Nm that he gives at a joint where his arm's weight takes `weight` Nm."""
+        """Return the largest torque in Nm at a joint where the weight of the wearer's arm takes `weight` Nm."""
         return STRENGTH
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
@@ -99,7 +100,7 @@ class Muscles(VirtualWearer):
             step = STEP / NOISE_TIME
             self._noise[n] += -step * self._noise[n] + math.sqrt(2.0 * step) * self._random.gauss(0.0, 1.0)
             whole = at_once + self._active[n] * (1.0 + NOISE * self._noise[n])
-            yielding = (1.0 - held) * DAMPING[n] * (speed - velocity[n])  # also beyond his strength
+            yielding = (1.0 - held) * DAMPING[n] * (speed - velocity[n])  # also beyond their strength
             given.append(max(-most, min(most, whole)) + yielding)
         self._late.popleft()
         self._late.append(wanted)

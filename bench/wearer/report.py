@@ -88,12 +88,12 @@ def picture(trial: Trial) -> Figure:
     lower.fill_between(time, value - width, value + width, color=JOINT_COLOURS[2], alpha=0.25, lw=0)
     lower.plot(time, value, color=JOINT_COLOURS[2], lw=1.2, label="share over 1 s, with its 95 % band")
     lower.plot(time, 100.0 * true.value, color=INK, lw=0.9, ls=(0, (4, 2)), label="true share")
-    lower.set(ylabel="Share of his arm's weight (%)", xlabel="Time (s)", ylim=(-40.0, 140.0), xlim=(0.0, time[-1]))
+    lower.set(ylabel="Share of their arm's weight (%)", xlabel="Time (s)", ylim=(-40.0, 140.0), xlim=(0.0, time[-1]))
     moving = trial.kind == KINDS.index("trunk in motion")
     for axis in (upper, lower):
         axis.fill_between(
             time, 0, 1, where=moving, transform=axis.get_xaxis_transform(), color=PUSH_COLOUR, lw=0, zorder=0,
-            label="his trunk bows or walks",
+            label="the trunk bows or walks",
         )  # fmt: skip
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         make_plain(axis)

@@ -1,7 +1,7 @@
 """An arm of the wearer that moves relative to the robot's: straps that give, and a shoulder that moves.
 
-The wearer's arm is modelled separately from the robot's, with the same joints, and his muscles act on it. Springs and
-dampers tie it to the robot at two cuffs. His shoulder moves up and towards the spine as he raises the upper arm
+The wearer's arm is modelled separately from the robot's, with the same joints, and the muscles act on it. Springs and
+dampers tie it to the robot at two cuffs. The shoulder moves up and towards the spine as the upper arm rises
 (scapulo-humeral rhythm).
 """
 
@@ -22,8 +22,8 @@ STRAP, STRAP_DAMPING = 2000.0, 40.0  # N/m and N s/m of each cuff
 CUFFS = (0.2, 0.2)  # m along the upper arm and the forearm
 SHOULDER, SHOULDER_DAMPING, GIRDLE = 5000.0, 200.0, 2.0  # N/m, N s/m and kg
 RHYTHM = np.array((-0.02, 0.0, -0.03))  # m in the base's axes at 90 degrees of elevation: to the spine, and up
-LIGHT = 0.001  # kg; links of his chain in which there is no segment
-INERTIA = (0.002,) * 4  # kg m^2, of flesh about each of his joints
+LIGHT = 0.001  # kg; links of the wearer's chain in which there is no segment
+INERTIA = (0.002,) * 4  # kg m^2, of flesh about each of the wearer's joints
 
 
 class StrappedArm(SimulatedArm):
@@ -42,7 +42,7 @@ class StrappedArm(SimulatedArm):
         super().__init__(replace(config, wearer_mass=NO_TORQUE))
 
     def hold(self, wearer: VirtualWearer) -> None:
-        """Let `wearer` act on his own joints from now on, and not on the robot's."""
+        """Let `wearer` act on their own joints from now on, and not on the robot's."""
         own = wearer.torque
 
         def torque(elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:

@@ -32,7 +32,7 @@ def trials(worn: Worn) -> list[Trial]:
 def table(found: Sequence[Sequence[Trial]]) -> str:
     """Return the table of all devices' `trials`."""
     lines = [
-        "| between his arm and the robot | RMS error, Nm | within the 95 % band | share over a trial, off by | mean |",
+        "| between wearer and robot | RMS error, Nm | within the 95 % band | share over a trial, off by | mean |",
         "|---|---|---|---|---|",
     ]
     for name, column in zip(TIED, zip(*found, strict=True), strict=True):

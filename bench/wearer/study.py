@@ -1,7 +1,7 @@
-"""One device and its wearer through one trial, and how far what is estimated is from what his muscles did.
+"""One device and its wearer through one trial, and how far what is estimated is from what the muscles did.
 
-The trial has three parts: he lifts what the device does not, then rests in full support, then tires from 60 to 20 %
-while the support rises as much. His trunk stands, bows and walks meanwhile. The observer and what it is compared with
+The trial has three parts: they lift what the device does not, then rest in full support, then tire from 60 to 20 %
+while the support rises as much. Their trunk stands, bows and walks meanwhile. The observer and what it is compared with
 get the same recording, through CAN frames and their 12 bits, and the same IMU, once every 10 ms:
 
     motor - gravity   the motors' torque beyond what the calibrated model needs at rest, with the sign changed
@@ -41,7 +41,7 @@ from .strapped_arm import StrappedArm
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
-SUPPORT = (0.4, 1.0, (0.4, 0.8))  # while he lifts, rests and tires
+SUPPORT = (0.4, 1.0, (0.4, 0.8))  # while the wearer lifts, rests and tires
 LOW, HIGH = (-0.5, 0.3, 0.1, 0.3), (0.7, 1.2, 1.0, 1.4)  # rad, of the poses
 TRUNK: tuple[dict[str, Any], ...] = (
     {"hold": 13.0}, {"bow": 0.4, "over": 1.2}, {"hold": 3.0}, {"bow": 0.0, "over": 1.2}, {"hold": 8.0}, {"walk": 8.0},
@@ -58,8 +58,8 @@ class Played:
     """What one trial left: what was recorded, and what is true.
 
     trunk: (m, 7), s, angular velocity in rad/s and felt gravity in g as measured, in the trunk's axes. elapsed, torque,
-    weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of his muscles and that carry his arm. trouble: '' if
-    the arm was carried to the end.
+    weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of their muscles and that carry their arm. trouble: ''
+    if the arm was carried to the end.
     """
 
     worn: Worn
@@ -133,7 +133,7 @@ class WornImu:
 
 
 def phases_of(seed: int) -> tuple[Phase, ...]:
-    """Return the wearer's way: three poses while he lifts, two while he rests, three while he tires."""
+    """Return the wearer's way: three poses while they lift, two while they rest, three while they tire."""
     rng = np.random.default_rng(seed)
     poses = [tuple(rng.uniform(LOW, HIGH).tolist()) for _ in range(8)]
     lifts = [Phase(pose, 1.5, 3.0, (1.0 - SUPPORT[0],) * 2) for pose in poses[:3]]
@@ -144,7 +144,7 @@ def phases_of(seed: int) -> tuple[Phase, ...]:
 
 
 def play(worn: Worn, arm: StrappedArm | None = None, trunk: Sequence[dict[str, Any]] = TRUNK) -> Played:
-    """Play the trial of `worn`. arm: in which his arm is strapped to the robot's; None for one that is a part of it."""
+    """Play the trial of `worn`. arm: with the wearer's strapped to the robot's; None for one that is a part of it."""
     phases, device, imu = phases_of(worn.seed), worn.device(arm), WornImu(worn)
     ends = np.cumsum([phase.move + phase.hold for phase in phases])
     script = TrialScript.parse({"name": "wearer", "steps": list(trunk)})

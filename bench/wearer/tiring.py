@@ -1,6 +1,6 @@
 """A wearer who holds a pose and tires, with a support that adapts and with a fixed one.
 
-He means to hold the pose all the time. His muscles give no more than a share of his arm's weight, which falls from 60
+They mean to hold the pose all the time. Their muscles give at most a share of their arm's weight, which falls from 60
 to 20 % within a minute, stays there for 20 s, and comes back at once. Only their damping, with which a muscle yields,
 is beyond that.
 """
@@ -28,9 +28,9 @@ from .muscles import Muscles, Phase
 from .study import DELAY, HIGH, LOW, RATE, WornImu
 
 SUPPORT = 0.4
-SHARES = (0.6, 0.2)  # of his arm's weight, at the start and the end
+SHARES = (0.6, 0.2)  # of the weight of the wearer's arm, at the start and the end
 MOVE, RESTED, TIRING, TIRED, RECOVERED = 3.0, 3.0, 60.0, 20.0, 30.0  # s
-SPARE = 0.3  # Nm, with which he guides joints that carry nothing
+SPARE = 0.3  # Nm, with which the wearer guides joints that carry nothing
 FASTEST = 0.3  # rad/s
 
 
@@ -40,7 +40,7 @@ class Tiring(Muscles):
     motion: list[tuple[float, ...]]
 
     def strength_at(self, elapsed: float, weight: float) -> float:
-        """Return the most in Nm that he gives at a joint where his arm's weight takes `weight` Nm."""
+        """Return the largest torque in Nm at a joint where the weight of the wearer's arm takes `weight` Nm."""
         since = elapsed - MOVE - RESTED
         if since < 0.0:
             return super().strength_at(elapsed, weight)
@@ -81,9 +81,9 @@ class Adapting(Compensator):
 
 @dataclass(frozen=True, eq=False)
 class Tired:
-    """What became of one wearer. time, support: (n,) s from when he begins to tire, and 0..1.
+    """What became of one wearer. time, support: (n,) s from when they begin to tire, and 0..1.
 
-    speed: rad/s, of the fastest joint until his strength comes back. sunk: rad, furthest of any joint from the pose
+    speed: rad/s, of the fastest joint until their strength comes back. sunk: rad, furthest of any joint from the pose
     until then. trouble: '' if the arm was carried to the end.
     """
 
@@ -133,14 +133,14 @@ def verdict(pairs: Sequence[tuple[Tired, Tired]]) -> list[Row]:
     fastest = max(one.speed for one, _ in pairs)
     carried = sum(not one.trouble for pair in pairs for one in pair)
     rows = [
-        Row("tiring from 60 to 20 %: support once he is tired, from 40 %", _percent(tired), "", True),
-        Row("tiring from 60 to 20 %: 30 s after his strength came back", _percent(back), "", True),
+        Row("tiring from 60 to 20 %: support once they are tired, from 40 %", _percent(tired), "", True),
+        Row("tiring from 60 to 20 %: 30 s after their strength came back", _percent(back), "", True),
         Row("tiring from 60 to 20 %: fastest joint", f"{fastest:.2f} rad/s", f"{FASTEST} rad/s", fastest < FASTEST),
     ]
     for number, name in enumerate(("support that adapts", "fixed support")):
         sunk = np.degrees([pair[number].sunk for pair in pairs])
         shown = f"{np.median(sunk):.0f} degrees in the median, {sunk.max():.0f} at most"
-        rows.append(Row(f"tiring from 60 to 20 %: furthest from his pose, {name}", shown, "", True))
+        rows.append(Row(f"tiring from 60 to 20 %: furthest joint from the pose, {name}", shown, "", True))
     held = carried == 2 * len(pairs)
     rows.append(Row("tiring from 60 to 20 %: arms carried to the end", f"{carried} of {2 * len(pairs)}", "all", held))
     return rows

@@ -6,7 +6,7 @@ F. Just et al., J. NeuroEng. Rehabil. 17:13, 2020, compare them on ARMin. What t
     Full          torques measured in several resting poses: `calibrate wearer`
     Equilibrium   the table, scaled so that it balances the torques measured in one resting pose; not in the package
 
-A relaxed wearer at full support would carry the difference to his true arm.
+A relaxed wearer at full support would carry the difference to their true arm.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ POSES = 200
 
 
 def left_over(worn: Worn) -> np.ndarray:
-    """Return the share (3,) of his arm's weight that each of WAYS leaves to the wearer, RMS over poses."""
+    """Return the share (3,) of the arm's weight that each of WAYS leaves to the wearer, RMS over poses."""
     theta = np.random.default_rng(worn.seed).uniform(LOW, HIGH, (POSES, 4))
     true = gravity_torque(worn.wearer, theta)
     rest = [gravity_torque(way, theta) - true for way in worn.ways]

@@ -12,7 +12,7 @@ def keep_to_this_machine() -> None:
 
     This machine alone, unless EXO_GRAVITY_DISCOVERY_RANGE widens it. ROS's setup.bash exports
     ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, with which every host on the subnet could publish torques to a worn robot.
-    Whether a person chose that can't be told, so it does not count.
+    There is no way to know whether a person chose that, so it does not count.
     """
     reach = os.environ[ROS_RANGE] = os.environ.get(RANGE) or "LOCALHOST"
     if reach != "LOCALHOST":

@@ -89,7 +89,7 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
 
 
 def wearers(nodes: Nodes) -> list[str]:
-    """Return the nodes `wearer` to start beside the compensators of a file that has no key for them."""
+    """Return the nodes `wearer` to start with the compensators of a file that has no key for them."""
     found = []
     for node, values in nodes.items():
         namespace, _, name = node.rpartition("/")

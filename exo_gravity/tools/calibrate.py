@@ -21,7 +21,7 @@ from exo_gravity.tools.cli import extras, require_ros
 if TYPE_CHECKING:
     from exo_gravity.lab.calibration.result import CalibrationResult
 
-# Module in tools/calibration, and what the command finds.
+# Module in lab/calibration, and what the command finds.
 COMMANDS = {
     "motors": ("motors", "each joint's motor, direction and zero, found by moving the joints by hand"),
     "gravity": ("tours", "the robot's first moments, from a slow tour of poses"),

@@ -136,7 +136,7 @@ def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rise
         assert np.abs(at_rest).max() < 0.015
     arm = StrappedArm(config, 0.0 * RHYTHM)
     arm.reset(POSE)
-    arm.data.qfrc_applied[7:] = (0.0, 3.0, 0.0, 0.0)  # his muscles lift both arms by the straps
+    arm.data.qfrc_applied[7:] = (0.0, 3.0, 0.0, 0.0)  # the wearer's muscles lift both arms by the straps
     arm.step(torque, 250)
     assert arm.positions[1] > POSE[1] + 0.05
 

@@ -1,4 +1,4 @@
-"""The deliberate defects of `make mutations` can be injected into this package, and name rows of the fault matrix."""
+"""The deliberate defects of `make study NAME=mutations` can be injected here, and name rows of the fault matrix."""
 
 from __future__ import annotations
 

@@ -121,4 +121,4 @@ def test_a_wearer_who_moves_on_is_not_stopped():
         assert arm.top_speed < 1.3 * speed + 0.05
         felt[is_damped] = np.array(hand.torques)
     length = min(map(len, felt.values()))
-    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE.brake + 1.0  # Nm that the damping costs him
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE.brake + 1.0  # Nm that damping costs

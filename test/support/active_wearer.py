@@ -1,4 +1,4 @@
-"""A wearer who acts on the simulated arm: lifts, pushes, holds still, shakes, reaches, throws. `attach` lets him act.
+"""A wearer who acts on the simulated arm: lifts, pushes, holds still, shakes, reaches, throws. `attach` lets them act.
 
 A behaviour is a function of the time in s since it began and of the arm's true angles and velocities, (4,) rad and
 rad/s; it returns the wearer's torque (4,) in Nm on the joints. A behaviour remembers: make a new one for each arm.

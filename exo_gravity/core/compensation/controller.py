@@ -1,4 +1,4 @@
-"""A compensator beside the loop that asks it: samples in, efforts out, as the nodes exchange them, without messages."""
+"""A compensator in the same process as the loop that calls it: samples in, efforts out, without messages."""
 
 from collections.abc import Sequence
 

@@ -118,7 +118,7 @@ def _urdf(given: LawData) -> Law:
     return given.urdf
 
 
-#: what makes each law, by name. Raises ParameterError where the law knows nothing of such an arm
+#: what makes each law, by name. Raises ParameterError where the law does not cover such an arm
 LAWS: dict[str, Callable[[LawData], Law]] = {
     "exact": lambda given: ArmLaw(given.arm, exact_torque),
     "paper_static": _paper_static,

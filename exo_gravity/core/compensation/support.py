@@ -53,7 +53,7 @@ class SupportRequest:
             self._support, self._stamp = float(values[0]), stamp
 
     def fresh(self, now: float) -> float | None:
-        """Return the share that is asked for at `now`, None if nobody asks, or two do."""
+        """Return the share that is requested at `now`, None without a request, or while two senders contradict."""
         is_trusted = now - self._contradicted > self._tuning.distrust
         return self._support if is_trusted and now - self._stamp <= self._tuning.expires else None
 
@@ -65,7 +65,7 @@ class SupportRequest:
         """
         asked = self.fresh(now)
         if asked is None:
-            return set_support  # at once: this is no more than any other change of load
+            return set_support  # at once: this is a guided change of load like any other
         wanted = max(set_support, asked)
         if now - self._changed < self._tuning.pause or abs(wanted - present) < self._tuning.least_change:
             return max(set_support, present)

@@ -28,7 +28,7 @@ CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry 
 
 @dataclass(frozen=True)
 class WeighingTuning:
-    """When a load can be weighed, and when a result is believed."""
+    """When a load can be weighed, and when a result is accepted."""
 
     take_over: float = 4.0  #: s in which the motors take the load over
     cycles: int = 3  #: there and back

@@ -9,7 +9,7 @@ the joint's velocity and V the permitted speed:
     |v| > V, otherwise:   k grows
 
 A joint sinks when it moves against the torque that it carried when the descent began: that torque shows which way
-gravity pulls. So the brake only takes energy out of the arm, and a wearer who lifts it meets damping alone. The brake
+gravity pulls. So the brake only takes energy out of the arm, and a wearer who lifts it feels damping alone. The brake
 returns at once to what the joint carried, which balanced gravity. Beyond that it grows slowly: gravity changes slowly,
 a wearer who pushes does not. It never exceeds `max_effort`, or what the joint carried if that was more.
 

@@ -93,7 +93,7 @@ class SwitchOnCheck:
     """Checks that all four motors are on: short pushes each way, under damping, must appear in their replies.
 
     A motor is on if the regression of its replied on its commanded torque is at least `SWITCH_ON.share`. Each pair of
-    pushes tells 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
+    pushes separates 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
     after a pair may have missed its ENTER: it gets another one, until the time-out.
 
     effort: (4,) Nm to apply now.

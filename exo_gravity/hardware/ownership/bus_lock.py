@@ -188,7 +188,7 @@ class ArmLock:
 
 
 def is_asked_for(lock: socket.socket) -> bool:
-    """Return whether someone waits for the bus of `lock`, with a connection that is still open."""
+    """Return whether another process waits for the bus of `lock`, with a connection that is still open."""
     lock.setblocking(False)
     while True:
         try:

@@ -52,7 +52,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
     The joints on a bus that cannot be opened come after the others.
 
     log: called with each change worth knowing.
-    is_wanted: whether to give up while the bus or a motor cannot be reached, because someone else waits for the bus.
+    is_wanted: whether to give up while the bus or a motor cannot be reached, because another process waits for the bus.
     """
     ports: list[CanPort | None] = []
     is_logged = False

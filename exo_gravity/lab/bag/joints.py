@@ -75,7 +75,7 @@ def _layout(message: bytes) -> tuple[tuple[str, ...], np.ndarray, np.dtype[np.vo
     """
     try:
         decoded: Any = TYPES.deserialize_cdr(message, JOINT_STATE)
-    except Exception:  # rosbags raises what its generated code meets
+    except Exception:  # rosbags raises whatever its generated code raises
         raise DataError("a message is damaged, or is not a sensor_msgs/msg/JointState in CDR") from None
     order, count = "<" if message[1] == 1 else ">", len(decoded.name)
     fixed, at = [*range(4)], 12

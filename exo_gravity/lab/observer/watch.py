@@ -1,4 +1,4 @@
-"""All that is told of the wearer of one arm, from one sample to the next: torque, share, contacts, support."""
+"""All estimates of the wearer of one arm, from one sample to the next: torque, share, contacts, support."""
 
 import math
 from collections.abc import Sequence

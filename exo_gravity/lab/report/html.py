@@ -1,7 +1,7 @@
 """HTML pages that need nothing outside themselves, and the look of their figures.
 
 A function that returns a piece of HTML escapes every text that it is given; a line break in a heading is kept. The
-palette is that of Okabe and Ito (2008), told apart with any colour vision.
+palette is that of Okabe and Ito (2008), whose colours can be distinguished with any colour vision.
 """
 
 import base64

@@ -27,7 +27,7 @@ MIN_HOLD = 2.0  # s
 
 @dataclass(frozen=True)
 class AnalysisTuning:
-    """How holds and motions are told apart and measured."""
+    """How holds and motions are distinguished and measured."""
 
     window: float = 10.0  #: s, over which `Hold.stray` is judged
     pose_time: float = 0.5  #: s before and after a motion, over which its first and last pose are averaged

@@ -100,7 +100,7 @@ class WearerNode(Node):
         self._settings: Settings | None = None
         self._fixed: tuple[object, ...] = ()
         self._refusal = ""
-        # What is read and told, once the parameters are known.
+        # What is read and reported, once the parameters are known.
         self._names: list[str] = []
         self._joint_states: PolledSubscription | None = None
         self._trunk: Trunk | None = None
@@ -144,7 +144,7 @@ class WearerNode(Node):
             self._settings, self._refusal = None, f"law {URDF_LAW}: there is no wearer to estimate"
             return
         try:
-            settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is told in any case
+            settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
         except ParameterError as error:
             self._settings, self._refusal = None, f"the compensator has {error}"
             return
@@ -178,7 +178,7 @@ class WearerNode(Node):
         self._estimate()
 
     def _estimate(self) -> None:
-        """Publish what the newest joint state tells, if it is new."""
+        """Publish the estimate from the newest joint state, if it is new."""
         settings, watch = self._settings, self._watch
         if not settings or not watch or not self._joint_states or self._silence():
             return

@@ -33,7 +33,7 @@ class AssistTuning:
     fade: float = 0.05  #: s from full assistance to none
     max_rate: float = 10.0  #: Nm/s, the fastest change of the torque
     ramp: float = 0.5  #: s from none to full
-    recovery: float = 0.5  #: s without a wrong message, after which efforts are believed again
+    recovery: float = 0.5  #: s without a wrong message, after which efforts are accepted again
 
 
 ASSIST = AssistTuning()
