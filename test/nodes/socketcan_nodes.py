@@ -16,8 +16,8 @@ import yaml
 
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
 from exo_gravity.hardware.can.can_port import open_bus
-from exo_gravity.lab.processes import Launcher
 from exo_gravity.lab import processes
+from exo_gravity.lab.processes import Launcher
 
 CONFIG = Path(__file__).parents[2] / "config" / "sim.yaml"
 VCAN = ("socketcan", "vcan0")
@@ -72,7 +72,7 @@ def nodes(
     params.write_text(yaml.safe_dump(content))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(processes, "DESCENT_TIMEOUT", processes.DESCENT_TIMEOUT * SLOWER)
-    monkeypatch.setattr(processes, "RECOVERY_TIMEOUT", launcher.RECOVERY_TIMEOUT * SLOWER)
+    monkeypatch.setattr(processes, "RECOVERY_TIMEOUT", processes.RECOVERY_TIMEOUT * SLOWER)
     log: list[str] = []
     nodes = Launcher(params, lambda node, line: log.append(f"{node}: {line}"))
     nodes.start()
