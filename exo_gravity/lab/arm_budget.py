@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.budget import (
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.errors import named
+from exo_gravity.lab.budget import (
     JointBudget,
     budget,
     largest_support,
@@ -22,8 +24,6 @@ from exo_gravity.core.arm.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.errors import named
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 if TYPE_CHECKING:

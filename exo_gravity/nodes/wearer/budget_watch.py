@@ -11,9 +11,9 @@ from typing import Any
 from rclpy.node import Node
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 WITHIN = "within rated torque everywhere"

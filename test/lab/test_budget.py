@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.budget import (
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.lab.budget import (
     FAMILY,
     budget,
     motor_for,
@@ -16,9 +19,6 @@ from exo_gravity.core.arm.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.core.arm.gravity import gravity_torque
-from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.arm.wearer import Wearer
 
 LINKS = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LINKS, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
