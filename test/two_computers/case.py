@@ -39,15 +39,14 @@ def play(
     hold: float,
     timing: Mapping[str, Parameters] = REAL,
     peers: Mapping[str, str] = PEERS,
-    patience: float = START_TIMEOUT,
 ) -> Result:
     """Play one case; the files stay in `folder`. hold: s for which the wearer lets go."""
     params = write_parameters(folder, hold, timing)
     began = time.monotonic()
     with Network(wire) as network, TwoComputers(network, params, peers) as arm:
         carried = released = ended = None
-        if arm.wait_until(lambda: arm.bridge.get("state") in ("active", "fault"), patience):
-            carried = time.monotonic() - began if arm.bridge["state"] == "active" else None
+        if arm.wait_until(lambda: _has_decided(arm), START_TIMEOUT) and arm.bridge["state"] == "active":
+            carried = time.monotonic() - began
             if _wait_for(arm, "hold", MOVE + 10.0):
                 released = arm.lines[-1][0]
                 _wait_for(arm, "done", hold + 10.0)
@@ -61,6 +60,11 @@ def play(
         truth = next(folder.glob("truth*.bin"))
         measured = measure(folder / "bag_robot", truth, released, ended)
     return Result(wire, carried, outcome, measured, late, network.traffic["latest"])
+
+
+def _has_decided(arm: TwoComputers) -> bool:
+    """Return whether the bridge carries the arm, has a fault, or has refused the start."""
+    return arm.bridge.get("state") in ("active", "fault") or arm.bridge.get("refusal", "none") != "none"
 
 
 def _wait_for(arm: TwoComputers, action: str, timeout: float) -> bool:
