@@ -34,7 +34,7 @@ class Arm:
         self.asked: float | None = None
         self.names: tuple[str, ...] = (NAME,)
         self.lag, self.now, self.number = 0.0, 0.0, 0
-        self.is_another = False
+        self.from_another = False
         self.answers: list[Compensation] = []
         self.run(3.0)
 
@@ -44,7 +44,7 @@ class Arm:
             self.number, self.now = self.number + 1, self.now + PERIOD
             if self.asked is not None and self.number % 20 == 0:
                 request = self.compensator.support_request
-                request.receive(self.now, self.names, (self.asked,), self.now - self.lag, self.is_another)
+                request.receive(self.now, self.names, (self.asked,), self.now - self.lag, self.from_another)
             self.answers.append(self.compensator.step(self.now, POSE, STILL))
         return self.support
 
@@ -131,9 +131,9 @@ def test_a_wrong_request_moves_nothing_is_noted_and_the_last_good_one_expires(
 
 def test_a_second_sender_ends_the_support_at_once_until_it_has_been_gone_for_a_while() -> None:
     arm = raised()
-    arm.is_another = True
+    arm.from_another = True
     assert arm.run(0.3) == 0.4 and "more than one publisher" in arm.report
-    arm.is_another = False
+    arm.from_another = False
     assert arm.run(REQUEST.distrust - 0.3) == 0.4
     assert arm.run(0.6) == 0.7
 

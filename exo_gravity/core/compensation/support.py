@@ -38,14 +38,14 @@ class SupportRequest:
         self._refusal, self._refused = "", -math.inf
 
     def receive(
-        self, now: float, names: Sequence[str], values: Sequence[float], stamp: float, is_another: bool = False
+        self, now: float, names: Sequence[str], values: Sequence[float], stamp: float, from_another: bool = False
     ) -> None:
         """Take a message that arrived at `now` and was sent at `stamp`.
 
         values: the share 0..1 of the wearer's arm under the one name 'support'.
-        is_another: whether it comes from another sender than the message before.
+        from_another: whether it comes from another sender than the message before.
         """
-        if is_another:
+        if from_another:
             self._contradicted = now
         if problem := self._problem(now, names, values, stamp):
             self._refusal, self._refused = problem, now

@@ -219,6 +219,6 @@ class Weighing:
                 self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
             elif off > 0.0:
                 torque = f"{off + WEIGHING.unlike[0]:.1f} Nm"
-                self.trouble = f"{name}: no load in the hand explains {torque}: is somebody touching the arm?"
+                self.trouble = f"{name}: no load in the hand explains {torque}: someone may be touching the arm"
         if not self.trouble:
             self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)

@@ -147,7 +147,7 @@ class CanBridge(LifecycleNode):
             loop.stop()
             raise
         self.loop = loop
-        self._look_at(self._owned.watchdog, loop)
+        self._check_watchdog(self._owned.watchdog, loop)
         loop.call(lambda: safety.enable(time.monotonic()))
 
     @_transition
@@ -194,10 +194,10 @@ class CanBridge(LifecycleNode):
 
     def _on_report(self) -> None:
         if self.loop is not None and self._owned is not None:
-            self._look_at(self._owned.watchdog, self.loop)
+            self._check_watchdog(self._owned.watchdog, self.loop)
         self._report.send(self.loop, self._exchange.newest, self._exchange.refusal)
 
-    def _look_at(self, watchdog: Watchdog, loop: ControlLoop) -> None:
+    def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
         loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""

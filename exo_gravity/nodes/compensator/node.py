@@ -175,15 +175,15 @@ class CompensatorNode(Node):
 
     def _on_assist_efforts(self, message: JointState, info: dict[str, Any]) -> None:
         now, stamp = self._times_of(message)
-        is_another = self._assistant.note(info)
+        from_another = self._assistant.note(info)
         with self._lock:
-            self._assist.receive(now, message.name, message.effort, stamp, is_another)
+            self._assist.receive(now, message.name, message.effort, stamp, from_another)
 
     def _on_support_request(self, message: JointState, info: dict[str, Any]) -> None:
         now, stamp = self._times_of(message)
-        is_another = self._requester.note(info)
+        from_another = self._requester.note(info)
         with self._lock:
-            self._control.support_request.receive(now, message.name, message.position, stamp, is_another)
+            self._control.support_request.receive(now, message.name, message.position, stamp, from_another)
 
     def _times_of(self, message: JointState) -> tuple[float, float]:
         """Return the present time and that of the message's stamp, both in monotonic s."""

@@ -193,9 +193,9 @@ class WearerNode(Node):
         self._problem = ""
         if estimate:
             for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
-                told = JointState(name=self._names, effort=values)
-                told.header.stamp = message.header.stamp
-                publisher.publish(told)
+                statement = JointState(name=self._names, effort=values)
+                statement.header.stamp = message.header.stamp
+                publisher.publish(statement)
         elif trunk is None:
             self._problem = "no fresh tilt of the trunk"
         else:

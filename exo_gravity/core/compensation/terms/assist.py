@@ -91,17 +91,17 @@ class AssistInput:
         return max(ASSIST.min_valid, ASSIST.periods * self._period)
 
     def receive(
-        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, is_another: bool = False
+        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, from_another: bool = False
     ) -> None:
         """Take a message that arrived at `now`: `efforts` in Nm of the joints `names`, computed at `stamp`.
 
-        is_another: whether its publisher is another than that of the message before.
+        from_another: whether its publisher is another than that of the message before.
         """
         interval, self._arrival = now - self._arrival, now
         is_stream = interval < ASSIST.slowest * ASSIST.periods
         if is_stream:
             self._period += ASSIST.smoothing * (min(interval, ASSIST.slowest) - self._period)
-        problem = self._problem(now, names, efforts, stamp, is_another and is_stream)
+        problem = self._problem(now, names, efforts, stamp, from_another and is_stream)
         if problem:
             self._refused, self.reason = now, problem
             return
