@@ -8,16 +8,13 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
 from exo_gravity.core.safety.limits import Limits
 
 
-class DirectController:
+class SampleController:
     """Answers the samples of a cycle at once; the next cycle applies the efforts.
 
-    compensator: what computes the efforts. It has the clock of the samples.
     limits: of the arm, which say when a motor is silent: then there is no answer, and the last one grows old.
     """
 
-    def __init__(self, compensator: Compensator, limits: Limits) -> None:
-        self.compensator = compensator
-        self.answer = Compensation.withdrawn("")  #: the compensator's last one
+    def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._newest = NO_EFFORTS
 
@@ -27,9 +24,27 @@ class DirectController:
 
     def take(self, now: float, samples: Sequence[JointSample]) -> None:
         """Answer the newest sample of each joint, unless a motor is silent."""
-        if any(self._limits.is_silent(now, sample) for sample in samples):
-            return
+        if not any(self._limits.is_silent(now, sample) for sample in samples):
+            self._newest = self._efforts_for(now, samples)
+
+    def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
+        raise NotImplementedError
+
+
+class DirectController(SampleController):
+    """Lets a compensator answer.
+
+    compensator: it has the clock of the samples.
+    limits: as in `SampleController`.
+    """
+
+    def __init__(self, compensator: Compensator, limits: Limits) -> None:
+        super().__init__(limits)
+        self.compensator = compensator
+        self.answer = Compensation.withdrawn("")  #: the compensator's last one
+
+    def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
         position, velocity, effort, _, _, times = zip(*samples, strict=True)
         self.compensator.applied = effort
         self.answer = answer = self.compensator.step(now, position, velocity)
-        self._newest = Efforts(answer.effort, min(times), answer.damped, bool(answer.held))
+        return Efforts(answer.effort, min(times), answer.damped, bool(answer.held))

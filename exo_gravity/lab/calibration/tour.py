@@ -17,13 +17,14 @@ from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.arm.gravity import Torque, load_moments
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt, angle_between
+from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
+from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 
@@ -211,29 +212,22 @@ class Tour:
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
 
 
-class TourController:
+class TourController(SampleController):
     """Carries an arm through a tour, in the compensator's place, without messages.
 
     tour: which is planned and stepped here.
-    limits: of the arm, which say when a motor is silent.
+    limits: as in `SampleController`.
     tilt: of the trunk or the stand.
     is_carried: whether the arm is carried; from then on the tour moves it.
     """
 
     def __init__(self, tour: Tour, limits: Limits, tilt: Tilt, is_carried: Callable[[], bool]) -> None:
+        super().__init__(limits)
         self.tour = tour
-        self._limits, self._tilt, self._is_carried = limits, tilt, is_carried
+        self._tilt, self._is_carried = tilt, is_carried
         self._has_begun = False
-        self._newest = NO_EFFORTS
 
-    def efforts(self, latest: float) -> Efforts:
-        """Return the newest efforts, without waiting."""
-        return self._newest
-
-    def take(self, now: float, samples: Sequence[JointSample]) -> None:
-        """Let the tour answer the samples, unless a motor is silent."""
-        if any(self._limits.is_silent(now, sample) for sample in samples):
-            return
+    def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
         position, velocity, *_, times = zip(*samples, strict=True)
         self._has_begun = self._has_begun or self._is_carried()
         if self._has_begun:
@@ -241,7 +235,7 @@ class TourController:
             self.tour.plan()
         else:
             effort = self.tour.wait(position, self._tilt)
-        self._newest = Efforts(effort, min(times), False, False)
+        return Efforts(effort, min(times), False, False)
 
 
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
