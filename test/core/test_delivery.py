@@ -10,7 +10,6 @@ from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, Moto
 from exo_gravity.core.safety.gate import SwitchOnCheck
 
 from ..support.safety_run import LIMITS, PERIOD
-from ..support.simulated_device import drive_of
 
 PEAK = (9.0, 18.0, 9.0, 9.0)
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
@@ -117,15 +116,6 @@ def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
     assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(10_000))
 
 
-def test_a_silent_motor_applies_what_it_last_replied_to():
-    replies = Replies()
-    replies.take(EFFORT)
-    later = drive_of((0.0,) * 4, (5.0,) * 4)
-    effort, damping = replies.monitor.applied(later, (False, True, False, False))
-    assert effort == (0.0, EFFORT[1], 0.0, 0.0)
-    assert damping == (5.0, 0.0, 5.0, 5.0)
-
-
 @pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
 @pytest.mark.parametrize("is_on", [True, False])
 def test_motors_that_are_on_pass_and_one_that_is_off_does_not_whatever_the_noise(rate, is_on):
@@ -137,7 +127,7 @@ def test_motors_that_are_on_pass_and_one_that_is_off_does_not_whatever_the_noise
         joints, commanded = [JointSample(0.5, 0.0, 0.0, 30, 0, 0.0)] * 4, [[0.0] * 4] * delay
         while not (check.done or fault):
             now += period
-            fault = check.step(period, joints, (0.0,) * 4)
+            fault = check.step(period, joints)
             commanded.append(list(check.effort))
             applied = np.array(commanded[-1 - delay]) * (1.0, 1.0, 1.0, is_on) + random.normal(0.0, 0.15, 4)
             for i in np.flatnonzero(random.random(4) > 0.06):
@@ -148,12 +138,12 @@ def test_motors_that_are_on_pass_and_one_that_is_off_does_not_whatever_the_noise
 
 
 def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
-    check, velocity, damping, now = SwitchOnCheck(LIMITS), [0.0] * 4, (1.5,) * 4, 0.0
+    check, velocity, now = SwitchOnCheck(LIMITS), [0.0] * 4, 0.0
     while not check.done:
         now += PERIOD
-        torque = [effort - 1.5 * speed for effort, speed in zip(check.effort, velocity, strict=True)]
+        torque = list(check.effort)
         joints = [JointSample(0.5, speed, net, 30, 0, now) for speed, net in zip(velocity, torque, strict=True)]
-        assert not check.step(PERIOD, joints, damping)
+        assert not check.step(PERIOD, joints)
         velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2
 
 

@@ -135,7 +135,7 @@ class VirtualRig(Rig):
         """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
         self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
         self.notes.clock = self.clock
-        self.notes.note(drive or self.drive, True)
+        self.notes.note(drive or self.drive)
         return let_down(self.arm, ArmNotes([self.notes] * 4), log, lambda: is_wanted)
 
 

@@ -90,7 +90,7 @@ def _at_least(angle: float) -> str:
 
 
 class SwitchOnCheck:
-    """Checks that all four motors are on: short pushes each way, under damping, must appear in their replies.
+    """Checks that all motors are on: short pushes each way must appear in their replies.
 
     A motor is on if the regression of its replied on its commanded torque is at least `SWITCH_ON.share`. Each pair of
     pushes separates 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
@@ -113,19 +113,15 @@ class SwitchOnCheck:
         self._is_on = [False] * JOINT_COUNT
         self._elapsed, self._pushes = 0.0, 0
 
-    def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
-        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
-
-        damping: (4,) Nm s/rad, last sent; its torque is part of the replies, and a light joint moves.
-        """
+    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
+        """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any."""
         self._elapsed += dt
         self.enter = [False] * len(self.enter)
         for i, joint in enumerate(joints):
             self._commanded[i] += min(1.0, dt / SWITCH_ON.lag) * (self.effort[i] - self._commanded[i])
             if joint.time > self._last_time[i]:
                 self._last_time[i] = joint.time
-                replied = joint.effort + damping[i] * joint.velocity
-                self._products[i] += self._commanded[i] * replied
+                self._products[i] += self._commanded[i] * joint.effort
                 self._squares[i] += self._commanded[i] ** 2
         pushes = int(self._elapsed / SWITCH_ON.time)
         if pushes > self._pushes and pushes % 2 == 0:
@@ -149,8 +145,8 @@ class SwitchOnCheck:
 class SignCheck:
     """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
 
-    Joint after joint: wait until it is still, push it gently and slowly under damping until it moves by about a degree,
-    then push it back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
+    Joint after joint: wait until it is still, push it gently and slowly until it moves by about a degree, then push it
+    back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
     compensation would double its weight. A joint that does not move has no torque, or is held. A joint that moves
     before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
     `direction` that reverses torque and encoder alike: such a joint moves as expected.
