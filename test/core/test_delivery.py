@@ -127,7 +127,7 @@ def test_motors_that_are_on_pass_and_one_that_is_off_does_not_whatever_the_noise
         joints, commanded = [JointSample(0.5, 0.0, 0.0, 30, 0, 0.0)] * 4, [[0.0] * 4] * delay
         while not (check.done or fault):
             now += period
-            fault = check.step(period, joints)
+            fault = check.step(period, joints, (0.0,) * 4)
             commanded.append(list(check.effort))
             applied = np.array(commanded[-1 - delay]) * (1.0, 1.0, 1.0, is_on) + random.normal(0.0, 0.15, 4)
             for i in np.flatnonzero(random.random(4) > 0.06):
@@ -138,12 +138,12 @@ def test_motors_that_are_on_pass_and_one_that_is_off_does_not_whatever_the_noise
 
 
 def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
-    check, velocity, now = SwitchOnCheck(LIMITS), [0.0] * 4, 0.0
+    check, velocity, damping, now = SwitchOnCheck(LIMITS), [0.0] * 4, (1.5,) * 4, 0.0
     while not check.done:
         now += PERIOD
-        torque = list(check.effort)
+        torque = [effort - 1.5 * speed for effort, speed in zip(check.effort, velocity, strict=True)]
         joints = [JointSample(0.5, speed, net, 30, 0, now) for speed, net in zip(velocity, torque, strict=True)]
-        assert not check.step(PERIOD, joints)
+        assert not check.step(PERIOD, joints, damping)
         velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2
 
 

@@ -50,6 +50,7 @@ class SafetyRun:
         self.drive = OFF
         self.applied = [0.0] * 4
         self.steps: list[float] = []
+        self._is_proving = False
 
     def cycle(self, seconds: float = PERIOD) -> SafetyRun:
         """Run the machine for `seconds`, at least one cycle."""
@@ -60,7 +61,7 @@ class SafetyRun:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
-            before, is_proving = list(self.applied), self.machine.state is State.PROVING
+            before, was_proving = list(self.applied), self._is_proving
             efforts = Efforts(self.effort, self.now - self.effort_age, self.damped, self.held)
             self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
             for i in range(4):
@@ -68,7 +69,8 @@ class SafetyRun:
                     self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
                 if self.drive.send[i] is Send.ENTER:
                     self.off.discard(i)
-            if not is_proving:  # its small pushes end at once
+            self._is_proving = self.machine.state is State.PROVING
+            if not was_proving:  # its small pushes end at once
                 own = [i for i in range(4) if i not in self.off]
                 self.steps.append(max([abs(self.applied[i] - before[i]) for i in own], default=0.0))
         return self

@@ -27,11 +27,11 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.gate import START_GATE, SignCheck, SwitchOnCheck, missing_for_a_start
+from exo_gravity.core.safety.gate import START_GATE, SWITCH_ON, SignCheck, SwitchOnCheck, missing_for_a_start
 from exo_gravity.core.safety.limits import DAMPING, Limits, guide_damping
 from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
-from exo_gravity.core.safety.power import Change, MotorPower, Power, SwitchingOn
+from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
 from exo_gravity.core.safety.transitions import TRANSITIONS, Event
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
@@ -72,6 +72,7 @@ class SafetyMachine:
         self._switching = SwitchingOn(self._replies)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NO_TORQUE)
+        self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: What else CHECKING waits for, set from outside; '' for nothing.
         self.hindrance = ""
 
@@ -185,8 +186,10 @@ class SafetyMachine:
         """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
         sent = self._sent
         undelivered = self._delivery.step(self._dt, self._readings.joints, sent.effort, sent.damping)
-        if undelivered and (self.state in CARRIED or self._switch_on.done):
-            return undelivered
+        if undelivered:
+            if self.state in CARRIED or self._attempts == SWITCH_ON.attempts:
+                return undelivered
+            self._attempts += 1
         if self._readings.fault:
             return self._readings.fault
         if efforts.effort is None:
@@ -223,7 +226,7 @@ class SafetyMachine:
         if self._now - self._calm_since >= START_GATE.calm:
             self.waiting_for = ""
             largest = 0.0 if self._is_trusted else limits.sign_check_torque
-            self._switching = SwitchingOn(self._replies)
+            self._switching, self._attempts = SwitchingOn(self._replies), 0
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
@@ -234,31 +237,40 @@ class SafetyMachine:
     def _prove(self) -> None:
         """Advance the checks of motors that were just switched on."""
         if not self._switching.done:
-            return
-        if self._switch_on.done:
-            fault = self._signs.step(self._dt, self._readings.joints)
-        else:
-            fault = self._switch_on.step(self._dt, self._readings.joints)
             self._delivery.reset()
+            return
+        joints = self._readings.joints
+        if self._signs.done:  # before, or there is nothing to check: they are trusted
+            fault = self._switch_on.step(self._dt, joints, self._sent.damping)
+            self._delivery.reset()
+        else:
+            fault = self._signs.step(self._dt, joints)
         self.waiting_for = self._signs.hint
         self._trip(fault)
-        if not fault and self._switch_on.done and self._signs.done:
+        if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
             self._is_trusted = True
             self.motion.reset()
             self._on(Event.PROVEN)
 
     def _push(self) -> Drive:
-        """Return a drive that switches the motors on, then pushes them gently, without damping.
+        """Return a drive that switches the motors on one by one, then pushes them gently.
 
-        Damping by a motor whose torque or encoder is reversed would drive its joint, without end.
+        A joint is damped only if its signs are trusted, or have just been proven.
         """
+        count = len(self.power)
         if not self._switching.done:
             return self._powered(NO_TORQUE, NO_TORQUE, self._switching.step())
-        pushed = self._signs.effort if self._switch_on.done else self._switch_on.effort
-        again = [False] * len(pushed) if self._switch_on.done else self._switch_on.enter
-        columns = zip(again, self._replies, strict=True)
-        send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in columns]
-        return self._powered(pushed, NO_TORQUE, send)
+        if self._signs.pushes:
+            pushed, again, damped = self._signs.effort, self._delivery.missing, self._signs.damped
+        else:
+            pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * count
+        if any(again):
+            self._delivery.reset()
+        boards = zip(again, self._replies, strict=True)
+        send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
+        rise = DAMPING / DESCENT.damping_rise * self._dt
+        columns = zip(damped, self._sent.damping, strict=True)
+        return self._powered(pushed, [min(DAMPING, last + rise) if may else 0.0 for may, last in columns], send)
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
         joints, ramp = self._readings.joints, 1.0
@@ -282,7 +294,8 @@ class SafetyMachine:
         readings = self._readings
         descent, silent, joints = self._descent, readings.silent, readings.joints
         descent.step(self._now, self._dt, joints, silent)
-        if descent.is_down(self._now, self._rest.since):
+        self._switch_quiet_off()
+        if self._is_switched_off or descent.is_down(self._now, self._rest.since):
             for power, is_silent in zip(self.power, silent, strict=True):
                 if not is_silent:
                     power.change(Change.SWITCH_OFF)
@@ -291,7 +304,8 @@ class SafetyMachine:
         delivered = self._delivery.step(self._dt, joints, self._sent.effort, self._sent.damping) is None
         send = self._lowering_sends()
         for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
-            is_off = is_missing and not power.shows_torque
+            asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
+            is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
             if is_off and power.state is Power.ON and power.may_return and not joint.error:
                 power.may_return, self._is_trusted = False, False
                 descent.rejoin(i)
@@ -302,9 +316,7 @@ class SafetyMachine:
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
-        for power in self.power:
-            if power.state in (Power.UNSURE, Power.UNKNOWN) and power.is_quiet:
-                power.change(Change.SWITCH_OFF)
+        self._switch_quiet_off()
         if any(power.state is Power.ON for power in self.power):
             if self.state is State.CHECKING:
                 self.refusal = "a motor was still on: it is let down"
@@ -314,6 +326,16 @@ class SafetyMachine:
             return OFF._replace(send=tuple(self._lowering_sends()))
         self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent)
         return self._powered(*self._descent.applied, self._lowering_sends())
+
+    def _switch_quiet_off(self) -> None:
+        """Switch motors off that may be on, but reply without torque."""
+        for power in self.power:
+            if power.state in (Power.UNSURE, Power.UNKNOWN) and power.is_quiet:
+                power.change(Change.SWITCH_OFF)
+
+    @property
+    def _is_switched_off(self) -> bool:
+        return all(power.state in (Power.OFF, Power.LEAVING) for power in self.power)
 
     def _lowering_sends(self) -> list[Send]:
         return [power.send(self._now) for power in self.power]

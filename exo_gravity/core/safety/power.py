@@ -35,6 +35,7 @@ class PowerTuning:
     #: s of silence after which its power may have been cut on purpose: whoever presses an emergency stop releases it
     #: later. A supply that dips is back sooner.
     cut: float = 0.2
+    off_share: float = 0.25  #: of the torque asked for, less of which a motor gives that does not deliver: it is off
     exit_period: float = 0.5  #: s between two EXIT frames to a motor that is off, in case it was switched on unseen
 
 
@@ -116,11 +117,6 @@ class MotorPower:
         return self.state not in (Power.OFF, Power.UNKNOWN)
 
     @property
-    def shows_torque(self) -> bool:
-        """Whether its replies show more torque than the noise of a motor that is off."""
-        return abs(self._torque) > POWER.torque
-
-    @property
     def is_quiet(self) -> bool:
         """Whether it has shown no torque for long enough to be off."""
         return self._heard_for >= POWER.read_time
@@ -156,7 +152,7 @@ class MotorPower:
             if is_confirmed and (self._board == 0 or abs(joint.effort) < POWER.torque):
                 self.change(Change.CONFIRMED)
         self._newest = max(self._newest, joint.time)
-        if self.shows_torque and self.state in (Power.UNSURE, Power.UNKNOWN):
+        if abs(self._torque) > POWER.torque and self.state in (Power.UNSURE, Power.UNKNOWN):
             self.change(Change.SHOWN_ON)
 
     def send(self, now: float) -> Send:

@@ -165,18 +165,18 @@ class MotorBus:
         self._raise_failure()
 
     def stop(self) -> None:
-        """Send EXIT, twice, and close the bus. Never raises.
+        """Send EXIT, twice, to the motors that were to be off; then close the bus. Never raises.
 
-        Nothing is sent if nothing was before: another owner may have left these motors on.
+        Nothing is sent to others: another owner may have left them on.
         """
-        self._drive = self._drive._replace(send=(Send.EXIT,) * len(self._motors))
-        for _ in range(2 if self._has_sent else 0):
+        left = [joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in (Send.POLL, Send.EXIT)]
+        for _ in range(2 if left else 0):
             self._failed.clear()
-            for joint in range(len(self._motors)):
-                self._send(self._ports[joint], *self._frames(joint, self._now()))
             self._answered.clear()
+            for joint in left:
+                self._send(self._ports[joint], *self._motors[joint].exit)
             with contextlib.suppress(BusError):
-                self.receive_until(self._now() + LAST_REPLIES, lambda: self._answered >= self._asked)
+                self.receive_until(self._now() + LAST_REPLIES, lambda: self._answered >= self._asked.intersection(left))
         self.close()
 
     def close(self) -> None:
