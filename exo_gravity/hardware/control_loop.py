@@ -232,6 +232,7 @@ class ControlLoop:
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
+        self.safety.unsent = self.bus.unsent
         if self.bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self.bus.foreign_commands
             self.safety.trip(FaultCode.FOREIGN_COMMAND, self.bus.foreign_command, self._now())

@@ -12,12 +12,13 @@ from typing import Any
 import can
 import pytest
 
-from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import OFF, FaultCode, State
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.power import Power
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
@@ -148,20 +149,20 @@ def test_a_bus_that_fails_does_not_keep_the_other_from_its_commands() -> None:
 
 
 def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_for_off() -> None:
-    """The first bus replies to zero commands as motors do that are still on: that confirms no EXIT."""
-    rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
-    bus.exchange(drive_of(NO_TORQUE), rig.clock.monotonic() + CYCLE)
+    arm = carried()
+    rig = halves(arm)
+    arm.safety.disable(arm.clock.monotonic())
+    arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
+    rig.second.refusal = BusError("no such device")
     rig.second.break_down(can.CanOperationError("Network is down"))
-    for _ in range(3):
-        with pytest.raises(BusError, match="Network is down"):
-            bus.exchange(OFF, rig.clock.monotonic() + CYCLE)
-    assert bus.may_be_powered and rig.motors_on[2:] == [True, True]
+    was_on = rig.motors_on[2:]
+    arm.run(0.5)
+    assert rig.motors_on == [False, False, *was_on]
+    assert arm.loop.is_off is not any(was_on)
+    rig.second.refusal = None
     rig.second.broken = set()
-    for _ in range(10):
-        bus.exchange(OFF, rig.clock.monotonic() + CYCLE)
-        rig.clock.sleep(CYCLE)
-    assert rig.motors_on == [False] * 4 and not bus.may_be_powered
+    arm.run_until(lambda: arm.loop.is_off)
+    assert rig.motors_on == [False] * 4
 
 
 def test_motors_that_all_lost_their_supply_stay_off_and_those_of_one_bus_are_held_again() -> None:

@@ -59,7 +59,7 @@ class Descent:
     free_damping: float = 0.2
     rest_time: float = 2.0  #: s at rest with nothing holding the arm, until it is down
     longest_rest: float = 7.5  #: s with nothing holding the arm, after which it is down even if the wearer moves it
-    longest_silence: float = 12.0  #: s for which a silent motor is waited for
+    longest_silence: float = 9.0  #: s for which a silent motor is waited for: until it has faded
     blind_fade_time: float = 8.0  #: s from full torque to none of a silent joint, as slowly as a horizontal arm sinks
 
 
@@ -158,18 +158,22 @@ class ArmDescent:
         """Torque (4,) in Nm and damping (4,) in Nm s/rad to apply now."""
         return tuple(joint.effort for joint in self._joints), tuple(joint.damping for joint in self._joints)
 
-    def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
+    def step(
+        self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool], unsent: Sequence[bool]
+    ) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings.
 
         silent: (4,) whether the joint's motor does not reply.
+        unsent: (4,) whether its last command did not leave: it holds what it had.
         """
-        for joint, sample, is_silent, was_silent in zip(self._joints, samples, silent, self._silent, strict=True):
+        columns = zip(self._joints, samples, silent, self._silent, unsent, strict=True)
+        for joint, sample, is_silent, was_silent, is_unsent in columns:
             expected = joint.effort - joint.damping * sample.velocity
             is_obeying = DELIVERY.excess(sample.effort, expected) <= 0.0
             if was_silent and not is_silent and not is_obeying:
                 joint.restart(sample.effort)
             elif is_silent:
-                joint.step_blind(dt)
+                joint.step_blind(0.0 if is_unsent else dt)
             else:
                 joint.step(dt, sample.velocity)
         self._silent = tuple(silent)

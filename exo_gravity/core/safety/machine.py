@@ -72,7 +72,10 @@ class SafetyMachine:
         self._switching = SwitchingOn(self._replies)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NO_TORQUE)
+        self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
+        #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
+        self.unsent: Sequence[bool] = (False,) * len(self.power)
         #: What else CHECKING waits for, set from outside; '' for nothing.
         self.hindrance = ""
 
@@ -135,7 +138,7 @@ class SafetyMachine:
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
-        self._sent = Drive(tuple(effort), tuple(damping), COMMANDS, True)
+        self._sent, self._left = Drive(tuple(effort), tuple(damping), COMMANDS, True), effort
         self._change_power(Change.TAKEN_OVER)
         self.state = State.ACTIVE
         self._on(Event.DISABLE, now)
@@ -181,6 +184,11 @@ class SafetyMachine:
         self._rest.step(self._now, readings.joints, readings.silent)
         for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
             power.step(self._now, self._dt, joint, is_silent)
+        if self._left and any(power.state is Power.ON for power in self.power):
+            # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
+            for power, held in zip(self.power, self._left, strict=True):
+                if power.state is Power.UNSURE and power.is_heard and abs(held) <= 2.0 * POWER.torque:
+                    power.change(Change.SHOWN_ON)
 
     def _carried_fault(self, efforts: Efforts) -> Fault | None:
         """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
@@ -293,7 +301,7 @@ class SafetyMachine:
         """Return a drive that lowers the arm, or stands once it is down."""
         readings = self._readings
         descent, silent, joints = self._descent, readings.silent, readings.joints
-        descent.step(self._now, self._dt, joints, silent)
+        descent.step(self._now, self._dt, joints, silent, self.unsent)
         self._switch_quiet_off()
         if self._is_switched_off or descent.is_down(self._now, self._rest.since):
             for power, is_silent in zip(self.power, silent, strict=True):
@@ -324,7 +332,7 @@ class SafetyMachine:
             return self._descend()
         if self._all_off:
             return OFF._replace(send=tuple(self._lowering_sends()))
-        self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent)
+        self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
         return self._powered(*self._descent.applied, self._lowering_sends())
 
     def _switch_quiet_off(self) -> None:

@@ -117,6 +117,11 @@ class MotorPower:
         return self.state not in (Power.OFF, Power.UNKNOWN)
 
     @property
+    def is_heard(self) -> bool:
+        """Whether it replies."""
+        return self._heard_for > 0.0
+
+    @property
     def is_quiet(self) -> bool:
         """Whether it has shown no torque for long enough to be off."""
         return self._heard_for >= POWER.read_time

@@ -80,6 +80,8 @@ class MotorBus:
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+        #: Whether the last drive did not leave for each motor (n,), because its bus failed.
+        self.unsent: Sequence[bool] = (False,) * len(motors)
         self._drive = OFF  # last sent
         self._has_sent = False  # anything: another owner's motors are left alone
         self._corrected = [-math.inf] * JOINT_COUNT  # s
@@ -128,6 +130,7 @@ class MotorBus:
             frames[own] += self._frames(joint, now)
         for own, due in frames.items():
             self._send(own, *due)
+        self.unsent = tuple([port in self._failed for port in self._ports])
         self._answered.clear()
         count = len(self._joints)
         self.receive_until(deadline, lambda: len(self._answered) == count)
@@ -169,7 +172,9 @@ class MotorBus:
 
         Nothing is sent to others: another owner may have left them on.
         """
-        left = [joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in (Send.POLL, Send.EXIT)]
+        left = [
+            joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in (Send.POLL, Send.EXIT)
+        ]
         for _ in range(2 if left else 0):
             self._failed.clear()
             self._answered.clear()

@@ -24,7 +24,7 @@ from pathlib import Path
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import COMMANDS, Drive
+from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -66,7 +66,8 @@ class DriveNotes(ctypes.Structure):
     @property
     def drive(self) -> Drive:
         """What the motors received last."""
-        return Drive(tuple(self._effort), tuple(self._damping), COMMANDS, bool(self._powered))
+        powered = bool(self._powered)
+        return Drive(tuple(self._effort), tuple(self._damping), COMMANDS if powered else OFF.send, powered)
 
     @property
     def owner(self) -> str:
