@@ -88,7 +88,7 @@ class JointDescent:
         self.effort, self.damping = effort, damping
         self._carried = max(self._carried, effort, key=abs)
         self._most = max(self._most, abs(effort))
-        self._fade_rate = min(MAX_EFFORT_RATE, max(DESCENT.min_fade_rate, abs(effort) / DESCENT.fade_time))
+        self._fade_rate = min(MAX_EFFORT_RATE, max(DESCENT.min_fade_rate, abs(self._carried) / DESCENT.fade_time))
         self._is_rising = True  # the damping has not yet reached DAMPING
 
     def step_blind(self, dt: float) -> None:
