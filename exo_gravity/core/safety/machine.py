@@ -214,7 +214,7 @@ class SafetyMachine:
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
+        missing = self.hindrance or missing or ("" if efforts_are_fresh else "effort commands")
         self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:
             self._calm_since = self._now
