@@ -133,11 +133,15 @@ def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wire,
         bus.listen()
 
 
-def test_a_motor_without_a_frame_for_its_zero_refuses_set_zero_for_the_whole_arm(wire, other) -> None:
+def test_a_broadcast_that_v3_boards_obey_is_opposed_at_each_of_them(wire, other) -> None:
     bus = motor_bus(wire, MIXED)
-    with pytest.raises(BusError, match="set_zero: motor 2 has a board without such a frame"):
-        bus.set_zero()
-    assert sent(other) == []
+    bus.exchange(ON, now(bus))
+    sent(other)
+    other.send(can.Message(arbitration_id=0x8FF, data=bytes(8), is_extended_id=True))
+    bus.receive_until(now(bus) + CYCLE)
+    reporting = [joint.command_id for joint in joints_of(MIXED) if not joint.wire_format.replies]
+    assert sorted(frame_id for frame_id, _ in sent(other)) == sorted(reporting)
+    assert bus.foreign_commands == len(reporting) == 2
 
 
 def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other) -> None:

@@ -137,7 +137,10 @@ class SwitchOnCheck:
                 self._is_on[i] = self._is_on[i] or share >= SWITCH_ON.share
                 self.enter[i] = not self._is_on[i]
                 if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
-                    reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
+                    reason = (
+                        f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied; "
+                        "a V3 board ignores commands while its configuration cable is plugged in"
+                    )
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
             self._products, self._squares = list(NO_TORQUE), list(NO_TORQUE)
         self._pushes = pushes

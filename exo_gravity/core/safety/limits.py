@@ -20,7 +20,7 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
@@ -151,7 +151,7 @@ class Limits:
         name, fastest = self.joint_names[i], self.max_velocity[i]
         low, high = self.position_min[i], self.position_max[i]
         if joint.error:
-            text = MOTOR_ERRORS.get(joint.error, "unknown")
+            text = error_text(joint.error)
             return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"

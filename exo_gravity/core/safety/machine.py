@@ -226,7 +226,7 @@ class SafetyMachine:
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
+        missing = self.hindrance or missing or ("" if efforts_are_fresh else "effort commands")
         missing = missing or ("the motors to confirm that they are off" if not self._all_off else "")
         self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:

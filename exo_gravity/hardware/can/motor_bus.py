@@ -23,8 +23,19 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.wire_formats import (
+    BROADCAST_ID,
+    COMMAND,
+    EXTENDED,
+    MALFORMED,
+    OTHER,
+    REPLY,
+    SERVO,
+    Frame,
+    WireFormat,
+)
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
@@ -66,6 +77,7 @@ class MotorBus:
         self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
         self.foreign_commands = 0  #: count of commands to these motors from another sender
         self.foreign_command = ""  #: the last of them, in words
+        self.boards = Boards(motors)  #: what keeps them from serving this arm
         self.clock = clock
         self._now = clock.monotonic
         self._ports = [CanPort(bus, clock, reopen)] * JOINT_COUNT if isinstance(bus, can.BusABC) else list(bus)
@@ -156,17 +168,6 @@ class MotorBus:
                 except BusError as error:
                     self._failed[port] = error
 
-    def set_zero(self) -> None:
-        """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
-        if self._drive.powered:
-            raise BusError("set_zero: refused while the motors are on")
-        frames = [motor.set_zero for motor in self._motors]
-        if not all(frames):
-            raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
-        for joint, own in enumerate(frames):
-            self._send(self._ports[joint], *own)
-        self._raise_failure()
-
     def stop(self) -> None:
         """Send EXIT, twice, to the motors that were to be off; then close the bus. Never raises.
 
@@ -215,32 +216,38 @@ class MotorBus:
             return motor.enter
         return (*motor.enter, idle) if send is Send.CLEAR else ()
 
-    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
-        """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
+    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, frozenset[int]]:
+        """Return the kind of a frame, and the IDs of the motors that it concerns: only FOREIGN_COMMAND has several."""
         if message.is_error_frame:
-            return "error frame", 0
-        if message.is_remote_frame or message.is_fd:
-            return "remote or FD frame", 0
+            return "error frame", frozenset()
+        if message.is_fd:
+            return "FD frame", frozenset()
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
         for own, board, can_ids in self._ids:
             if own is not port:
                 continue
-            kind, can_id = board.classify(frame_id, message.data, can_ids)
-            if kind == REPLY:
-                return kind, can_id
+            kind, can_id = board.classify(frame_id, message.data, can_ids, message.is_remote_frame)
+            if kind == COMMAND and port.is_echo(message):
+                return "echo", frozenset()
             if kind == COMMAND:
-                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
-        return "foreign frame", 0
+                return FOREIGN_COMMAND, can_ids if can_id == BROADCAST_ID else frozenset((can_id,))
+            if kind != OTHER:
+                return kind, frozenset((can_id,))
+        return "foreign frame", frozenset()
 
     def _take(self, port: CanPort, message: can.Message) -> None:
-        kind, can_id = self._sort(port, message)
+        kind, can_ids = self._sort(port, message)
+        joints = [self._joint_of[can_id] for can_id in can_ids]
         if kind != REPLY:
             self.ignored[kind] += 1
-            if kind == FOREIGN_COMMAND:
-                self._oppose(self._joint_of[can_id], bytes(message.data))
+            for joint in joints if kind == FOREIGN_COMMAND else ():
+                self._oppose(joint, bytes(message.data))
+            for joint in joints if kind in (MALFORMED, SERVO) else ():
+                self.boards.heard(joint, kind, bytes(message.data), self._now())
             return
-        joint = self._joint_of[can_id]
+        (joint,) = joints
         sample = self._motors[joint].sample(message.data, self._now())
+        self.boards.take(joint, sample)
         self._answered.add(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
             self._follow(joint, sample)
