@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, OFF, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.limits import DAMPING, GUIDE, MAX_EFFORT_RATE
+from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 from exo_gravity.core.safety.monitors import RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
@@ -281,15 +282,15 @@ def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(si
 def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_neither_steps_nor_stays():
     run = SafetyRun().until_active()
     run.damped = True
-    run.changes[1] = {"velocity": GUIDE.speed}
+    run.changes[1] = {"velocity": GUIDANCE.calm}
     run.changes[2] = {"velocity": -1.0}
     run.changes[3] = {"velocity": 0.4}
     steps = [run.drive.damping]
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping[:2] == (0.0, 0.0)
-    assert run.drive.damping[2] == pytest.approx(GUIDE.brake)
-    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDE.brake
+    assert run.drive.damping[2] == pytest.approx(GUIDANCE.brake)
+    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDANCE.brake
     run.damped = False
     for _ in range(100):
         steps.append(run.cycle().drive.damping)

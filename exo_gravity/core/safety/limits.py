@@ -55,17 +55,6 @@ class Derating:
 
 
 @dataclass(frozen=True)
-class Guide:
-    """The brake of joints while the load changes (core/compensation/guidance.py).
-
-    A wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in their hand.
-    """
-
-    speed: float = 0.25  #: rad/s beyond which it brakes; above the noise of a motor's velocity
-    brake: float = 1.5  #: Nm, at most
-
-
-@dataclass(frozen=True)
 class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
@@ -83,7 +72,7 @@ class LoopTiming:
     periods: int = 2  #: of control that must fit into each time-out, so that one late cycle is not a fault
 
 
-WALL, HEAT, GUIDE, READING, LOOP = SoftWall(), Derating(), Guide(), ReadingLimits(), LoopTiming()
+WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming()
 
 
 @dataclass(frozen=True)
@@ -167,12 +156,17 @@ class Limits:
         return None
 
     def shape(
-        self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
+        self,
+        effort: Sequence[float],
+        share: Sequence[float],
+        joints: Sequence[JointSample],
+        before: Sequence[float],
+        dt: float,
     ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:
         """Return the limited torque (4,) in Nm, the soft walls' damping (4,) in Nm s/rad, and which limits acted.
 
-        effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
-        `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
+        effort: (4,) Nm, requested. share: (4,) 0..1, of effort and soft wall, where torque begins. before: (4,) Nm,
+        applied `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
         step = MAX_EFFORT_RATE * dt
         shaped, damping, acted = [], [], set()
@@ -187,7 +181,7 @@ class Limits:
             wall = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
             colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
             permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
-            wanted = share * (effort[i] + wall)
+            wanted = share[i] * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
             shaped.append(limited)
@@ -201,12 +195,6 @@ class Limits:
             if limited != clamped:
                 acted.add(f"max_effort_rate ({name})")
         return tuple(shaped), tuple(damping), acted
-
-
-def guide_damping(velocity: float) -> float:
-    """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
-    speed = max(GUIDE.speed, abs(velocity))
-    return min(DAMPING * (speed - GUIDE.speed), GUIDE.brake) / speed
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

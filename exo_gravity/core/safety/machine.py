@@ -5,6 +5,7 @@
 - CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang.
 - PROVING switches the motors on one by one (power.py). Each must show in its replies that it is on. If signs are not
   trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault switches the motors off.
+- RAMPING_IN: the torque begins as a guided motion (guidance.py), which ends at the full torque.
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that does not reply is taken to obey, and is still watched for: if it replies
   again, however late, its joint is lowered from the torque that it then applies.
@@ -28,13 +29,13 @@ from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import START_GATE, SWITCH_ON, SignCheck, SwitchOnCheck, missing_for_a_start
-from exo_gravity.core.safety.limits import DAMPING, Limits, guide_damping
+from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
+from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
 from exo_gravity.core.safety.transitions import TRANSITIONS, Event
 
-RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
@@ -64,6 +65,7 @@ class SafetyMachine:
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
+        self._begin = GuidedMotion(JOINT_COUNT)  # of the torque
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_trusted = False  # zeros and signs
@@ -258,6 +260,7 @@ class SafetyMachine:
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
             self._is_trusted = True
             self.motion.reset()
+            self._begin.begin()
             self._on(Event.PROVEN)
 
     def _push(self) -> Drive:
@@ -281,17 +284,19 @@ class SafetyMachine:
         return self._powered(pushed, [min(DAMPING, last + rise) if may else 0.0 for may, last in columns], send)
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
-        joints, ramp = self._readings.joints, 1.0
+        joints = self._readings.joints
         if self.state is State.RAMPING_IN:
-            ramp = min(1.0, (self._now - self._since) / RAMP_TIME)
-            if ramp == 1.0:
+            self._begin.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
+            if self._begin.is_over:
                 self._on(Event.RAMPED)
-        shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
+        is_guided = damped or self.state is State.RAMPING_IN
+        share = [1.0 - left for left in self._begin.shares]
+        shaped, walls, acted = self.limits.shape(effort, share, joints, self._sent.effort, self._dt)
         self.acted.update(dict.fromkeys(acted, self._now))
         # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
         # rises over `damping_rise`, and any damping falls so.
         step = DAMPING / DESCENT.damping_rise * self._dt
-        guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
+        guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
         columns = zip(walls, wanted, self._sent.damping, strict=True)
         damping = [max(wall, last - step, min(last + step, most)) for wall, most, last in columns]
