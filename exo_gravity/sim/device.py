@@ -27,7 +27,7 @@ from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
 from exo_gravity.sim.motor import SimulatedMotor
 from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
-from exo_gravity.sim.truth import TruthLog
+from exo_gravity.sim.truth import Truth
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
@@ -51,7 +51,7 @@ class SimulatedDevice:
         self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
         self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT  #: the same for each motor
         self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT  #: rad, added to the angle that a motor reads
-        self.truth: TruthLog | None = None  #: receives every physics step
+        self.truth: Truth | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0

@@ -17,7 +17,7 @@ from exo_gravity.core.safety.limits import READING
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
-from .judge import measure
+from exo_gravity.sim.judge import measure
 from .rigs import COMPENSATOR, BothArmsRig, WearerRig
 from .stall_clock import StallClock
 from .wearer_cases import HOLD, MOVED, PUSH_DOWN, RATED, SHAKE, THROW

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..support.ros_probe import Timeout
 from .fault_case import FaultCase
-from .judge import MAX_GAP, Response, measure
+from exo_gravity.sim.judge import MAX_GAP, Response, measure
 from .rig import CARRYING, Rig
 from .rigs import BothArmsRig
 

@@ -5,7 +5,7 @@ import pytest
 
 from exo_gravity.sim.truth import RECORD
 
-from .judge import MAX_SPEED, measure
+from exo_gravity.sim.judge import MAX_SPEED, measure
 
 FAULT = 10.0  # s
 PERIOD = 0.004  # s
