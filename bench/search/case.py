@@ -124,7 +124,7 @@ def pose(random: random.Random, highest: float) -> tuple[float, ...]:
 
 
 def push(random: random.Random) -> Values:
-    most = (2.0, 4.0, 2.0, 1.0)
+    most = (2.0, 4.0, 1.5, 0.5)
     torque = [round(random.uniform(-limit, limit), 2) for limit in most]
     return {"torque": torque, "duration": round(random.uniform(0.2, 0.6), 2)}
 
