@@ -111,9 +111,13 @@ def replay(seed: int, console: Console) -> float:
     """Play one case, print what happened, and draw it; return its share of the bound."""
     played, records = play_case(draw(seed))
     case = played.case
-    console.print(f"seed {seed}: {case.rate:g} Hz, pose {case.pose}, payload {case.payload:g} kg")
+    console.print(
+        f"seed {seed}: {case.rate:g} Hz, pose {case.pose}, friction {case.friction:g} Nm, payload {case.payload:g} kg"
+    )
     table = Table("s", "", "", box=None)
-    happened = [(played.begin + time_, name, str(values or "")) for time_, name, values in map(Event._make, case.events)]
+    happened = [
+        (played.begin + time_, name, str(values or "")) for time_, name, values in map(Event._make, case.events)
+    ]
     for when, name, text in sorted([*happened, *played.states]):
         table.add_row(f"{when:.3f}", name, text)
     console.print(table)

@@ -38,6 +38,7 @@ class Case:
 
     worn: with the passive arm of a wearer in it, which Zero-G carries; else One-G carries the bare arm.
     payload: kg in the hand, known to the compensator.
+    friction: Nm, Coulomb's of each joint.
     pose: (4,) rad, to which the wearer moves the carried arm.
     begin: ENABLED or CARRIED.
     """
@@ -46,6 +47,7 @@ class Case:
     rate: float
     worn: bool
     payload: float
+    friction: float
     pose: tuple[float, ...]
     begin: str
     events: tuple[Event, ...]
@@ -119,7 +121,12 @@ def reach(random: random.Random) -> Values:
 
 
 def pose(random: random.Random, highest: float) -> tuple[float, ...]:
-    angles = random.uniform(-0.4, 0.4), random.uniform(0.2, highest), random.uniform(-0.2, 0.8), random.uniform(0.1, 1.5)
+    angles = (
+        random.uniform(-0.4, 0.4),
+        random.uniform(0.2, highest),
+        random.uniform(-0.2, 0.8),
+        random.uniform(0.1, 1.5),
+    )
     return tuple(round(angle, 2) for angle in angles)
 
 
@@ -154,6 +161,7 @@ KINDS = {
     "efforts_nan": Kind("computer", lasting(0.005, 0.1)),
     "reach": Kind("wearer", reach),
     "limp": Kind("wearer"),
+    "lap": Kind("wearer", lasting(5.0, 20.0)),
     "resist": Kind("wearer", lasting(1.0, 5.0)),
     "spasm": Kind("wearer", one_of(size=(1.0, 2.0))),
     "push": Kind("wearer", push),
@@ -185,10 +193,13 @@ def draw(seed: int) -> Case:
     if source.random() < 0.6:
         events.append(event(source, REARM, at + apart + source.uniform(3.0, 14.0)))
         if source.random() < 0.3:
-            events.append(event(source, source.choice(("reach", "limp", "push")), events[-1].time + source.uniform(3.0, 9.0)))
+            last = source.choice(("reach", "limp", "push"))
+            events.append(event(source, last, events[-1].time + source.uniform(3.0, 9.0)))
     payload = source.choice((0.2, 1.0)) if {first, second} & {"payload_dropped", "payload_flicked"} else 0.0
     rate, highest = source.choice(RATES), 0.6 if worn else HORIZONTAL
-    return Case(seed, rate, worn, payload, pose(source, highest), begin, tuple(sorted(events, key=lambda e: e.time)))
+    in_order = tuple(sorted(events, key=lambda event: event.time))
+    friction = source.choice((0.05, 0.2))
+    return Case(seed, rate, worn, payload, friction, pose(source, highest), begin, in_order)
 
 
 def pair(random: random.Random) -> tuple[str, str]:

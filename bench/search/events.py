@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -10,6 +11,7 @@ from exo_gravity.core.arm.wearer import Wearer
 
 from .stage import Stage
 
+LAP = (0.1, 0.45, 0.5, 1.3)  # rad, an arm that lies in the lap
 RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms
 WARMING = 4.0  # s
 Act = Callable[..., None]
@@ -58,10 +60,21 @@ def body_mass(stage: Stage, mass: float) -> None:
 
 
 def supply_cut(stage: Stage, motors: list[int], duration: float) -> None:
+    """Cut the supply: after it the encoders, on the rotors, know the angle only within a turn of the rotor."""
     stage.arm.catch_up()
     for joint in motors:
         stage.motors[joint].unplugged = True
     stage.device.return_power(duration)
+    stage.clock.later(duration, lambda: forget_turns(stage, motors))
+
+
+def forget_turns(stage: Stage, motors: list[int]) -> None:
+    stage.arm.catch_up()
+    errors = list(stage.device.encoder_error)
+    for joint in motors:
+        turn = 2.0 * math.pi / stage.motors[joint].joint.spec.gear_ratio
+        errors[joint] = -turn * round(stage.device.arm.positions[joint] / turn)
+    stage.device.encoder_error = errors
 
 
 def lost(which: str) -> Act:
@@ -191,6 +204,7 @@ ACTS: dict[str, Act] = {
     "efforts_nan": efforts("nan"),
     "reach": reach,
     "limp": lambda stage: stage.act(),
+    "lap": lambda stage, duration: stage.act({"move": list(LAP), "over": duration}),
     "resist": resist,
     "spasm": spasm,
     "push": push,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -120,10 +121,10 @@ class Stage:
         assert robot
         self.load = Wearer(BODY_MASS).on_links(robot.length)
         worn = {"wearer_mass": self.load.mass.tolist(), "wearer_cog": self.load.cog.tolist()}
-        if case.worn:
-            settings = replace(settings, mode="zero_g", **worn)
-        self.settings: Settings = settings
-        device_arm = SimulatedArm(ArmConfig(**(worn if case.worn else {})))
+        mode = "zero_g" if case.worn else "one_g"
+        self.settings: Settings = replace(settings, mode=mode, **worn)
+        friction = (case.friction,) * len(configured.motors)
+        device_arm = SimulatedArm(ArmConfig(coulomb_friction=friction, **(worn if case.worn else {})))
         device_arm.carry(case.payload)
         self.motors = [FailingMotor(joint) for joint in configured.motors]
         self.device = SimulatedDevice(device_arm, self.motors)
@@ -131,13 +132,14 @@ class Stage:
         limits = Limits(configured.joint_names)
         self.wire = LossyWire([motor.can_id for motor in configured.motors])
         self.clock = self.wire.clock
-        self.compensator = Compensator(settings)
+        self.compensator = Compensator(self.settings)
         self.controller = FailingController(DirectController(self.compensator, limits), self.clock)
         self.arm = VirtualArm(self.device, self.controller, configured.motors, limits, case.rate, self.wire)
         self.safety = self.arm.safety
         self.imu_error = [0.0, 0.0]
         self.imu_frozen: TrunkReading | None = None
         self.imu_silent = False
+        self.newest_reading: TrunkReading | None = None
         self.states: list[tuple[float, str, str]] = []  #: when the state changed, the state, and the fault's sentence
         self.clock.every(IMU_PERIOD, self._read_imu)
         self.clock.run(2.0 * IMU_PERIOD)
@@ -183,7 +185,5 @@ class Stage:
             self.clock.later(IMU_PERIOD, lambda: self._deliver(reading, taken))
 
     def _deliver(self, reading: TrunkReading, taken: float) -> None:
-        try:
+        with contextlib.suppress(ParameterError):  # the node refuses it, too
             self.arm.tell(self.compensator, reading, taken)
-        except ParameterError:
-            pass  # refused, as the node does

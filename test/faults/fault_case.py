@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.sim.judge import MAX_SPEED, MAX_WORK
+
 from .rig import Rig
 
 REACTION = 0.10  # s from a fault until damping acts on every motor,

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from exo_gravity.sim.judge import MAX_GAP, Response, measure
+
 from ..support.ros_probe import Timeout
 from .fault_case import FaultCase
-from exo_gravity.sim.judge import MAX_GAP, Response, measure
 from .rig import CARRYING, Rig
 from .rigs import BothArmsRig
 

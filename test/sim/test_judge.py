@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from exo_gravity.sim.truth import RECORD
-
 from exo_gravity.sim.judge import MAX_SPEED, measure
+from exo_gravity.sim.truth import RECORD
 
 FAULT = 10.0  # s
 PERIOD = 0.004  # s
