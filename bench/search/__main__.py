@@ -1,17 +1,18 @@
 """python -m bench.search [--minutes 60] [--seed S]: search for ways to throw an arm that nobody listed.
 
-Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what is
-permitted, or beyond. build/search.jsonl keeps every case by its seed: the next run goes on where this one ended. With
---seed one case is replayed: a table of what happened, and a picture in build/. Exit code 1 if a case was beyond.
+Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what
+is permitted, or beyond. build/search.jsonl keeps every case by its seed: the next run goes on where this one ended.
+With --seed one case is replayed: a table of what happened, and a picture in build/. Exit code 1 if a case was beyond.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from .play import Played, play, play_case
 
 FILE = Path("build/search.jsonl")
 SHOWN = 20
-WORKERS_AHEAD = 2  # cases that wait for each process
+AHEAD = 2  # cases that wait for each process
 
 Row = dict[str, Any]
 
@@ -57,7 +58,7 @@ def kept(path: Path) -> dict[int, Row]:
     return rows
 
 
-def search(path: Path, minutes: float, workers: int | None, console: Console) -> dict[int, Row]:
+def search(path: Path, minutes: float, workers: int, console: Console) -> dict[int, Row]:
     """Play cases for so many minutes, or until Ctrl-C; return all rows, also those of earlier runs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = kept(path)
@@ -65,10 +66,10 @@ def search(path: Path, minutes: float, workers: int | None, console: Console) ->
     bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console)
     with ProcessPoolExecutor(workers) as pool, path.open("a", encoding="utf-8") as file, bar:
         task = bar.add_task("", total=60.0 * minutes)
-        waiting = set()
+        waiting: set[Future[Played]] = set()
         try:
             while (passed := time.monotonic() - begin) < 60.0 * minutes or waiting:
-                while passed < 60.0 * minutes and len(waiting) < WORKERS_AHEAD * pool._max_workers:
+                while passed < 60.0 * minutes and len(waiting) < AHEAD * workers:
                     if seed not in rows:
                         waiting.add(pool.submit(play, seed))
                     seed += 1
@@ -100,7 +101,8 @@ def show(rows: dict[int, Row], console: Console) -> None:
     for row in sorted(rows.values(), key=lambda row: -row["share"])[:SHOWN]:
         done, (speed, energy) = row["driven"], row["bound"]
         figures = (row["share"], done["speed"], speed, done["energy"], energy, done["power"], done["damping"])
-        text = f"{row['begin']}{', worn' * row['worn']}: {text_of(row['events'])} | {row['error'] or row['fault'] or 'no fault'}"
+        became = row["error"] or row["fault"] or "no fault"
+        text = f"{row['begin']}{', worn' * row['worn']}: {text_of(row['events'])} | {became}"
         table.add_row(str(row["seed"]), *(f"{figure:.2f}" for figure in figures), str(done["joint"]), text)
     console.print(table)
     beyond = [seed for seed, row in rows.items() if row["share"] > 1.0]
@@ -156,7 +158,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.search", description="Search for ways to throw an arm.")
     parser.add_argument("--minutes", type=float, default=60.0, help="(%(default)g)")
     parser.add_argument("--seed", type=int, help="replay this case alone")
-    parser.add_argument("--workers", type=int, help="processes (default: one per core)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one per core)")
     parser.add_argument("--file", type=Path, default=FILE, help="of the cases so far (%(default)s)")
     options = parser.parse_args()
     console = Console(width=None if Console().is_terminal else 200, highlight=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from exo_gravity.core.arm.wearer import Wearer
@@ -17,7 +18,7 @@ WARMING = 4.0  # s
 Act = Callable[..., None]
 
 
-def during(stage: Stage, duration: float, begin: Callable[[], object], end: Callable[[], object]) -> None:
+def during(stage: Stage, duration: float, begin: Callable[[], None], end: Callable[[], None]) -> None:
     """Call `begin` now and `end` in `duration` s."""
     begin()
     stage.clock.later(duration, end)
@@ -29,11 +30,11 @@ def setting(stage: Stage, owner: object, name: str, value: object, normal: objec
     during(stage, duration, lambda: setattr(owner, name, value), lambda: setattr(owner, name, normal))
 
 
-def gradually(stage: Stage, duration: float, step: Callable[[float], object]) -> None:
+def gradually(stage: Stage, duration: float, step: Callable[[float], None]) -> None:
     """Call step(share) with a share that grows to 1 within `duration` s."""
     for number in range(1, RAMP_STEPS + 1):
         share = number / RAMP_STEPS
-        stage.clock.later(share * duration, lambda share=share: step(share))  # type: ignore[misc]
+        stage.clock.later(share * duration, partial(step, share))
 
 
 def toggle(stage: Stage, duration: float) -> None:

@@ -31,9 +31,9 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included. energy: J in one
-    stretch of such motion beyond SLOW. power: W at the moment. damping: Nm, by its damping alone, with a hand on it too.
-    joint: of the speed, 1..n. time: of the speed, as in the records.
+    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included, by `joint` (1..n)
+    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. damping: Nm,
+    by its damping alone, also while a hand is on the arm.
     """
 
     speed: float = 0.0
@@ -75,8 +75,9 @@ class Response:
     rad/s of `fastest` (joint 1..4), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
     torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
     what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
-    put into the arm while no hand was on it. power: W, and damping: Nm, as in `Driven`. off: s until the last motor was off, None if one is on at the end.
-    re_enabled: whether a motor was switched on after all had been off. gap: s, the longest time without a record.
+    put into the arm while no hand was on it. power: W, and damping: Nm, as in `Driven`. off: s until the last motor was
+    off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
+    longest time without a record.
     """
 
     reaction: float | None = None
