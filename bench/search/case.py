@@ -17,7 +17,8 @@ from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 JOINTS = range(len(USUAL_MOTORS))
 RATES = (100.0, 250.0)  # Hz
 BODY_MASS = 75.0  # kg, of a wearer
-HORIZONTAL = 1.35  # rad of abduction
+HORIZONTAL = (0.4, 1.35, 0.8, 1.5)  # rad, the farthest pose of a bare arm,
+CARRIED_IN_FULL = (0.2, 0.5, 0.2, 0.5)  # and of one with a wearer's arm, which the rated torques carry
 ENABLED, CARRIED = "enabled", "carried"  # what the times of a case's events count from
 REARM = "rearm"  # clear and enable
 
@@ -117,7 +118,7 @@ def one_of(**choices: tuple[Any, ...]) -> Callable[[random.Random], Values]:
 
 
 def reach(random: random.Random) -> Values:
-    return {"pose": pose(random, 1.5), "duration": round(random.uniform(0.5, 1.5), 2)}
+    return {"pose": pose(random, HORIZONTAL), "duration": round(random.uniform(0.5, 1.5), 2)}
 
 
 def pose(random: random.Random, highest: float) -> tuple[float, ...]:
@@ -196,10 +197,10 @@ def draw(seed: int) -> Case:
             last = source.choice(("reach", "limp", "push"))
             events.append(event(source, last, events[-1].time + source.uniform(3.0, 9.0)))
     payload = source.choice((0.2, 1.0)) if {first, second} & {"payload_dropped", "payload_flicked"} else 0.0
-    rate, highest = source.choice(RATES), 0.6 if worn else HORIZONTAL
+    rate, farthest = source.choice(RATES), CARRIED_IN_FULL if worn and source.random() < 0.75 else HORIZONTAL
     in_order = tuple(sorted(events, key=lambda event: event.time))
     friction = source.choice((0.05, 0.2))
-    return Case(seed, rate, worn, payload, friction, pose(source, highest), begin, in_order)
+    return Case(seed, rate, worn, payload, friction, pose(source, farthest), begin, in_order)
 
 
 def pair(random: random.Random) -> tuple[str, str]:

@@ -22,6 +22,7 @@ MAX_EFFORT_RATE = 50.0  # Nm/s
 HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
+WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
 PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
@@ -31,8 +32,8 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included, by `joint` (1..n)
-    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. damping: Nm,
+    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included, if that is not WEAK;
+    of `joint` (1..n), at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. damping: Nm,
     by its damping alone, also while a hand is on the arm.
     """
 
@@ -48,6 +49,7 @@ def driven(records: np.ndarray) -> Driven:
     """Return what the motors did in these records (sim/truth.py); at least one."""
     is_free, _, gained = _gained(records)
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
+    power[np.abs(records["torque"]) < WEAK] = 0.0
     speed = np.where(power > 0.0, gained, 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
     done = np.cumsum(np.where(speed > SLOW, power, 0.0) * _lasting(records)[:, None], axis=0)
