@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -164,6 +165,7 @@ def main() -> int:
     console = Console(width=None if Console().is_terminal else 200, highlight=False)
     if options.seed is not None:
         return int(replay(options.seed, console) > 1.0)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     rows = search(options.file, options.minutes, options.workers, console)
     show(rows, console)
     return int(any(row["share"] > 1.0 for row in rows.values()))

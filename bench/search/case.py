@@ -121,14 +121,9 @@ def reach(random: random.Random) -> Values:
     return {"pose": pose(random, HORIZONTAL), "duration": round(random.uniform(0.5, 1.5), 2)}
 
 
-def pose(random: random.Random, highest: float) -> tuple[float, ...]:
-    angles = (
-        random.uniform(-0.4, 0.4),
-        random.uniform(0.2, highest),
-        random.uniform(-0.2, 0.8),
-        random.uniform(0.1, 1.5),
-    )
-    return tuple(round(angle, 2) for angle in angles)
+def pose(random: random.Random, farthest: tuple[float, ...]) -> tuple[float, ...]:
+    least = -farthest[0], 0.2, -0.5 * farthest[2], 0.1
+    return tuple(round(random.uniform(*ends), 2) for ends in zip(least, farthest, strict=True))
 
 
 def push(random: random.Random) -> Values:

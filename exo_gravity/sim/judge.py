@@ -32,9 +32,9 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included, if that is not WEAK;
-    of `joint` (1..n), at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. damping: Nm,
-    by its damping alone, also while a hand is on the arm.
+    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
+    at `time` as in the records. A WEAK torque drives nothing. energy: J in one stretch of such motion beyond SLOW, and
+    power: W in it. damping: Nm, by its damping alone, also while a hand is on the arm.
     """
 
     speed: float = 0.0
