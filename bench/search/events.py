@@ -62,20 +62,19 @@ def body_mass(stage: Stage, mass: float) -> None:
 
 def supply_cut(stage: Stage, motors: list[int], duration: float) -> None:
     """Cut the supply: after it the encoders, on the rotors, know the angle only within a turn of the rotor."""
-    stage.arm.catch_up()
-    for joint in motors:
-        stage.motors[joint].unplugged = True
-    stage.device.return_power(duration)
-    stage.clock.later(duration, lambda: forget_turns(stage, motors))
 
+    def power(is_on: bool) -> None:
+        stage.arm.catch_up()
+        errors = list(stage.device.encoder_error)
+        for joint in motors:
+            motor = stage.motors[joint]
+            motor.unplugged = not is_on
+            turn = 2.0 * math.pi / motor.joint.spec.gear_ratio
+            errors[joint] = -turn * round(stage.device.arm.positions[joint] / turn)
+        stage.device.encoder_error = errors
 
-def forget_turns(stage: Stage, motors: list[int]) -> None:
-    stage.arm.catch_up()
-    errors = list(stage.device.encoder_error)
-    for joint in motors:
-        turn = 2.0 * math.pi / stage.motors[joint].joint.spec.gear_ratio
-        errors[joint] = -turn * round(stage.device.arm.positions[joint] / turn)
-    stage.device.encoder_error = errors
+    power(False)
+    stage.clock.later(duration, partial(power, True))
 
 
 def lost(which: str) -> Act:

@@ -18,7 +18,6 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
-from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
@@ -27,9 +26,10 @@ from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock, Wire
 
-from .case import BODY_MASS, Case
+from .case import BODY_MASS, CARRIED, Case
 
 IMU_PERIOD = 0.01  # s
+COMMAND_TIMEOUT, TILT_TIMEOUT, ENABLE_TIMEOUT = 0.05, 0.08, 10.0  # s, those of a real arm
 NOTHING = TrialScript("nothing", ())
 
 
@@ -116,7 +116,7 @@ class Stage:
 
     def __init__(self, case: Case) -> None:
         configured = read_arm(load(packaged_config("sim.yaml")), "/right")
-        settings = replace(configured.settings(), tilt_timeout=0.08, payload_mass=case.payload)
+        settings = replace(configured.settings(), tilt_timeout=TILT_TIMEOUT, payload_mass=case.payload)
         robot = settings.robot_by_mass
         assert robot
         self.load = Wearer(BODY_MASS).on_links(robot.length)
@@ -129,7 +129,9 @@ class Stage:
         self.motors = [FailingMotor(joint) for joint in configured.motors]
         self.device = SimulatedDevice(device_arm, self.motors)
         self.truth = self.device.truth = TruthRecords()
-        limits = Limits(configured.joint_names)
+        # An arm whose events come later has proven its signs: that takes 5 s.
+        proven = {"sign_check_torque": 0.0} if case.begin == CARRIED else {}
+        limits = replace(configured.limits, command_timeout=COMMAND_TIMEOUT, enable_timeout=ENABLE_TIMEOUT, **proven)
         self.wire = LossyWire([motor.can_id for motor in configured.motors])
         self.clock = self.wire.clock
         self.compensator = Compensator(self.settings)

@@ -50,6 +50,7 @@ class SimulatedDevice:
         self.pitch = self.roll = 0.0  #: rad, of the trunk
         self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
         self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT  #: the same for each motor
+        self.mute: Sequence[bool] = (False,) * JOINT_COUNT  #: whether a motor's replies are lost, while it obeys
         self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT  #: rad, added to the angle that a motor reads
         self.truth: Truth | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
@@ -117,11 +118,11 @@ class SimulatedDevice:
         self._frames[joint] += 1
         position = arm.positions[joint] + self.encoder_error[joint]
         reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
-        return None if reply is None else (motor.reply_id, reply)
+        return None if reply is None or self.mute[joint] else (motor.reply_id, reply)
 
     def status(self, joint: int) -> Frame | None:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
-        if self.bus_silent or self.cut_off[joint]:
+        if self.bus_silent or self.cut_off[joint] or self.mute[joint]:
             return None
         return self.motors[joint].status(
             self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint]

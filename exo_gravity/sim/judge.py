@@ -22,6 +22,7 @@ MAX_EFFORT_RATE = 50.0  # Nm/s
 HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
+LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
 PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
@@ -33,8 +34,8 @@ class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
     speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
-    at `time` as in the records. A WEAK torque drives nothing. energy: J in one stretch of such motion beyond SLOW, and
-    power: W in it. damping: Nm, by its damping alone, also while a hand is on the arm.
+    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. A WEAK torque
+    drives nothing, and a stretch of LITTLE energy has no speed. damping: Nm, by its damping alone, also while a hand is on the arm.
     """
 
     speed: float = 0.0
@@ -50,14 +51,15 @@ def driven(records: np.ndarray) -> Driven:
     is_free, _, gained = _gained(records)
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
     power[np.abs(records["torque"]) < WEAK] = 0.0
-    speed = np.where(power > 0.0, gained, 0.0)
+    is_moved = (power > 0.0) & (gained > SLOW)
+    done = np.cumsum(np.where(is_moved, power, 0.0) * _lasting(records)[:, None], axis=0)
+    energy = done - np.maximum.accumulate(np.where(is_moved, 0.0, done), axis=0)
+    speed = np.where(energy > LITTLE, gained, 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
-    done = np.cumsum(np.where(speed > SLOW, power, 0.0) * _lasting(records)[:, None], axis=0)
-    energy = done - np.maximum.accumulate(np.where(speed > SLOW, 0.0, done), axis=0)
     return Driven(
         speed=float(speed[when, joint]),
         energy=float(energy.max()),
-        power=float(power[speed > SLOW].max(initial=0.0)),
+        power=float(power[is_moved].max(initial=0.0)),
         damping=float(np.abs(records["damping"] * records["velocity"]).max()),
         joint=int(joint) + 1,
         time=float(records["time"][when]),

@@ -55,6 +55,7 @@ SIMULATOR = (
     Param("fault.unplugged", [False] * 4, "motors without power"),
     Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
     Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
+    Param("fault.mute", [False] * 4, "motors that obey, but whose replies are lost"),
     Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
     Param("fault.temperature", [30.0] * 4, "motor temperatures", (-40.0, 215.0), "degC"),
     Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
@@ -82,6 +83,7 @@ def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
     """Set the faults of `device` that parameter values describe."""
     device.bus_silent = values["fault.bus_silent"]
     device.cut_off, device.encoder_error = values["fault.cut_off"], values["fault.encoder_error"]
+    device.mute = values["fault.mute"]
     if values["fault.unplugged_time"]:
         device.return_power(values["fault.unplugged_time"])
     faults = (values["fault.unplugged"], values["fault.temperature"], values["fault.error"])
