@@ -98,7 +98,7 @@ def text_of(events: list[Any]) -> str:
 
 def show(rows: dict[int, Row], console: Console) -> None:
     """Print the cases that use most of their bounds."""
-    table = Table("seed", "share", "rad/s", "bound", "J", "bound", "W", "damping Nm", "joint", "events", box=None)
+    table = Table("seed", "share", "rad/s", "bound", "J", "bound", "W", "damping", "joint", "events", box=None)
     for row in sorted(rows.values(), key=lambda row: -row["share"])[:SHOWN]:
         done, (speed, energy) = row["driven"], row["bound"]
         figures = (row["share"], done["speed"], speed, done["energy"], energy, done["power"], done["damping"])

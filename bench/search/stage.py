@@ -129,9 +129,9 @@ class Stage:
         self.motors = [FailingMotor(joint) for joint in configured.motors]
         self.device = SimulatedDevice(device_arm, self.motors)
         self.truth = self.device.truth = TruthRecords()
-        # An arm whose events come later has proven its signs: that takes 5 s.
-        proven = {"sign_check_torque": 0.0} if case.begin == CARRIED else {}
-        limits = replace(configured.limits, command_timeout=COMMAND_TIMEOUT, enable_timeout=ENABLE_TIMEOUT, **proven)
+        limits = replace(configured.limits, command_timeout=COMMAND_TIMEOUT, enable_timeout=ENABLE_TIMEOUT)
+        if case.begin == CARRIED:  # its signs are as good as proven, which takes 5 s
+            limits = replace(limits, sign_check_torque=0.0)
         self.wire = LossyWire([motor.can_id for motor in configured.motors])
         self.clock = self.wire.clock
         self.compensator = Compensator(self.settings)

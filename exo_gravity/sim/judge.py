@@ -15,17 +15,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
 HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
+MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
-PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
+PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in USUAL_MOTORS])
+RATED_TORQUE = np.array([MOTORS[name].rated_torque for name in USUAL_MOTORS])
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
 
 
@@ -35,7 +37,8 @@ class Driven:
 
     speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
     at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. A WEAK torque
-    drives nothing, and a stretch of LITTLE energy has no speed. damping: Nm, by its damping alone, also while a hand is on the arm.
+    drives nothing, and a stretch of LITTLE energy has no speed. damping: torque by damping alone as a multiple of the
+    motor's rated torque, also while a hand is on the arm.
     """
 
     speed: float = 0.0
@@ -60,7 +63,7 @@ def driven(records: np.ndarray) -> Driven:
         speed=float(speed[when, joint]),
         energy=float(energy.max()),
         power=float(power[is_moved].max(initial=0.0)),
-        damping=float(np.abs(records["damping"] * records["velocity"]).max()),
+        damping=float(np.abs(records["damping"] * records["velocity"] / RATED_TORQUE).max()),
         joint=int(joint) + 1,
         time=float(records["time"][when]),
     )
@@ -79,7 +82,7 @@ class Response:
     rad/s of `fastest` (joint 1..4), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
     torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
     what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
-    put into the arm while no hand was on it. power: W, and damping: Nm, as in `Driven`. off: s until the last motor was
+    put into the arm while no hand was on it. power: W, and damping, as in `Driven`. off: s until the last motor was
     off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
     longest time without a record.
     """
