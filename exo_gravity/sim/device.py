@@ -27,7 +27,7 @@ from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
-from exo_gravity.sim.truth import TruthLog
+from exo_gravity.sim.truth import Truth
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 REPLY_DELAY = (200e-6, 400e-6)  # s
@@ -50,8 +50,9 @@ class SimulatedDevice:
         self.pitch = self.roll = 0.0  #: rad, of the trunk
         self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
         self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT  #: the same for each motor
+        self.mute: Sequence[bool] = (False,) * JOINT_COUNT  #: whether a motor's replies are lost, while it obeys
         self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT  #: rad, added to the angle that a motor reads
-        self.truth: TruthLog | None = None  #: receives every physics step
+        self.truth: Truth | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0
@@ -130,13 +131,13 @@ class SimulatedDevice:
             self._frames[joint] += 1
             position = arm.positions[joint] + self.encoder_error[joint]
             reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
-            if reply is not None:
+            if reply is not None and not self.mute[joint]:
                 replies.append((joint, (motor.reply_id, reply)))
         return replies
 
     def status(self, joint: int) -> Frame | None:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
-        if self.bus_silent or self.cut_off[joint]:
+        if self.bus_silent or self.cut_off[joint] or self.mute[joint]:
             return None
         return self.motors[joint].status(
             self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint]

@@ -90,6 +90,7 @@ SIMULATOR = (
     Param("fault.cable", [False] * 4, "V3 boards with their configuration cable plugged in, which ignore commands"),
     Param("fault.strength", [1.0] * 4, "share of its torque that a motor still gives, and does not report", (0.1, 1.0)),
     Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
+    Param("fault.mute", [False] * 4, "motors that obey, but whose replies are lost"),
     Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
     Param("fault.temperature", [30.0] * 4, "motor temperatures", (-40.0, 215.0), "degC"),
     Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
@@ -135,6 +136,7 @@ def set_faults(device: SimulatedDevice, values: Mapping[str, Any], changed: Coll
     """
     device.bus_silent = values["fault.bus_silent"]
     device.cut_off, device.encoder_error = values["fault.cut_off"], values["fault.encoder_error"]
+    device.mute = values["fault.mute"]
     if changed is None or "fault.unplugged" in changed:
         for joint, unplugged in enumerate(values["fault.unplugged"]):
             if unplugged:
