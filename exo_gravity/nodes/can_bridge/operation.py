@@ -1,6 +1,9 @@
 """How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
 
-Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
+Each service runs on the control thread between two cycles, and the executor does not wait for it: a request to let the
+arm down never waits behind others, and ends those that would arm it. A request that would arm the arm is refused once
+it is older than REQUEST_LIFE: whoever sent it no longer expects it to be carried out. One that lets the arm down is
+carried out at any age. Who holds control is a lease (core/safety/lease.py).
 """
 
 import time
@@ -25,6 +28,7 @@ from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
+from exo_gravity.nodes.ros.inner import Until, age_of_request, wake
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
@@ -35,6 +39,7 @@ ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write thei
 REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
+REQUEST_LIFE = 1.0  # s; a busy computer delays requests by tenths of that
 
 # What follows a request that was carried out, by the state that it led to.
 FOLLOWS = {
@@ -59,14 +64,36 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
     node.set_descriptor("use_sim_time", fixed)
 
 
+def why_too_old(age: float) -> str:
+    """Return why a request that is `age` s old may not arm an arm; '' if it may."""
+    if age <= REQUEST_LIFE:
+        return ""
+    return (
+        f"refused: the request is {age:.1f} s old, must be at most {REQUEST_LIFE:g} s: send it again; if it comes from "
+        "another computer, compare the clocks"
+    )
+
+
 class BridgeServices:
-    """Creates the services on `node`. get_loop returns the present control loop, None while the node is inactive.
+    """Creates the services on `node`.
+
+    get_loop: returns the present control loop, None while the node is inactive.
+    hindrance: returns why the arm may not be armed now; '' if it may.
 
     Each method below, on the control thread, does what its service is for and returns why it is refused, or ''.
     """
 
-    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], motors: Sequence[JointMotor]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        get_loop: Callable[[], ControlLoop | None],
+        motors: Sequence[JointMotor],
+        hindrance: Callable[[], str],
+    ) -> None:
+        self._node = node
         self._get_loop = get_loop
+        self._hindrance = hindrance
+        self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._zero = [motor.zero for motor in motors]
         services = {self.enable: SetBool, self.clear_fault: Trigger, self.resume: Trigger, self.set_zero: Trigger}
         for function, kind in services.items():
@@ -102,22 +129,36 @@ class BridgeServices:
         loop.bus.set_zero()
         return ""
 
-    def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
+    async def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
         """Run `function` on the control thread, and wait for the motors' zeros if it has set them.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
         """
         loop, since = self._get_loop(), time.monotonic()
+        response.success, response.message = False, "the node is not active"
         if loop is None:
-            response.success, response.message = False, "the node is not active"
             return response
+        lets_down = function == self.enable and not request.data
+        if not lets_down and (why_not := why_too_old(age_of_request(self._node)) or self._hindrance()):
+            response.message = why_not
+            return response
+        if lets_down:
+            for waiting in tuple(self._arming):
+                waiting.cancel()
         future = loop.call(lambda: function(loop, request))
+        if not lets_down:
+            self._arming.add(future)
+        future.add_done_callback(lambda _: wake(self._node))
+        await Until(future.done, CALL_TIMEOUT)
+        self._arming.discard(future)
         try:
-            response.message = future.result(CALL_TIMEOUT)
+            response.message = future.result(0.0)
             if function == self.set_zero and not response.message:
-                response.message = _wait_for_zeros(loop, since)
+                response.message = await _zeros(loop, since)
         except BusError as error:
             response.message = str(error)
+        except futures.CancelledError:
+            response.message = "refused: the arm was asked to be let down"
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
             future.cancel()
             response.message = "the control thread did not respond"
@@ -127,15 +168,18 @@ class BridgeServices:
         return response
 
 
-def _wait_for_zeros(loop: ControlLoop, since: float) -> str:
+async def _zeros(loop: ControlLoop, since: float) -> str:
     """Wait for replies of all motors, later than `since` (monotonic s), at their zero; return who did not reply so."""
-    while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-        if time.monotonic() > since + ZERO_TIMEOUT:
-            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-            return f"the motors did not set their zero: {positions}"
-        time.sleep(0.005)
-    return ""
+
+    def are_set() -> bool:
+        return all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples)
+
+    await Until(are_set, ZERO_TIMEOUT)
+    if are_set():
+        return ""
+    columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
+    positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
+    return f"the motors did not set their zero: {positions}"
 
 
 class Operator:
