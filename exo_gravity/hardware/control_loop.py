@@ -227,6 +227,8 @@ class ControlLoop:
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
+        if late := self.bus.late_replies:
+            self.safety.trip(FaultCode.REPLIES_LATE, late, self._now())
         if self.bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self.bus.foreign_commands
             self.safety.trip(FaultCode.FOREIGN_COMMAND, self.bus.foreign_command, self._now())

@@ -26,10 +26,12 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from exo_gravity.core.params import Param
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.operation import BridgeServices
 from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, age_of_request, prepare_transitions
+from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 from ..support.waiting import wait_until
@@ -113,11 +115,14 @@ async def nothing_first(_request):
 
 
 def test_an_exception_of_this_package_in_a_standard_service_still_ends_the_node(served):
+    def fail(_read: object, _names: set[str]) -> None:
+        raise KeyError("broken")
+
     served.node.declare_parameter("some", 1)
-    served.node.add_on_set_parameters_callback(lambda _: standing().no_such_attribute)
+    accept_changes(served.node, (Param("some", 1, "a number"),), lambda values: values, fail)
     some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=3))
     served.send(SetParameters, "set_parameters", SetParameters.Request(parameters=[some]))
-    with pytest.raises(AttributeError, match="no_such_attribute"):
+    with pytest.raises(KeyError, match="broken"):
         wait_until(lambda: False, served.spin)
 
 

@@ -32,6 +32,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
+from exo_gravity.hardware.can.request_age import Requests
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
@@ -98,6 +99,15 @@ class MotorBus:
         self._exit_sent = -math.inf
         self._is_confirming = False  # replies now follow an EXIT
         self._answered: set[int] = set()
+        self._requests = [Requests() for _ in motors]
+
+    @property
+    def late_replies(self) -> str:
+        """Which motor answers commands that are too old, as a sentence; '' if none does."""
+        for motor, requests in zip(self._motors, self._requests, strict=True):
+            if requests.late:
+                return f"motor {motor.can_id} answers commands that are {1000.0 * requests.late:.0f} ms old or older"
+        return ""
 
     @property
     def may_be_powered(self) -> bool:
@@ -214,11 +224,11 @@ class MotorBus:
         for port in self._buses:
             port.close()
 
-    def _send(self, port: CanPort | None, *frames: Frame) -> None:
+    def _send(self, port: CanPort | None, *frames: Frame, may_be_lost: bool = False) -> None:
         """Send frames on a bus, unless it is not open or has failed in this cycle."""
         if port and port not in self._failed:
             try:
-                port.send(*frames)
+                port.send(*frames, may_be_lost=may_be_lost)
             except BusError as error:
                 self._failed[port] = error
 
@@ -250,10 +260,14 @@ class MotorBus:
         for joint, motor in enumerate(self._motors):
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
+            if joint in self._asked:
+                if not self._requests[joint].may_send(now):
+                    continue
+                self._requests[joint].sent(now, 1)
             command = self._command(joint, now)
             frames[self._ports[joint]] += (command, *motor.enter, command) if drive.enter[joint] else (command,)
         for port, own in frames.items():
-            self._send(port, *own)
+            self._send(port, *own, may_be_lost=True)
 
     def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
         """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
@@ -280,7 +294,9 @@ class MotorBus:
                 self._oppose(self._joint_of[can_id], bytes(message.data))
             return
         joint = self._joint_of[can_id]
-        sample = self._motors[joint].sample(message.data, self._now())
+        now = self._now()
+        asked = self._requests[joint].replied(now) if joint in self._asked else now
+        sample = self._motors[joint].sample(message.data, asked)
         self._answered.add(joint)
         if self._is_confirming and (joint in self._asked or abs(sample.effort) < OFF_EFFORT):
             self._unconfirmed.discard(joint)

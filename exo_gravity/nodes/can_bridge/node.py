@@ -29,6 +29,7 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
@@ -120,7 +121,7 @@ class CanBridge(LifecycleNode):
         if any(limits.largest_moment):
             _follow_gravity(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
-        operation.log_risks(self, traffic, values["rate"])
+        operation.log_risks(self, self._arm.address[0], traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
@@ -243,7 +244,9 @@ class CanBridge(LifecycleNode):
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
     """Declare the parameters; return their values, and the arm that they describe. Raises ParameterError."""
     values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-    return values, ArmOnBus(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
+    serials = serials_of(values["can.serial"], values["can.channel"])
+    address, motors, limits = bus_of(node, values), motors_of(values), limits_of(values)
+    return values, ArmOnBus(address, motors, limits, 1.0 / values["rate"], serials=serials)
 
 
 def _owner(node: Node) -> str:

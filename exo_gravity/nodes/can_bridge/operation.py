@@ -24,6 +24,7 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
+from exo_gravity.hardware.can.adapter import serial_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
@@ -215,10 +216,12 @@ class Operator:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
-def log_risks(node: Node, traffic: Mapping[str, Traffic], rate: float) -> None:
-    """Log the load of each bus at `rate` (Hz), and whether other hosts can command the arm."""
+def log_risks(node: Node, interface: str, traffic: Mapping[str, Traffic], rate: float) -> None:
+    """Log the load of each bus at `rate` (Hz), its adapter, and whether other hosts can command the arm."""
     log = node.get_logger()
     for name, bus in traffic.items():
+        if serial := serial_of(interface, name):
+            log.info(f"the adapter of {name} has the serial number {serial}: can.serial binds the bus to it")
         log.info(
             f"bus load of {name} at {rate:g} Hz: {bus.load(rate):.0%} of {bus.bitrate / 1000:g} kbit/s, "
             f"{bus.load(rate, worst=True):.0%} at worst; the bus is full at {int(bus.largest_rate)} Hz"
