@@ -272,11 +272,11 @@ def test_a_v3_command_has_the_bytes_worked_out_by_hand():
 
 
 def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
-    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 3 Nm / 7.4 A, -5 degC, error 7
+    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 0.2997 Nm/A, -5 degC, error 7
     data = bytes.fromhex("0384 0348 ff38 fb 07")
     reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
     assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
-    assert reply[3:] == (pytest.approx(-2.0 * 3.0 / 7.4), -5, 7)
+    assert reply[3:] == (pytest.approx(-2.0 * 0.2997), -5, 7)
     assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
     assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
 
@@ -314,3 +314,34 @@ def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():
     with pytest.raises(ParameterError, match=r"torque_range = 15\.0: must be 12 or 0 for an AK60-6 with wire_format"):
         motors_of(parameters(**given))
     assert motors_of(parameters(**{**given, "torque_range": [9.0, 0.0, 0.0, 0.0]}))[0].spec.torque_range == 9.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("motor_timeout", 0.1, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("motor_timeout", 3.0, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("motor_timeout", math.nan, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("position_range", 10.0, r"must be 0, the usual one of the motor, or from 12\.4 to 12\.6"),
+        ("torque_per_ampere", 0.3, "must be 0 with wire_format = mit, whose replies carry the torque itself"),
+    ],
+)
+def test_a_value_that_no_firmware_has_is_refused(name, value, sentence):
+    with pytest.raises(ParameterError, match=f"{name} = .*: {sentence}"):
+        motors_of(parameters(**{name: [0.0, value, 0.0, 0.0]}))
+
+
+def test_each_motor_has_the_time_out_and_position_range_of_its_own_firmware():
+    motors = motors_of(parameters(motor_timeout=[0.0, 0.15, 0.5, 0.3], position_range=[12.56, 0.0, 12.5, 12.566]))
+    assert [motor.timeout for motor in motors] == [0.0, 0.15, 0.5, 0.3]
+    assert [motor.spec.position_range for motor in motors] == [12.56, 12.5, 12.5, 12.566]
+    quarter_turn = pack_reply(motors[0].spec, 1, math.pi / 2, 0.0, 0.0)
+    assert motors[0].sample(quarter_turn, 0.0).position == pytest.approx(math.pi / 2, abs=0.001)
+    assert motors[1].sample(quarter_turn, 0.0).position == pytest.approx(math.radians(90.0 - 0.43), abs=0.001)
+
+
+def test_the_torque_of_a_v3_board_is_its_current_times_the_torque_per_ampere_of_its_firmware():
+    given = {"wire_format": ["mit_v3"] * 4, "torque_per_ampere": [0.0, 0.0, 0.45, 0.0]}
+    data = bytes.fromhex("0000 0000 03e8 19 00")  # 10 A
+    efforts = [motor.sample(data, 0.0).effort for motor in motors_of(parameters(**given))]
+    assert efforts == pytest.approx([2.997, 10.0 * 9.0 / 10.3, 4.5, 2.997])

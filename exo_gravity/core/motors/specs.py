@@ -54,7 +54,9 @@ class MotorSpec:
     peak_torque: float  #: Nm, for seconds
     gear_ratio: int  #: turns of the rotor per turn of the output
     pole_pairs: int  #: of the rotor; only V3 boards report a speed of it
-    torque_per_ampere: float  #: Nm, rated torque by rated current; only V3 boards report a current
+    #: Nm/A at the output, by which a V3 board divides torque for its current, which it reports: that of its firmware
+    #: where known, else rated torque by rated current
+    torque_per_ampere: float
     rotor_inertia: float  #: kg m^2, that of the rotor times the gear ratio squared
     position_range: float = 12.5  #: rad: the wire range is +- this value
     kp_max: float = 500.0  #: Nm/rad: the wire range starts at 0
@@ -112,7 +114,7 @@ MOTORS = {
         peak_torque=9.0,
         gear_ratio=6,
         pole_pairs=14,
-        torque_per_ampere=3.0 / 7.4,
+        torque_per_ampere=0.2997,  # of firmware V3.2; rated torque by rated current would be 0.405
         rotor_inertia=8.8e-4,
     ),
     "AK80-9": MotorSpec(
