@@ -153,7 +153,7 @@ class MotorPower:
         if joint.time > self._newest:
             self._torque += min(1.0, dt / POWER.smoothing) * (joint.effort - self._torque)
             self._heard_for += dt
-            is_confirmed = len(self._exits) == 2 and joint.time > self._exits[1]
+            is_confirmed = len(self._exits) == 2 and joint.time >= self._exits[1]
             if is_confirmed and (self._board == 0 or abs(joint.effort) < POWER.torque):
                 self.change(Change.CONFIRMED)
         self._newest = max(self._newest, joint.time)
