@@ -162,7 +162,8 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
     if machine.state in CARRYING:
         assert arm.effort is not None
         assert arm.effort_age <= RIDE.longest_age + 1e-9
-        assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or min(drive.damping) > 0.0
+        is_damped = machine.state is State.PROVING or min(drive.damping) > 0.0
+        assert arm.effort_age <= LIMITS.command_timeout + 1e-9 or is_damped
         assert all(arm.now - joint.time <= LIMITS.reply_timeout + 1e-9 for joint in arm.joints)
         assert machine.fault is None
     elif machine.is_off:

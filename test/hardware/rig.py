@@ -184,7 +184,7 @@ class CarriedArm:
         self.clock, self.wire, self.bus, self.safety, self.loop = arm.clock, arm.wire, arm.bus, arm.safety, arm.loop
         self.run = arm.run
         arm.enable()
-        self.run_until(lambda: self.safety.fault or self.rig.is_raised)
+        self.run_until(lambda: self.safety.fault or (self.rig.is_raised and self.safety.state is State.ACTIVE))
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self.controller.is_raised = True
         self.rig.top_speed = 0.0

@@ -83,12 +83,12 @@ def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_ma
     arm = CompensatedArm()
     begin, carry = arm.now, arm.wire.carry
 
-    def queue(sender, message):
+    def queue(sender, message, *sent):
         is_command = sender is not None and message.arbitration_id and message.data[0] in (0x7F, 0x80)
         if is_command:
-            arm.clock.later(0.02 * (arm.now - begin), lambda: carry(sender, message))
+            arm.clock.later(0.02 * (arm.now - begin), lambda: carry(sender, message, *sent))
         else:
-            carry(sender, message)
+            carry(sender, message, *sent)
 
     arm.wire.carry = queue
     assert arm.run_until(lambda: arm.safety.state is not State.ACTIVE, 20.0)
