@@ -33,6 +33,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NO_MOTOR, OFF, Drive, Efforts, Fault, FaultCode, State
@@ -65,7 +66,8 @@ class SafetyMachine:
         self.is_unreached = False
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
-        self._peak_damping = [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT
+        #: the last hand on every drive
+        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
@@ -204,8 +206,10 @@ class SafetyMachine:
     def _powered(
         self, effort: Iterable[float], damping: Iterable[float], enter: tuple[bool, ...], unsure: tuple[bool, ...]
     ) -> Drive:
-        """Return a drive of motors that are on, with no more damping than each of them can apply."""
-        return Drive(tuple(effort), tuple(map(min, damping, self._peak_damping)), True, enter, unsure)
+        """Return a drive of motors that are on."""
+        readings, torque = self._readings, tuple(effort)
+        bounded = self.barrier.damping(self._dt, readings.joints, readings.silent, torque, tuple(damping))
+        return Drive(torque, bounded, True, enter, unsure)
 
     def _check(self, efforts_are_fresh: bool) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
@@ -247,16 +251,11 @@ class SafetyMachine:
             ramp = min(1.0, (self._now - self._since) / RAMP_TIME)
             if ramp == 1.0:
                 self._enter(State.ACTIVE)
-        shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
-        self.acted.update(dict.fromkeys(acted, self._now))
-        # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
-        # rises over `damping_rise`, and any damping falls so.
-        step = DAMPING / DESCENT.damping_rise * self._dt
         guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        columns = zip(walls, wanted, self._sent.damping, strict=True)
-        damping = [max(wall, last - step, min(last + step, most)) for wall, most, last in columns]
-        return self._powered(shaped, damping, NO_MOTOR, NO_MOTOR)
+        shaped = self.barrier.shape(self._dt, joints, effort, ramp, self._sent.effort, wanted)
+        self.acted.update(dict.fromkeys(shaped.acted, self._now))
+        return self._powered(shaped.effort, shaped.damping, NO_MOTOR, NO_MOTOR)
 
     def _descend(self) -> Drive:
         descent, supply, silent = self._descent, self._supply, self._readings.silent
