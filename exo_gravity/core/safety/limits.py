@@ -1,11 +1,9 @@
-"""The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
+"""The limits of a worn arm, and which motor readings are a fault.
 
-`find_fault` checks a motor's reading; monitors.py confirms what it finds. `shape` limits the requested efforts, in this
-order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
-compares the defaults with those of other systems.
+`find_fault` checks a motor's reading; monitors.py confirms what it finds. barrier.py keeps every drive within the
+limits. docs/safety.md compares the defaults with those of other systems.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -93,6 +91,13 @@ class Limits:
         (0.0, max(spec.peak_torque for spec in MOTORS.values())),
         "Nm",
     )
+    driven_speed: float = owned(
+        1.5,
+        "speed from which a joint is braked that its own motor drives; 1 rad/s beyond, the motor drives it no more",
+        (0.5, 4.0),
+        "rad/s",
+        expert=True,
+    )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
     #: s without a reply that makes a motor silent; `limits_of` derives it from the rate
     reply_timeout: float = READING.reply_timeout
@@ -154,47 +159,6 @@ class Limits:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
         return None
-
-    def shape(
-        self,
-        effort: Sequence[float],
-        share: Sequence[float],
-        joints: Sequence[JointSample],
-        before: Sequence[float],
-        dt: float,
-    ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:
-        """Return the limited torque (4,) in Nm, the soft walls' damping (4,) in Nm s/rad, and which limits acted.
-
-        effort: (4,) Nm, requested. share: (4,) 0..1, of effort and soft wall, where torque begins. before: (4,) Nm,
-        applied `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
-        """
-        step = MAX_EFFORT_RATE * dt
-        shaped, damping, acted = [], [], set()
-        for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
-            if not abs(effort[i]) <= MAX_COMMAND:
-                raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
-            above = joint.position - self.position_max[i] + WALL.width
-            below = self.position_min[i] + WALL.width - joint.position
-            depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
-            # Once the joint leaves the wall, no spring pushes it.
-            is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL.release
-            wall = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
-            colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
-            permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
-            wanted = share[i] * (effort[i] + wall)
-            clamped = max(-permitted, min(permitted, wanted))
-            limited = max(before[i] - step, min(before[i] + step, clamped))
-            shaped.append(limited)
-            damping.append(WALL.damping * min(1.0, abs(depth) / WALL.edge))
-            if depth != 0.0:
-                acted.add(f"soft wall ({name})")
-            if permitted < self.max_effort[i]:
-                acted.add(f"derating ({name})")
-            if clamped != wanted:
-                acted.add(f"max_effort ({name})")
-            if limited != clamped:
-                acted.add(f"max_effort_rate ({name})")
-        return tuple(shaped), tuple(damping), acted
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

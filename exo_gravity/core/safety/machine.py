@@ -19,12 +19,14 @@ nothing to repair.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+import operator
+from collections.abc import Sequence
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
@@ -58,7 +60,8 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
-        self._peak_damping = [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT
+        #: the last hand on every drive
+        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
         self._replies = [motor.wire_format.replies for motor in motors] or [True] * JOINT_COUNT
         self.power = tuple(map(MotorPower, self._replies))
         self._since = self._calm_since = 0.0
@@ -216,10 +219,10 @@ class SafetyMachine:
             return self._push()
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
-    def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
-        """Return a drive with no more damping than each motor can apply."""
-        damping = tuple(map(min, damping, self._peak_damping))
-        return Drive(tuple(effort), damping, tuple(send), self._may_be_powered)
+        #: the last hand on every drive
+        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
+        self._replies = [motor.wire_format.replies for motor in motors] or [True] * JOINT_COUNT
+        self.power = tuple(map(MotorPower, self._replies))
 
     def _check(self, efforts_are_fresh: bool) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
@@ -280,8 +283,8 @@ class SafetyMachine:
         boards = zip(again, self._replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
         rise = DAMPING / DESCENT.damping_rise * self._dt
-        columns = zip(damped, self._sent.damping, strict=True)
-        return self._powered(pushed, [min(DAMPING, last + rise) if may else 0.0 for may, last in columns], send)
+        drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
+        return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
         joints = self._readings.joints
@@ -291,16 +294,11 @@ class SafetyMachine:
                 self._on(Event.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._begin.shares]
-        shaped, walls, acted = self.limits.shape(effort, share, joints, self._sent.effort, self._dt)
-        self.acted.update(dict.fromkeys(acted, self._now))
-        # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
-        # rises over `damping_rise`, and any damping falls so.
-        step = DAMPING / DESCENT.damping_rise * self._dt
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        columns = zip(walls, wanted, self._sent.damping, strict=True)
-        damping = [max(wall, last - step, min(last + step, most)) for wall, most, last in columns]
-        return self._powered(shaped, damping, COMMANDS)
+        shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
+        self.acted.update(dict.fromkeys(shaped.acted, self._now))
+        return self._powered(shaped.effort, shaped.damping, COMMANDS)
 
     def _descend(self) -> Drive:
         """Return a drive that lowers the arm, or stands once it is down."""
