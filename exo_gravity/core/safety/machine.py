@@ -219,10 +219,11 @@ class SafetyMachine:
             return self._push()
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
-        #: the last hand on every drive
-        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
-        self._replies = [motor.wire_format.replies for motor in motors] or [True] * JOINT_COUNT
-        self.power = tuple(map(MotorPower, self._replies))
+    def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
+        """Return a drive of motors that may be on, within the barrier."""
+        readings, torque = self._readings, tuple(effort)
+        bounded = self.barrier.damping(self._dt, readings.joints, readings.silent, torque, tuple(damping))
+        return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, efforts_are_fresh: bool) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
