@@ -95,6 +95,7 @@ class FaultCode(str, Enum):
     MOTOR_ERROR = "motor_error", "a motor reports an error", RECHECK
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
     TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK
+    TORQUE_DIPPED = "torque_dipped", "a joint fell while the loop stood still: its motor's own time-out is too short"
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than 5 rad/s, the elbow 6"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"

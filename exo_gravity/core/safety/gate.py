@@ -39,10 +39,10 @@ class SwitchOn:
 class SignPush:
     """The pushes that show which way a motor moves its joint."""
 
-    rise: float = 2.0  #: Nm/s
+    rise: float = 1.5  #: Nm/s; a joint that breaks loose is not yet damped
     fall: float = 10.0  #: Nm/s
     least: float = 0.1  #: Nm; motion under a smaller push is not caused by it
-    moved: float = 0.02  #: rad; fifty codes of the position
+    moved: float = 0.015  #: rad; forty codes of the position
     still: float = 0.003  #: rad within which a joint is still
     still_time: float = 0.2  #: s for which it must stay within `still`
     timeout: float = 0.5  #: s at full torque

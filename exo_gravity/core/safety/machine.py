@@ -26,7 +26,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.barrier import Barrier
+from exo_gravity.core.safety.barrier import BARRIER, Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
@@ -36,6 +36,7 @@ from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
+from exo_gravity.core.safety.stall import StallWatch
 from exo_gravity.core.safety.transitions import TRANSITIONS, Event
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
@@ -69,6 +70,8 @@ class SafetyMachine:
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
         self._begin = GuidedMotion(JOINT_COUNT)  # of the torque
+        self._stall = StallWatch(limits.joint_names)
+        self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_trusted = False  # zeros and signs
@@ -171,6 +174,7 @@ class SafetyMachine:
             self._check(is_fresh)
         elif self.state in CARRYING:
             self._trip(self._carried_fault(efforts))
+        self._watch_stalls()
         effort = efforts.effort
         if effort is not None and self.state in CARRIED:
             effort, fault = self.motion.step(self._dt, self._readings.joints, effort, now - efforts.answered)
@@ -194,6 +198,17 @@ class SafetyMachine:
             for power, held in zip(self.power, self._left, strict=True):
                 if power.state is Power.UNSURE and power.is_heard and abs(held) <= 2.0 * POWER.torque:
                     power.change(Change.SHOWN_ON)
+
+    def _watch_stalls(self) -> None:
+        """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
+        self._guard = max(0.0, self._guard - BARRIER.rate * self._dt)
+        if self.state not in CARRIED:
+            self._stall.reset()
+            return
+        has_stood_still, fault = self._stall.step(self._now, self._readings.joints, self._sent.effort)
+        if has_stood_still:
+            self._guard = DAMPING
+        self._trip(fault)
 
     def _carried_fault(self, efforts: Efforts) -> Fault | None:
         """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
@@ -299,7 +314,8 @@ class SafetyMachine:
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
         shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
         self.acted.update(dict.fromkeys(shaped.acted, self._now))
-        return self._powered(shaped.effort, shaped.damping, COMMANDS)
+        damping = [max(self._guard, own) for own in shaped.damping]
+        return self._powered(shaped.effort, damping, COMMANDS)
 
     def _descend(self) -> Drive:
         """Return a drive that lowers the arm, or stands once it is down."""

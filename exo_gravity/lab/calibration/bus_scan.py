@@ -117,7 +117,7 @@ class BusScan(contextlib.ExitStack):
             self.callback(self._port.close)
             for message, kind, answer in self._frames(LISTEN_TIME):
                 if answer and message.is_extended_id:
-                    self._rates[answer.can_id] += 1.0 / LISTEN_TIME
+                    self._rates[answer.can_id] += 1.0 / LISTEN_TIME  # type: ignore[assignment]
                 heard = message.arbitration_id
                 if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                     raise BusError(
