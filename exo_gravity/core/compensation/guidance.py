@@ -13,6 +13,9 @@ from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.safety.guidance import GUIDANCE, GuidedMotion
 
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
+# s without an answer, after which nothing is left to change from. This is longer than any command_timeout: the arm is
+# already being let down.
+PAUSE = 0.2
 LAST_FADE = 2.0  # s; a launcher kills a node 5 s after it asked it to end
 # Nm between the old torque and the new one; less is slow enough without damping, which a wearer who moves would feel
 LARGE = 1.0
@@ -26,7 +29,6 @@ class DropLimits:
     rise: float = 0.25  #: m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
     low_pass: float = 0.03  #: s, time constant of that
     speed: float = 0.8  #: m/s upwards, however slowly it was gained: a light load
-    readings: int = 2  #: in a row that must show it: one may be wrong
     least_mass: float = 0.1  #: kg; less throws no arm
     least_carried: float = 0.5  #: of the load's torque, that motors must apply to carry it
 
@@ -37,20 +39,19 @@ DROP = DropLimits()
 class DropWatch:
     """Whether a load that the motors carry has left the hand: its torque then throws the arm upwards.
 
-    A person who lifts as fast loses the support for the load, and nothing else.
+    Two readings in a row must show it, since one may be wrong. A person who lifts as fast loses the support for the
+    load, and nothing else.
     """
 
     def __init__(self) -> None:
-        self._slow = 0.0  # m/s
-        self._shown = 0  # readings in a row
+        self._last = self._slow = 0.0  # m/s
 
     def step(self, dt: float, speed: float, mass: float) -> bool:
         """Return whether the load of `mass` kg was dropped; speed: m/s of the hand, upwards, `dt` s after the last."""
+        self._last, speed = speed, min(self._last, speed)
         self._slow += min(1.0, dt / DROP.low_pass) * (speed - self._slow)
         is_sudden = speed > 0.0 and speed - self._slow > DROP.rise
-        is_shown = mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
-        self._shown = self._shown + 1 if is_shown else 0
-        return self._shown >= DROP.readings
+        return mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
 
 
 Load = TypeVar("Load")

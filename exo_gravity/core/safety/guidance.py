@@ -34,7 +34,7 @@ class Guidance:
     rate: float = 4.0  #: Nm/s of a joint that is calm: a wearer follows it without effort
     longest: float = 10.0  #: s, of larger arms; and always where the velocity is not known
     calm: float = 0.25  #: rad/s along the change, above the noise of a motor's velocity
-    thrown: float = 1.0  #: rad/s against the change, beyond a wearer's own slow motion
+    thrown: float = 0.4  #: rad/s against the change: motors may drive a joint at 0.6
     gain: float = 20.0  #: Nm/rad, of the way beyond `calm` or `thrown`
     brake: float = 1.5  #: Nm at most, by which the motors damp beyond `calm`: a wearer feels 0.5 kg in the hand
     watch: float = 1.0  #: s after its end in which a joint that begins to move is still guided
