@@ -153,7 +153,7 @@ def test_a_sweep_of_settings_is_followed_without_a_step():
         run.compensator.apply(settings_with(mode="zero_g", support=support))
         run.cycle(0.02)
     run.cycle(GUIDANCE.time)
-    one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
+    two = gravity_torque(settings_with(mode="zero_g").arm, THETA)
     np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
     assert run.largest_step <= GUIDANCE.rate * PERIOD * 1.001
 

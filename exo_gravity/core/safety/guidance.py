@@ -47,16 +47,16 @@ GUIDANCE = Guidance()
 class GuidedMotion:
     """The guided motion of `count` joints; none is under way at first.
 
-    shares: (n,) what is left of the way, 1 at the begin and 0 at the end.
+    shares: (n,) what is left of the way, 0 at the end.
     """
 
     def __init__(self, count: int) -> None:
         self._count = count
         self.stop()
 
-    def begin(self) -> None:
-        """Begin at the old torque."""
-        self.shares, self._calm = (1.0,) * self._count, 0.0
+    def begin(self, shares: Sequence[float]) -> None:
+        """Begin where this is left of the way, (n,); 1 is the old torque."""
+        self.shares, self._calm = tuple(shares), 0.0
 
     def stop(self) -> None:
         """Be at the new torque."""

@@ -70,7 +70,7 @@ class SafetyMachine:
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
-        self._begin = GuidedMotion(JOINT_COUNT)  # of the torque
+        self._rise = GuidedMotion(JOINT_COUNT)  # of the torque, where it begins
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_found_on = False  # by this cycle's replies
@@ -240,17 +240,17 @@ class SafetyMachine:
         if not fault and self._switch_on.done and self._signs.done:
             self._is_trusted = True
             self.motion.reset()
-            self._begin.begin()
+            self._rise.begin((1.0,) * JOINT_COUNT)
             self._enter(State.RAMPING_IN)
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
         joints = self._readings.joints
         if self.state is State.RAMPING_IN:
-            self._begin.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
-            if self._begin.is_over:
+            self._rise.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
+            if self._rise.is_over:
                 self._enter(State.ACTIVE)
         is_guided = damped or self.state is State.RAMPING_IN
-        share = [1.0 - left for left in self._begin.shares]
+        share = [1.0 - left for left in self._rise.shares]
         shaped, walls, acted = self.limits.shape(effort, share, joints, self._sent.effort, self._dt)
         self.acted.update(dict.fromkeys(acted, self._now))
         # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
