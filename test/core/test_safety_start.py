@@ -14,7 +14,7 @@ from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
 
 
-def test_a_new_machine_keeps_the_motors_off_and_torque_ramps_in_over_the_ramp_time_without_a_step():
+def test_a_new_machine_keeps_the_motors_off_and_torque_begins_slowly_and_without_a_step():
     arm = SafetyRun().cycle(1.0)
     assert arm.machine.state is State.DISABLED
     assert arm.drive == OFF
@@ -85,8 +85,7 @@ def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
         arm.changes[1].update(position=0.02 * step)
         arm.cycle(0.02)
     arm.enable()
-    arm.cycle(3.0)
-    assert arm.machine.state is State.ACTIVE
+    arm.until(State.ACTIVE)
 
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
@@ -127,16 +126,14 @@ def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried()
     arm.enable()
     arm.cycle(1.5)
     assert arm.machine.state is State.PROVING
-    arm.cycle(14.0)
-    assert arm.machine.state is State.ACTIVE
+    arm.until(State.ACTIVE, limit=16.0)
     assert all(-0.05 < position < 0.06 for position in arm.position)
     assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     arm.largest_effort = [0.0] * 4
     arm.enable()
-    arm.cycle(3.0)
-    assert arm.machine.state is State.ACTIVE
+    arm.until(State.ACTIVE)
     assert arm.largest_effort == [SWITCH_ON.torque] * 4  # the check that the motors are on
 
 
@@ -215,8 +212,7 @@ def test_a_motor_that_missed_its_enter_gets_another_one():
     arm.off.update((0, 3))
     arm.enable().cycle(1.2)
     assert not arm.off
-    arm.cycle(2.0)
-    assert arm.machine.state is State.ACTIVE
+    arm.until(State.ACTIVE)
 
 
 class Joint:

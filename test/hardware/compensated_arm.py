@@ -17,7 +17,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.virtual_arm import VirtualArm
+from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.simulated_device import joints_of, make_device
@@ -47,8 +47,10 @@ class Person(VirtualWearer):
 class CompensatedArm(DirectController, VirtualArm):
     """The arm of a 75 kg wearer, carried in `pose`; settings: what differs from exact Zero-G.
 
-    top_speed: rad/s, the largest true speed of a joint since the arm was raised. torques: (n, 4) Nm, what the motors
-    applied since then. is_damped: whether the bridge damps while the load changes.
+    imu: of the trunk; None for a trunk that is upright.
+    top_speed: rad/s, the largest true speed of a joint since the arm was raised. driven: rad/s, the same of a joint
+    along its motor's torque. torques: (n, 4) Nm, what the motors applied since then. is_damped: whether the bridge
+    damps while the load changes.
     """
 
     def __init__(
@@ -58,14 +60,15 @@ class CompensatedArm(DirectController, VirtualArm):
         formats: Sequence[WireFormat] = (MIT,) * JOINT_COUNT,
         friction: float = 0.1,
         has_wearer: bool = True,
+        imu: TrunkSensor | None = None,
         **settings: Any,
     ) -> None:
         mass, cog = WEARER
         worn = {"wearer_mass": mass, "wearer_cog": cog}
-        given = {"mode": "zero_g", "max_effort": limit, "use_imu": False, **worn, **settings}
+        given = {"mode": "zero_g", "max_effort": limit, "use_imu": bool(imu), **worn, **settings}
         self.settings = Settings("right", DEFAULT_LINKS, **given)
         self.is_damped = True
-        self.top_speed = 0.0
+        self.top_speed = self.driven = 0.0
         self.torques: list[list[float]] = []
         limits = Limits(JOINTS, max_effort=limit, sign_check_torque=0.0)
         config = ArmConfig(coulomb_friction=(friction,) * JOINT_COUNT, **(worn if has_wearer else {}))
@@ -73,12 +76,18 @@ class CompensatedArm(DirectController, VirtualArm):
         DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
         VirtualArm.__init__(self, device, self, joints_of(formats), limits, 1.0 / CYCLE, look=self._look)
         self.person = Person(pose)
+        if imu:
+            self.add_imu(imu, self.compensator, 0.01)
         self.enable()
         assert self.run_until(lambda: self.safety.state is State.ACTIVE), (self.safety.fault, self.safety.waiting_for)
         device.start(self.person)
         self.run(MOVE + 0.5)
         assert self.safety.state is State.ACTIVE, self.safety.fault
-        self.top_speed = 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget how fast the joints were and what the motors applied."""
+        self.top_speed = self.driven = 0.0
         self.torques.clear()
 
     def efforts(self, latest: float) -> Efforts:
@@ -92,6 +101,8 @@ class CompensatedArm(DirectController, VirtualArm):
         self.top_speed = max(self.top_speed, *map(abs, velocity))
         joints = zip(self.device.motors, position, velocity, strict=True)
         self.torques.append([motor.torque(angle, speed) for motor, angle, speed in joints])
+        along = (abs(speed) for speed, torque in zip(velocity, self.torques[-1], strict=True) if speed * torque > 0.0)
+        self.driven = max([self.driven, *along])
 
     def change(self, **settings: Any) -> None:
         """Change the compensator's settings live."""

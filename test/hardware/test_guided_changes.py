@@ -51,8 +51,8 @@ def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
     assert arm.top_speed < SAFE_SPEED
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     if hangs:
-        arm.run(1.0)  # it swings for a moment
-        assert max(map(abs, arm.device.arm.velocities)) < 0.2
+        arm.run(1.0)  # without friction it swings on, more slowly than a change is guided
+        assert max(map(abs, arm.device.arm.velocities)) < GUIDANCE.calm + 0.03
         assert abs(arm.device.arm.positions[1]) < 0.1
         assert arm.answer.remainder == ()
 

@@ -17,7 +17,7 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import Torque, exact_torque
 from exo_gravity.core.arm.kinematics import turning_torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, DropWatch, GuidedChange, limited
+from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange, limited
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
@@ -27,9 +27,6 @@ from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
-# s without an answer, after which nothing is left to change from. This is longer than any command_timeout: the arm is
-# already being let down.
-PAUSE = 0.2
 LONGEST_STEP = (
     0.01  # s that the rate limit allows for after a shorter one, so that the torque does not catch up at once
 )

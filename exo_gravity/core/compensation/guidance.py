@@ -5,7 +5,7 @@ A change of law, mode, masses, gain, `max_effort` or terms, and the end of a wei
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -13,10 +13,12 @@ from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.safety.guidance import GUIDANCE, GuidedMotion
 
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion
+# s without an answer, after which nothing is left to change from. This is longer than any command_timeout: the arm is
+# already being let down.
+PAUSE = 0.2
 LAST_FADE = 2.0  # s; a launcher kills a node 5 s after it asked it to end
 # Nm between the old torque and the new one; less is slow enough without damping, which a wearer who moves would feel
 LARGE = 1.0
-MOST_LOADS = 4  # that a change remembers: a slider makes many, of which the oldest have little left
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,6 @@ class DropLimits:
     rise: float = 0.25  #: m/s that the hand gains over its own low-passed speed: 8 m/s^2 for a moment,
     low_pass: float = 0.03  #: s, time constant of that
     speed: float = 0.8  #: m/s upwards, however slowly it was gained: a light load
-    readings: int = 2  #: in a row that must show it: one may be wrong
     least_mass: float = 0.1  #: kg; less throws no arm
     least_carried: float = 0.5  #: of the load's torque, that motors must apply to carry it
 
@@ -37,32 +38,32 @@ DROP = DropLimits()
 class DropWatch:
     """Whether a load that the motors carry has left the hand: its torque then throws the arm upwards.
 
-    A person who lifts as fast loses the support for the load, and nothing else.
+    Two readings in a row must show it, since one may be wrong. A person who lifts as fast loses the support for the
+    load, and nothing else.
     """
 
     def __init__(self) -> None:
-        self._slow = 0.0  # m/s
-        self._shown = 0  # readings in a row
+        self._last = self._slow = 0.0  # m/s
 
     def step(self, dt: float, speed: float, mass: float) -> bool:
         """Return whether the load of `mass` kg was dropped; speed: m/s of the hand, upwards, `dt` s after the last."""
+        self._last, speed = speed, min(self._last, speed)
         self._slow += min(1.0, dt / DROP.low_pass) * (speed - self._slow)
         is_sudden = speed > 0.0 and speed - self._slow > DROP.rise
-        is_shown = mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
-        self._shown = self._shown + 1 if is_shown else 0
-        return self._shown >= DROP.readings
+        return mass > DROP.least_mass and (speed > DROP.speed or is_sudden)
 
 
 Load = TypeVar("Load")
+Needs = Callable[[Load], Torque]  # returns the torque (n,) in Nm that a load needs in the present pose
 
 
 class GuidedChange(Generic[Load]):
-    """The way of `count` joints to the present load from those before it.
+    """The way of each of `count` joints to the new load from one before it.
 
-    What a joint has at the begin of a change is a weighted mean of what its last loads need, since a change may follow
-    another before that is done. The weights stay, and the loads follow the arm into other poses. A constant, the
-    offset, is only what they do not explain: the torque of a weighing, of a law that does not apply here, and of loads
-    that are forgotten.
+    A change may follow another before that is done. What a joint has then lies between two loads, so it is on the way
+    to the new one from at least one of them, and follows the arm into other poses with both. Of two, it takes the
+    longer way, which leaves most to go back. A constant, the offset, is only what no load explains: the torque of a
+    weighing, or of a law that does not apply here.
 
     remainder: (n,) Nm that the torque still has to go.
     """
@@ -74,7 +75,7 @@ class GuidedChange(Generic[Load]):
 
     def stop(self) -> None:
         """Forget the change: the next torque is the new load's."""
-        self._loads: list[tuple[Load, Torque]] = []  # and their weights (n,)
+        self._origins: list[Load | None] = [None] * len(self._zeros)  # None where the new load is the origin, too
         self._offset = self.remainder = self._zeros
         self._largest = 0.0  # Nm between the old torque and the new one in this pose
         self._motion.stop()
@@ -89,52 +90,59 @@ class GuidedChange(Generic[Load]):
         """Whether the motors are to damp the joints meanwhile."""
         return not self.is_over and self._largest > LARGE
 
-    def begin(self, carried: Load | None, torque: Torque, needs: Callable[[Load], Torque], after: Torque) -> None:
+    def begin(self, carried: Load | None, torque: Torque, needs: Needs[Load], after: Torque) -> None:
         """Begin at the present `torque` the way to `after`, both (n,) Nm in this pose.
 
         carried: what was the new load until now; None where it explains nothing.
-        needs: returns the torque (n,) in Nm that a load needs in this pose.
         """
-        shares = self._motion.shares
-        loads = [(load, _product(weight, shares)) for load, weight in self._loads]
-        if carried is not None:
-            weights = [weight for _, weight in loads]
-            loads.append((carried, tuple([1.0 - sum(each) for each in zip(self._zeros, *weights, strict=True)])))
-        loads = sorted(loads, key=lambda each: max(each[1]))[-MOST_LOADS:]
-        torques = [torque, *(needs(load) for load, weight in loads if any(weight))]
-        if all(abs(old - new) < GUIDANCE.small for each in torques for old, new in zip(each, after, strict=True)):
+        starts = [([carried] * len(after), self._zeros)]
+        if not self.is_over:
+            starts.append((self._origins, self._offset))
+        ways = [zip(*start, _torques(*start, needs, after), strict=True) for start in starts]
+        joints = [_longest(now, new, each) for now, new, *each in zip(torque, after, *ways, strict=True)]
+        befores = (torque, *(_torques(*start, needs, after) for start in starts))
+        if all(abs(old - new) < GUIDANCE.small for each in befores for old, new in zip(each, after, strict=True)):
             self.stop()
             return
-        self._loads, self._offset = loads, self._zeros
-        explained = self._before(needs, after)
-        self._offset = tuple([now - old for now, old in zip(torque, explained, strict=True)])
-        self._motion.begin()
+        origins, self._offset, shares = zip(*joints, strict=True)
+        self._origins = list(origins)
+        self._motion.begin(shares)
 
-    def step(
-        self, dt: float, velocity: Sequence[float] | None, needs: Callable[[Load], Torque], after: Torque
-    ) -> Torque:
+    def step(self, dt: float, velocity: Sequence[float] | None, needs: Needs[Load], after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more.
 
         velocity: (n,) rad/s, None if not known.
         needs, after: as in `begin`, in the present pose.
         """
-        before = self._before(needs, after)
+        before = _torques(self._origins, self._offset, needs, after)
         torque = self._motion.step(dt, velocity, before, after)
         self._largest = max([abs(old - new) for old, new in zip(before, after, strict=True)])
         self.remainder = tuple([now - new for now, new in zip(torque, after, strict=True)])
         return torque
 
-    def _before(self, needs: Callable[[Load], Torque], after: Torque) -> Torque:
-        """Return the torque (n,) in Nm that the loads before would have here; where they weigh nothing, `after`."""
-        before = [new + offset for new, offset in zip(after, self._offset, strict=True)]
-        for load, weight in self._loads:
-            columns = zip(before, weight, needs(load), after, strict=True)
-            before = [torque + share * (old - new) for torque, share, old, new in columns]
-        return tuple(before)
+
+def _torques(loads: Sequence[Load | None], offset: Torque, needs: Needs[Load], after: Torque) -> Torque:
+    """Return the torque (n,) in Nm that each joint's load would need here, `after` for None, and its offset."""
+    needed = {id(load): needs(load) if load else after for load in loads}
+    return tuple([needed[id(load)][n] + more for n, (load, more) in enumerate(zip(loads, offset, strict=True))])
 
 
-def _product(a: Sequence[float], b: Sequence[float]) -> Torque:
-    return tuple([x * y for x, y in zip(a, b, strict=True)])
+def _longest(now: float, new: float, ways: Iterable[tuple[Load, float, float]]) -> tuple[Load, float, float]:
+    """Return origin, offset in Nm and share of the longest way from one of `ways` to `new` on which `now` lies.
+
+    If it lies on none, the share is 1 and the offset makes up for what is missing.
+
+    ways: origin, offset and torque of each, in Nm.
+    """
+    found = []
+    for origin, offset, old in ways:
+        length = abs(old - new)
+        share = (now - new) / (old - new) if length > GUIDANCE.small else math.inf
+        if 0.0 <= share <= 1.0:
+            found.append((length, origin, offset, share))
+        else:
+            found.append((-abs(now - old), origin, offset + now - old, 1.0))
+    return max(found, key=lambda each: each[0])[1:]
 
 
 def limited(wanted: float, last: float, step: float) -> float:
@@ -178,7 +186,7 @@ class CommandFade:
         if self.state == "waiting":
             self.state, self._held, self._time = "active", tuple(applied), now
             self._motion = GuidedMotion(len(effort))
-            self._motion.begin()
+            self._motion.begin((1.0,) * len(effort))
         dt, self._time = now - self._time, now
         self._effort = self._motion.step(dt, velocity, self._held, effort)
         return self._effort

@@ -34,8 +34,9 @@ class Guidance:
     rate: float = 4.0  #: Nm/s of a joint that is calm: a wearer follows it without effort
     longest: float = 10.0  #: s, of larger arms; and always where the velocity is not known
     calm: float = 0.25  #: rad/s along the change, above the noise of a motor's velocity
-    thrown: float = 1.0  #: rad/s against the change, beyond a wearer's own slow motion
-    gain: float = 20.0  #: Nm/rad, of the way beyond `calm` or `thrown`
+    thrown: float = 1.0  #: rad/s against the change: below, wearers who move on would feel their support come and go
+    gain: float = 20.0  #: Nm/rad, of the way beyond `calm`: back; more makes a light joint swing at 100 Hz
+    release: float = 40.0  #: Nm/rad, of the way beyond `thrown`: on; it ends there, so it cannot swing
     brake: float = 1.5  #: Nm at most, by which the motors damp beyond `calm`: a wearer feels 0.5 kg in the hand
     watch: float = 1.0  #: s after its end in which a joint that begins to move is still guided
     small: float = 0.05  #: Nm; a smaller difference needs no guiding
@@ -47,16 +48,16 @@ GUIDANCE = Guidance()
 class GuidedMotion:
     """The guided motion of `count` joints; none is under way at first.
 
-    shares: (n,) what is left of the way, 1 at the begin and 0 at the end.
+    shares: (n,) what is left of the way, 0 at the end.
     """
 
     def __init__(self, count: int) -> None:
         self._count = count
         self.stop()
 
-    def begin(self) -> None:
-        """Begin at the old torque."""
-        self.shares, self._calm = (1.0,) * self._count, 0.0
+    def begin(self, shares: Sequence[float]) -> None:
+        """Begin where this is left of the way, (n,); 1 is the old torque."""
+        self.shares, self._calm = tuple(shares), 0.0
 
     def stop(self) -> None:
         """Be at the new torque."""
@@ -97,7 +98,7 @@ def pace(velocity: float | None, change: float) -> float:
     if along > g.calm:
         return -g.gain * (along - g.calm) / size
     calm = min(1.0 / g.time, max(g.rate / size, 1.0 / g.longest))
-    return calm * (1.0 - max(0.0, along) / g.calm) + g.gain * max(0.0, -along - g.thrown) / size
+    return calm * (1.0 - max(0.0, along) / g.calm) + g.release * max(0.0, -along - g.thrown) / size
 
 
 def guide_damping(velocity: float) -> float:

@@ -69,7 +69,7 @@ class SafetyMachine:
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
-        self._begin = GuidedMotion(JOINT_COUNT)  # of the torque
+        self._rise = GuidedMotion(JOINT_COUNT)  # of the torque, where it begins
         self._stall = StallWatch(limits.joint_names)
         self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
         self._rest = RestTracker()
@@ -279,7 +279,7 @@ class SafetyMachine:
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
             self._is_trusted = True
             self.motion.reset()
-            self._begin.begin()
+            self._rise.begin((1.0,) * len(self.power))
             self._on(Event.PROVEN)
 
     def _push(self) -> Drive:
@@ -305,11 +305,11 @@ class SafetyMachine:
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
         joints = self._readings.joints
         if self.state is State.RAMPING_IN:
-            self._begin.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
-            if self._begin.is_over:
+            self._rise.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
+            if self._rise.is_over:
                 self._on(Event.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
-        share = [1.0 - left for left in self._begin.shares]
+        share = [1.0 - left for left in self._rise.shares]
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
         shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)

@@ -28,7 +28,6 @@ LEASE = "core.safety.lease:Lease.lost"
 COMPENSATOR = "core.compensation.compensator:Compensator.step"
 GUIDANCE = "core.compensation.guidance:GuidedChange.step"
 ASSIST_VALID, ASSIST = (f"core.compensation.terms.assist:AssistInput.{name}" for name in ("valid", "torque"))
-ASSIST_MEMORY = "_torque"  # of an AssistInput
 LOCK = "hardware.ownership.bus_lock:NAME"
 LISTEN = "hardware.can.motor_bus:MotorBus.listen"
 LET_DOWN = "hardware.ownership.owned_bus:let_down"
@@ -164,11 +163,10 @@ def remembered(torque: Callable[..., Any]) -> Callable[..., Any]:
     """Keep the torque while the efforts are not sound."""
 
     def remember(self: Any, now: float) -> Any:
-        before = getattr(self, ASSIST_MEMORY)
         result = torque(self, now)
-        if self.reason:
-            setattr(self, ASSIST_MEMORY, before)
-        return result
+        if not self.reason:
+            self.__dict__["remembered"] = result
+        return self.__dict__.get("remembered", result)
 
     return remember
 

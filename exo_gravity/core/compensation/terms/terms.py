@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
+from exo_gravity.core.compensation.guidance import PAUSE
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -38,7 +39,6 @@ class SumLimits:
     """What bounds all terms together."""
 
     effort: Sequence[float] = (2.0, 4.0, 2.0, 2.0)  #: Nm: well below the motors' rated torque, which gravity needs
-    pause: float = 0.2  #: s between two cycles, beyond which the acceleration is measured anew
     edge_share: float = 0.8  #: of the stiffness that the arm can bear, for `limits` where that is less
 
 
@@ -151,8 +151,8 @@ class Terms:
         theta, velocity: (4,) rad and rad/s.
         """
         dt, self._time = now - self._time, now
-        if not 0.0 <= dt <= SUM.pause:
-            dt = 0.0
+        if not 0.0 <= dt <= PAUSE:
+            dt = 0.0  # the acceleration is measured anew
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
         self._state = TermState(dt, theta, velocity, acceleration, now - self.in_force.since)
         total = _sum(self.in_force.terms, self._state)

@@ -1,0 +1,145 @@
+"""What has thrown an arm where a torque began or a load went: judged by how fast the motors truly drive a joint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.arm.tilt import gravity_in_trunk
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.virtual_arm import TrunkReading
+
+from .compensated_arm import PEAK, POSE, CompensatedArm
+from .test_guided_changes import CLAMPED, HALVED, ONE_G, RAISED, SAFE_SPEED
+
+HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
+UPRIGHT = TrunkReading(gravity_in_trunk(0.0, 0.0).tolist())
+ZERO_G = {"mode": "zero_g"}
+
+
+def let_go(now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+    return (0.0,) * 4
+
+
+class Holding:
+    """A hand that holds the arm in `pose`."""
+
+    def __init__(self, pose: Sequence[float]) -> None:
+        self._pose, self._weight = np.array(pose), np.zeros(4)
+
+    def __call__(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+        error = self._pose - theta
+        self._weight += np.array((0.12, 0.16, 0.15, 0.08)) * error
+        torque = np.array((60.0, 80.0, 60.0, 30.0)) * error - np.array((3.0, 6.0, 5.0, 2.0)) * velocity + self._weight
+        return [float(part) for part in torque]
+
+
+def put_down(arm: CompensatedArm) -> None:
+    arm.safety.disable(arm.now)
+    assert arm.run_until(lambda: arm.safety.state is State.DISABLED)
+
+
+def carry_again(arm: CompensatedArm) -> None:
+    arm.enable()
+    assert arm.run_until(lambda: arm.safety.state is State.RAMPING_IN)
+    arm.forget()
+
+
+def test_an_empty_cuff_that_is_carried_again_rises_slowly():
+    arm = CompensatedArm(pose=LEANING, limit=PEAK, has_wearer=False, mode="one_g")
+    arm.person.hand = Holding(LEANING)
+    put_down(arm)
+    arm.change(**ZERO_G)
+    arm.run(1.0)
+    carry_again(arm)
+    arm.person.hand = let_go
+    arm.run(8.0)
+    assert arm.device.arm.positions[1] > 1.0  # nobody's weight holds it
+    assert arm.driven < SAFE_SPEED
+
+
+@pytest.mark.parametrize("roll", [-30.0, 30.0])
+def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
+    read = [UPRIGHT]
+    arm = CompensatedArm(pose=HANGING, limit=PEAK, imu=lambda now, state: read[0], mode="zero_g")
+    put_down(arm)
+    for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
+        read[0] = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
+        arm.run(0.05)
+    carry_again(arm)
+    arm.run(6.0)
+    assert 0.1 < arm.driven < SAFE_SPEED
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [[ZERO_G, ONE_G] * 4, [HALVED, ZERO_G, CLAMPED, {"max_effort": PEAK}, {"robot": DEFAULT_LINKS}, HALVED, ONE_G]],
+    ids=["mode", "gain, mode and max_effort"],
+)
+def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(changes):
+    arm = CompensatedArm(pose=RAISED, limit=PEAK, has_wearer=False, mode="one_g")
+    for change in changes:
+        arm.change(**change)
+        arm.run(0.3)
+    arm.run(4.0)
+    assert arm.driven < SAFE_SPEED
+
+
+def loaded(mass: float, pose: Sequence[float]) -> CompensatedArm:
+    """Return a carried arm in `pose` with a load in its hand."""
+    arm = CompensatedArm(pose=pose, limit=PEAK)
+    arm.person.hand = Holding(pose)
+    arm.device.arm.carry(mass)
+    arm.change(payload_mass=mass)
+    arm.run(7.0)
+    arm.person.hand = let_go
+    arm.run(0.5)
+    arm.forget()
+    return arm
+
+
+def test_one_wrong_velocity_takes_no_load_from_the_hand():
+    arm = loaded(2.0, POSE)
+    honest, calls = arm.compensator.step, iter(range(1000))
+
+    def once_wrong(now, theta, velocity=None):
+        wrong = (velocity[0], 3.0, *velocity[2:])
+        return honest(now, theta, wrong if next(calls) == 50 else velocity)
+
+    arm.compensator.step = once_wrong
+    arm.run(2.0)
+    assert next(calls) > 100
+    assert arm.compensator.dropped == 0.0 and arm.compensator.settings.payload_mass == 2.0
+    assert arm.top_speed < 0.1
+
+
+def test_a_cup_that_is_flicked_away_during_a_change_leaves_the_change_as_slow_as_it_was():
+    arm = loaded(0.2, RAISED)
+    arm.change(**ONE_G)
+    arm.run(0.5)
+    arm.device.arm.carry(0.0)
+    start, efforts = arm.now, []
+    arm.person.hand = lambda now, theta, velocity: (0.0, 6.0, 0.0, 4.0) if arm.now < start + 0.15 else (0.0,) * 4
+    for _ in range(200):
+        arm.run(0.02)
+        efforts.append(arm.answer.effort)
+    assert arm.compensator.dropped == 0.2
+    assert arm.device.arm.positions[1] < 2.5
+    still = np.abs(np.diff(efforts, axis=0))[50:]  # the flick is over
+    assert still.max() < 0.02 * (GUIDANCE.rate + GUIDANCE.gain * SAFE_SPEED)
+
+
+def test_a_load_of_2_kg_that_is_dropped_lets_the_arm_rise_but_not_fly():
+    arm = loaded(2.0, POSE)
+    start = np.array(arm.device.arm.positions)
+    arm.device.arm.carry(0.0)
+    arm.run(4.0)
+    assert arm.compensator.dropped == 2.0
+    assert arm.safety.state is State.ACTIVE
+    assert arm.driven < 4.0
+    assert np.abs(arm.device.arm.positions - start).max() < 1.2
