@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -29,6 +29,7 @@ import yaml
 from exo_gravity.core.compensation.settings import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, check_buses, load, stages
 
 NODES_PACKAGE = "exo_gravity.nodes."
@@ -88,6 +89,17 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
     return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
 
 
+@contextlib.contextmanager
+def asking_on_terminal(bridges: Sequence[str]) -> Iterator[None]:
+    """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that."""
+    words = [sys.executable, "-m", f"{NODES_PACKAGE}pose_prompt", *bridges]
+    with subprocess.Popen(words) as prompt:
+        try:
+            yield
+        finally:
+            prompt.terminate()
+
+
 def wearers(nodes: Nodes) -> list[str]:
     """Return the nodes `wearer` to start with the compensators of a file that has no key for them."""
     found = []
@@ -143,6 +155,8 @@ class Launcher:
         self._on_line = on_line
         self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
+        #: The bridges whose start asks a person whether the arm hangs as it is drawn.
+        self.asking = [f"{namespace}{node}" for node in pairs if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
 
     def start(self) -> None:
         """Start every node."""

@@ -8,7 +8,8 @@
         +-------------------------------------------+ down: FAULT after a fault, else DISABLED
 
 - DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
-- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang.
+- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
+  person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
 - PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
   must move the right way (gate.py).
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
@@ -20,9 +21,8 @@
 
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
-Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
-means that they must be checked again. Until then `resume` carries an arm on from any pose after a fault that leaves
-nothing to repair.
+Zeros and signs are trusted once they were checked, for as long as the angles are continuous (trust.py). So long
+`resume` carries an arm on from any pose after a fault that leaves nothing to repair.
 """
 
 import math
@@ -36,10 +36,19 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, NO_MOTOR, OFF, Drive, Efforts, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import START_GATE, SignCheck, SwitchOnCheck, missing_for_a_start
-from exo_gravity.core.safety.limits import DAMPING, Limits, guide_damping
-from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough, SupplyMonitor
+from exo_gravity.core.safety.gate import (
+    HANGING_ARM,
+    START_GATE,
+    PoseQuestion,
+    SignCheck,
+    SwitchOnCheck,
+    missing_for_a_start,
+    torque_while_hanging,
+)
+from exo_gravity.core.safety.limits import CONFIRM, DAMPING, Limits, guide_damping
+from exo_gravity.core.safety.monitors import REST, RestTracker, RideThrough, SupplyMonitor
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
+from exo_gravity.core.safety.trust import Readings
 
 RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
 
@@ -53,7 +62,7 @@ class SafetyMachine:
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
     is_unreached: whether a motor that may be on cannot be reached. ride: through late efforts.
-    motion: judges the efforts by gravity alone.
+    motion: judges the efforts by gravity alone. pose: the question to the operator whether the arm hangs as drawn.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -73,7 +82,7 @@ class SafetyMachine:
         self._rest = RestTracker()
         self._readings = Readings(limits)
         self._is_found_on = False  # by this cycle's replies
-        self._is_trusted = False  # zeros and signs
+        self.pose = PoseQuestion(limits.joint_names)
         self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._supply = SupplyMonitor()
@@ -113,7 +122,18 @@ class SafetyMachine:
             return f"the arm is {self.state.value}, must be in fault"
         if not self.fault.code.is_resumable:
             return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
-        return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+        return (
+            ""
+            if self._readings.trusted
+            else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+        )
+
+    def confirm_pose(self, now: float) -> str:
+        """Take the operator's word that the arm hangs as it is drawn; return '' or why that is not asked."""
+        if self.pose.confirm(now):
+            return ""
+        waits = f", waiting for {self.waiting_for}" if self.state is State.CHECKING else ""
+        return f"nothing to confirm: the arm is {self.state.value}{waits}"
 
     def resume(self, now: float) -> bool:
         """Clear the fault and enable, on the operator's request only. Return False, and do nothing, if refused."""
@@ -125,7 +145,7 @@ class SafetyMachine:
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
         if code.needs_recheck:
-            self._is_trusted = False
+            self._readings.doubt()
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or Fault(code, reason)
@@ -161,14 +181,12 @@ class SafetyMachine:
         self._now, self._dt = now, min(now - self._now, self._period)
         readings, supply, sent = self._readings, self._supply, self._sent
         readings.step(now, joints, sent.powered)
-        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False
         self._rest.step(now, readings.joints, readings.silent)
         if all(readings.silent) and sent.powered:
             supply.suspect(sent.effort)
         self._is_found_on = supply.step(self._dt, readings.joints, readings.silent)
         if self.state is State.CHECKING:
-            self._check(effort is not None and age <= self.limits.command_timeout)
+            self._check(effort if age <= self.limits.command_timeout else None)
         if sent.powered:
             fault = self._delivery.step(self._dt, readings.joints, sent.effort, sent.damping)
             is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
@@ -207,26 +225,39 @@ class SafetyMachine:
         """Return a drive of motors that are on, with no more damping than each of them can apply."""
         return Drive(tuple(effort), tuple(map(min, damping, self._peak_damping)), True, enter, unsure)
 
-    def _check(self, efforts_are_fresh: bool) -> None:
-        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
+    def _check(self, effort: Sequence[float] | None) -> None:
+        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
+
+        effort: (n,) Nm, what is asked for, None if that is not known.
+        """
         readings, limits = self._readings, self.limits
-        missing = missing_for_a_start(limits, readings.joints, readings.fault, self._is_trusted)
+        missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
+        missing = missing or self.hindrance or ("effort commands" if effort is None else "")
+        asks = not readings.trusted and limits.start_pose == CONFIRM
+        patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
+        if readings.fault:
+            self.pose.withdraw()
+        if asks:
+            missing = self.pose.missing(self._now, readings.joints, missing)
         self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:
             self._calm_since = self._now
-        if self._now - self._calm_since >= START_GATE.calm:
+        if effort is not None and self._now - self._calm_since >= START_GATE.calm:
+            fault = None if readings.trusted else torque_while_hanging(limits, effort)
+            if fault:
+                self._trip(fault)
+                return
             self.waiting_for = ""
-            largest = 0.0 if self._is_trusted else limits.sign_check_torque
+            largest = 0.0 if readings.trusted else limits.sign_check_torque
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
             self._enter(State.PROVING)
-        elif self._now - self._since >= limits.enable_timeout:
-            self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
+        elif self._now - self._since >= patience:
+            self._refuse(f"not enabled within {patience:g} s: waited for {self.waiting_for}")
 
     def _prove(self) -> None:
         if self._switch_on.done:
@@ -237,7 +268,7 @@ class SafetyMachine:
         self.waiting_for = self._signs.hint
         self._trip(fault)
         if not fault and self._switch_on.done and self._signs.done:
-            self._is_trusted = True
+            self._readings.prove()
             self.motion.reset()
             self._enter(State.RAMPING_IN)
 
@@ -272,7 +303,7 @@ class SafetyMachine:
         columns = zip(self._delivery.missing, self._unsure, strict=True)
         enter = tuple(missing and not is_unsure for missing, is_unsure in columns)
         if any(enter):
-            self._is_trusted = False
+            self._readings.doubt()
             self._delivery.reset()
         return self._powered(*descent.applied, enter, self._unsure)
 
@@ -314,4 +345,5 @@ class SafetyMachine:
 
     def _enter(self, state: State, now: float = -math.inf) -> None:
         self.state = state
+        self.pose.withdraw()
         self._since = self._now = max(now, self._now)

@@ -1,8 +1,9 @@
-"""How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
+"""How `can_bridge` is operated: its services enable, clear_fault, resume, confirm_pose and set_zero; /diagnostics.
 
 Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
@@ -25,7 +26,18 @@ from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
-from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.messages import (
+    ERROR,
+    HELD_BY,
+    NO_POSE,
+    NOBODY,
+    OK,
+    POSE_TO_CONFIRM,
+    WARN,
+    Diagnostics,
+    milliseconds,
+    row,
+)
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
@@ -68,9 +80,9 @@ class BridgeServices:
     def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], motors: Sequence[JointMotor]) -> None:
         self._get_loop = get_loop
         self._zero = [motor.zero for motor in motors]
-        services = {self.enable: SetBool, self.clear_fault: Trigger, self.resume: Trigger, self.set_zero: Trigger}
-        for function, kind in services.items():
-            node.create_service(kind, f"~/{function.__name__}", partial(self.answer, function))
+        node.create_service(SetBool, "~/enable", partial(self.answer, self.enable))
+        for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
+            node.create_service(Trigger, f"~/{function.__name__}", partial(self.answer, function))
 
     def enable(self, loop: ControlLoop, request: SetBool.Request) -> str:
         """Enable the arm, or let it down and disable it."""
@@ -90,6 +102,10 @@ class BridgeServices:
         """Clear a fault that leaves nothing to repair, and enable the arm where it is."""
         why_not = loop.safety.why_not_resumed
         return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
+
+    def confirm_pose(self, loop: ControlLoop, _request: Trigger.Request) -> str:
+        """Take the operator's word that the arm hangs as it is drawn, for the start that waits for it."""
+        return loop.safety.confirm_pose(time.monotonic())
 
     def set_zero(self, loop: ControlLoop, _request: Trigger.Request) -> str:
         """Make the present pose the motors' zero, while they are off."""
@@ -124,6 +140,8 @@ class BridgeServices:
         response.success = not response.message
         if response.success:
             response.message = FOLLOWS.get(loop.safety.state, "")
+            if function == self.confirm_pose:
+                response.message = f"confirmed (degrees): {loop.safety.pose.text}; {response.message}"
         return response
 
 
@@ -220,6 +238,7 @@ class BridgeReport:
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
+            POSE_TO_CONFIRM: row(list(map(math.degrees, safety.pose.asked)), 0) if safety.pose.asked else NO_POSE,
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
