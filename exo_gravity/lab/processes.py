@@ -92,8 +92,8 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
 @contextlib.contextmanager
 def asking_on_terminal(bridges: Sequence[str]) -> Iterator[None]:
     """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that."""
-    words = [sys.executable, "-m", f"{NODES_PACKAGE}pose_prompt", *bridges]
-    with subprocess.Popen(words) as prompt:
+    program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}pose_prompt")
+    with subprocess.Popen([sys.executable, "-c", program, *bridges]) as prompt:
         try:
             yield
         finally:

@@ -1,7 +1,7 @@
 """Asks on a terminal whether an arm hangs as it is drawn, when the start of its can_bridge waits for the answer.
 
-The launcher runs it on its own terminal: `python -m exo_gravity.nodes.pose_prompt /right/can_bridge ...`. It is an
-operator like any other: the question comes from /diagnostics, the answer is a call of `~/confirm_pose`.
+The launcher runs it on its own terminal; arguments: the full names of the nodes can_bridge to ask for. It is an operator
+like any other: the question comes from /diagnostics, the answer is a call of `~/confirm_pose`.
 """
 
 import contextlib
@@ -53,17 +53,13 @@ class PosePrompt(Node):
                 print(f"{bridge}: {response.message if response else 'the bridge did not answer'}", flush=True)
 
 
-def main(bridges: Sequence[str]) -> None:
-    """Ask for the nodes `bridges` until Ctrl-C or the end of the terminal."""
+def main() -> None:
+    """Ask until Ctrl-C or the end of the terminal."""
     keep_to_this_machine()
     rclpy.init(args=[sys.argv[0], *ENCLAVE], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.suppress(KeyboardInterrupt, EOFError):
-        prompt = PosePrompt(bridges, input)
+        prompt = PosePrompt(sys.argv[1:], input)
         while True:
             rclpy.spin_once(prompt, timeout_sec=0.1)
             prompt.look()
     rclpy.try_shutdown()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

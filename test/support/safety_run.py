@@ -36,8 +36,8 @@ class SafetyRun:
     changes: of each joint's reading. silent: the joints whose motors do not reply. off: those whose motors have been
     switched off behind the machine's back. effort: Nm, with `effort_age` in s; damped: as while the load changes; held:
     as of a late tilt. drive: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
-    keeps its torque. steps: its largest step per cycle. while_hanging: Nm, asked for in place of `effort` while the start
-    is checked.
+    keeps its torque. steps: its largest step per cycle. while_hanging: Nm, asked for in place of `effort` while the
+    start is checked.
     """
 
     def __init__(self, **limits: Any) -> None:
