@@ -1,7 +1,7 @@
 """Asks on a terminal whether an arm hangs as it is drawn, when the start of its can_bridge waits for the answer.
 
-The launcher runs it on its own terminal; arguments: the full names of the nodes can_bridge to ask for. It is an operator
-like any other: the question comes from /diagnostics, the answer is a call of `~/confirm_pose`.
+The launcher runs it on its own terminal; arguments: the full names of the nodes can_bridge to ask for. It is an
+operator like any other: the question comes from /diagnostics, the answer is a call of `~/confirm_pose`.
 """
 
 import contextlib

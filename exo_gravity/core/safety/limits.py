@@ -20,7 +20,7 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
@@ -56,17 +56,6 @@ class Derating:
 
 
 @dataclass(frozen=True)
-class Guide:
-    """The brake of joints while the load changes (core/compensation/guidance.py).
-
-    A wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in their hand.
-    """
-
-    speed: float = 0.25  #: rad/s beyond which it brakes; above the noise of a motor's velocity
-    brake: float = 1.5  #: Nm, at most
-
-
-@dataclass(frozen=True)
 class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
@@ -83,7 +72,7 @@ class LoopTiming:
     periods: int = 2  #: of control that must fit into each time-out, so that one late cycle is not a fault
 
 
-WALL, HEAT, GUIDE, READING, LOOP = SoftWall(), Derating(), Guide(), ReadingLimits(), LoopTiming()
+WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming()
 
 
 @dataclass(frozen=True)
@@ -155,7 +144,7 @@ class Limits:
         low, high = self.position_min[i], self.position_max[i]
         faults = []
         if joint.error:
-            text = MOTOR_ERRORS.get(joint.error, "unknown")
+            text = error_text(joint.error)
             faults.append(Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})"))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
@@ -169,12 +158,17 @@ class Limits:
         return faults
 
     def shape(
-        self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
+        self,
+        effort: Sequence[float],
+        share: Sequence[float],
+        joints: Sequence[JointSample],
+        before: Sequence[float],
+        dt: float,
     ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:
         """Return the limited torque (4,) in Nm, the soft walls' damping (4,) in Nm s/rad, and which limits acted.
 
-        effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
-        `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
+        effort: (4,) Nm, requested. share: (4,) 0..1, of effort and soft wall, where torque begins. before: (4,) Nm,
+        applied `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
         step = MAX_EFFORT_RATE * dt
         shaped, damping, acted = [], [], set()
@@ -189,7 +183,7 @@ class Limits:
             wall = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
             colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
             permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
-            wanted = share * (effort[i] + wall)
+            wanted = share[i] * (effort[i] + wall)
             clamped = max(-permitted, min(permitted, wanted))
             limited = max(before[i] - step, min(before[i] + step, clamped))
             shaped.append(limited)
@@ -203,12 +197,6 @@ class Limits:
             if limited != clamped:
                 acted.add(f"max_effort_rate ({name})")
         return tuple(shaped), tuple(damping), acted
-
-
-def guide_damping(velocity: float) -> float:
-    """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
-    speed = max(GUIDE.speed, abs(velocity))
-    return min(DAMPING * (speed - GUIDE.speed), GUIDE.brake) / speed
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

@@ -42,8 +42,6 @@ from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
-ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
-ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
 REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
@@ -79,7 +77,7 @@ class BridgeServices:
 
     def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], motors: Sequence[JointMotor]) -> None:
         self._get_loop = get_loop
-        self._zero = [motor.zero for motor in motors]
+        self._motors = tuple(motors)
         node.create_service(SetBool, "~/enable", partial(self.answer, self.enable))
         for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
             node.create_service(Trigger, f"~/{function.__name__}", partial(self.answer, function))
@@ -108,30 +106,28 @@ class BridgeServices:
         return loop.safety.confirm_pose(time.monotonic())
 
     def set_zero(self, loop: ControlLoop, _request: Trigger.Request) -> str:
-        """Make the present pose the motors' zero, while they are off."""
-        safety, now = loop.safety, time.monotonic()
-        if any(self._zero):
-            return f"zero = {self._zero}: must be all 0 when the motors store the zero"
-        is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
-        if safety.state is not State.DISABLED or is_silent or not safety.is_at_rest(now):
-            return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
-        loop.bus.set_zero()
-        return ""
+        """Return what to write instead: some firmware forgets a zero that is set over the bus with its power."""
+        if any(not math.isfinite(joint.position) for joint in loop.samples):
+            return "refused: motors may forget a zero that is set over the bus; write zero: in the file, once all reply"
+        columns = zip(self._motors, loop.samples, strict=True)
+        zeros = ", ".join(f"{motor.motor_position(joint.position):.4f}" for motor, joint in columns)
+        return (
+            "refused: motors may forget a zero that is set over the bus when their power goes. To make the present "
+            f"angles 0, write zero: [{zeros}] for can_bridge in the parameter file, and start again"
+        )
 
     def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
-        """Run `function` on the control thread, and wait for the motors' zeros if it has set them.
+        """Run `function` on the control thread.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
         """
-        loop, since = self._get_loop(), time.monotonic()
+        loop = self._get_loop()
         if loop is None:
             response.success, response.message = False, "the node is not active"
             return response
         future = loop.call(lambda: function(loop, request))
         try:
             response.message = future.result(CALL_TIMEOUT)
-            if function == self.set_zero and not response.message:
-                response.message = _wait_for_zeros(loop, since)
         except BusError as error:
             response.message = str(error)
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
@@ -143,17 +139,6 @@ class BridgeServices:
             if function == self.confirm_pose:
                 response.message = f"confirmed (degrees): {loop.safety.pose.text}; {response.message}"
         return response
-
-
-def _wait_for_zeros(loop: ControlLoop, since: float) -> str:
-    """Wait for replies of all motors, later than `since` (monotonic s), at their zero; return who did not reply so."""
-    while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-        if time.monotonic() > since + ZERO_TIMEOUT:
-            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-            return f"the motors did not set their zero: {positions}"
-        time.sleep(0.005)
-    return ""
 
 
 class Operator:
@@ -242,6 +227,7 @@ class BridgeReport:
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
+            "temperatures when switched on": "implausible" if loop.bus.boards.odd_temperature else "plausible",
             "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
@@ -258,6 +244,8 @@ class BridgeReport:
         hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
         if hot:
             warnings.append(f"above rated torque for too long: {', '.join(hot)}")
+        if odd := loop.bus.boards.odd_temperature:
+            warnings.append(odd)
         if 0.0 < rate < self._slow:
             warnings.append(f"slower than {self._slow:.0f} Hz")
         self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)

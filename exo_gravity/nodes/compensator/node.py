@@ -152,7 +152,7 @@ class CompensatorNode(Node):
         now = time.monotonic()
         try:
             theta, velocity = self._interface.read(message)
-            if self._interface.problem:  # no step: the torque must ramp in from zero
+            if self._interface.problem:  # no step: there is no torque to change
                 answer = Compensation.withdrawn(self._interface.problem)
             else:
                 with self._lock:
