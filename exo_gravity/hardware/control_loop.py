@@ -233,6 +233,8 @@ class ControlLoop:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
         self.safety.unsent = self.bus.unsent
+        if late := self.bus.late_replies:
+            self.safety.trip(FaultCode.REPLIES_LATE, late, self._now())
         if self.bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self.bus.foreign_commands
             self.safety.trip(FaultCode.FOREIGN_COMMAND, self.bus.foreign_command, self._now())
@@ -290,7 +292,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             bus.exchange(Drive(effort, (DAMPING,) * len(effort), send, True), now + period)
         if exits > 1:  # a reply after the second EXIT is none to the command before the first
             samples = zip(confirmed, bus.samples, strict=True)
-            confirmed = [was or sample.time > now for was, sample in samples]
+            confirmed = [was or sample.time >= now for was, sample in samples]
         clock.sleep(max(0.0, now + period - clock.monotonic()))
     with contextlib.suppress(Exception):
         bus.exchange(OFF, clock.monotonic() + period)

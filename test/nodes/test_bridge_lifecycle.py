@@ -52,6 +52,7 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
             "can.interface": rig.arm.address[0],
             "can.channel": rig.arm.address[1],
             "sign_check_torque": 0.0,
+            "start_pose": "hanging",
             "rate": 100.0,  # the tests share a busy machine
             "command_timeout": 0.1,
         }

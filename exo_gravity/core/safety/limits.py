@@ -205,6 +205,12 @@ CAN_BRIDGE = (
     Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
     Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
+    Param(
+        "can.serial",
+        "",
+        "serial number of the CAN adapter, with two buses one per motor; empty: any adapter",
+        fixed=True,
+    ),
     *LIMIT_PARAMETERS,
     *REAL_TIME_PARAMETERS,
 )

@@ -40,6 +40,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import OFF, Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
+from exo_gravity.hardware.can.request_age import Requests
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
@@ -101,6 +102,15 @@ class MotorBus:
         self._held = [math.nan] * JOINT_COUNT  # rad
         self._note = note
         self._answered: set[int] = set()
+        self._requests = [Requests() for _ in motors]
+
+    @property
+    def late_replies(self) -> str:
+        """Which motor answers commands that are too old, as a sentence; '' if none does."""
+        for motor, requests in zip(self._motors, self._requests, strict=True):
+            if requests.late:
+                return f"motor {motor.can_id} answers commands that are {1000.0 * requests.late:.0f} ms old or older"
+        return ""
 
     @property
     def is_contested(self) -> bool:
@@ -139,9 +149,14 @@ class MotorBus:
         now = self._now()
         frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
         for joint, own in enumerate(self._ports):
-            frames[own] += self._frames(joint, now)
-        for own, due in frames.items():
-            self._send(own, *due)
+            due = self._frames(joint, now)
+            if due and self.replies[joint]:
+                if not self._requests[joint].may_send(now):
+                    continue
+                self._requests[joint].sent(now, len(due))
+            frames[own] += due
+        for own, all_due in frames.items():
+            self._send(own, *all_due, may_be_lost=True)
         self.unsent = tuple([port in self._failed for port in self._ports])
         self._answered.clear()
         count = len(self._joints)
@@ -190,11 +205,11 @@ class MotorBus:
         for port in self._buses:
             port.close()
 
-    def _send(self, port: CanPort | None, *frames: Frame) -> None:
+    def _send(self, port: CanPort | None, *frames: Frame, may_be_lost: bool = False) -> None:
         """Send frames on a bus, unless it is not open or has failed in this cycle."""
         if port and port not in self._failed:
             try:
-                port.send(*frames)
+                port.send(*frames, may_be_lost=may_be_lost)
             except BusError as error:
                 self._failed[port] = error
 
@@ -246,7 +261,9 @@ class MotorBus:
                 self.boards.heard(joint, kind, bytes(message.data), self._now())
             return
         (joint,) = joints
-        sample = self._motors[joint].sample(message.data, self._now())
+        now = self._now()
+        asked = self._requests[joint].replied(now) if self.replies[joint] else now
+        sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
         self._answered.add(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
