@@ -48,6 +48,10 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 # Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+CONFIRMING = (
+    "the start of {0} asks whether the arm hangs as it is drawn; once you see it hang: "
+    "ros2 service call {0}/confirm_pose std_srvs/srv/Trigger"
+)
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
 OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
@@ -91,7 +95,15 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def asking_on_terminal(bridges: Sequence[str]) -> Iterator[None]:
-    """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that."""
+    """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that.
+
+    Where there is no terminal, print which services to call.
+    """
+    if not (bridges and sys.stdin.isatty()):
+        for bridge in bridges:
+            print(CONFIRMING.format(bridge), flush=True)
+        yield
+        return
     program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}pose_prompt")
     with subprocess.Popen([sys.executable, "-c", program, *bridges]) as prompt:
         try:

@@ -11,7 +11,6 @@ import os
 import sys
 import threading
 from collections.abc import Sequence
-from contextlib import nullcontext
 from datetime import datetime
 
 from exo_gravity.core.errors import ExoGravityError
@@ -19,10 +18,6 @@ from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
 from exo_gravity.tools.cli import require_ros
 
-CONFIRMING = (
-    "launcher: {0} asks at its start whether the arm hangs as it is drawn; see it hang, then: "
-    "ros2 service call {0}/confirm_pose std_srvs/srv/Trigger"
-)
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
@@ -68,10 +63,7 @@ def main(args: Sequence[str] | None = None) -> None:
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
-        asks = asking_on_terminal(launcher.asking) if launcher.asking and sys.stdin.isatty() else nullcontext()
-        if launcher.asking and not sys.stdin.isatty():
-            print("\n".join(map(CONFIRMING.format, launcher.asking)), flush=True)
-        with asks:
+        with asking_on_terminal(launcher.asking):
             dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

@@ -130,7 +130,7 @@ class PoseQuestion:
         """The pose in question, or the one that was confirmed, in degrees by joint; '' for none."""
         pose = self.asked or self._confirmed
         shown = zip(self._names, pose, strict=True) if pose else ()
-        return ", ".join(f"{name} {math.degrees(angle):.0f}" for name, angle in shown)
+        return ", ".join(f"{name} {round(math.degrees(angle))}" for name, angle in shown)
 
     def withdraw(self) -> None:
         """Forget question and answer."""
