@@ -18,7 +18,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -29,6 +29,7 @@ import yaml
 from exo_gravity.core.compensation.settings import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, check_buses, load, stages
 
 NODES_PACKAGE = "exo_gravity.nodes."
@@ -47,6 +48,10 @@ SUPERVISED = {"EXO_GRAVITY_SUPERVISED": "1", "PYTHONUNBUFFERED": "1"}  # a node 
 # Starts can_bridge for one purpose: to let down an arm that was left behind, after that time for its watchdog.
 RECOVERY = {"EXO_GRAVITY_RECOVER": f"{WATCHDOG_TIMEOUT:g}"}
 ENDED_WELL = (0, 2)  # exit codes of a node that ended by itself: stopped, or with wrong parameters or no bus
+CONFIRMING = (
+    "the start of {0} asks whether the arm hangs as it is drawn; once you see it hang: "
+    "ros2 service call {0}/confirm_pose std_srvs/srv/Trigger"
+)
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
 OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
@@ -86,6 +91,25 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
         if not any(fnmatchcase(node, pattern) for node in names):
             raise ParameterError("only", pattern, f"a pattern that matches one of {', '.join(names)}")
     return [node for node in names if not only or any(fnmatchcase(node, pattern) for pattern in only)]
+
+
+@contextlib.contextmanager
+def asking_on_terminal(bridges: Sequence[str]) -> Iterator[None]:
+    """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that.
+
+    Where there is no terminal, print which services to call.
+    """
+    if not (bridges and sys.stdin.isatty()):
+        for bridge in bridges:
+            print(CONFIRMING.format(bridge), flush=True)
+        yield
+        return
+    program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}pose_prompt")
+    with subprocess.Popen([sys.executable, "-c", program, *bridges]) as prompt:
+        try:
+            yield
+        finally:
+            prompt.terminate()
 
 
 def wearers(nodes: Nodes) -> list[str]:
@@ -143,6 +167,8 @@ class Launcher:
         self._on_line = on_line
         self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
+        #: The bridges whose start asks a person whether the arm hangs as it is drawn.
+        self.asking = [f"{namespace}{node}" for node in pairs if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
 
     def start(self) -> None:
         """Start every node."""

@@ -28,6 +28,7 @@ KEYS: Mapping[str, frozenset[str]] = {
     "enable": ARM,
     "clear_fault": ARM,
     "resume": ARM,  # clear and enable, after a fault that leaves nothing to repair
+    "confirm_pose": ARM,  # the arm hangs as it is drawn
     "set": frozenset({"arm", "values"}),  # parameters of the compensator
     "weigh": ARM,  # what the hand holds; the compensator's diagnostics tell
     "bring_home": ARM,  # a simulated arm: its virtual wearer lets it hang

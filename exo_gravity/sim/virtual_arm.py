@@ -5,6 +5,7 @@ calibration, or one that is late on purpose. Only what takes time on a real comp
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import Drive
-from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.limits import HANGING, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -48,6 +49,7 @@ class VirtualArm:
     controller: what turns samples into efforts.
     motors, limits: the arm as the controller's side assumes it.
     rate: cycles of the loop per s.
+    start_pose: in place of that of the limits; by default whoever starts a simulated arm has seen it hang.
     wire: the bus; by default one of its own, whose clock is at 0 s.
     ports: of each joint's motor, if the caller has connected the device; by default one port for all of them.
     look: called after every step of the device, at least every 2 ms.
@@ -68,6 +70,7 @@ class VirtualArm:
         look: Callable[[], None] | None = None,
         note: Callable[[Drive], None] = lambda drive: None,
         hand_over: Callable[[str], bool] = lambda reason: False,
+        start_pose: str = HANGING,
     ) -> None:
         self.device = device
         self.wire = wire or Wire(start=0.0)
@@ -76,7 +79,7 @@ class VirtualArm:
             self._played = self.wire.play(device, look) if look else self.wire.play(device, tick=None)
             ports = [CanPort(self.wire.open(), self.clock, self.wire.open)] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
-        self.safety = SafetyMachine(limits, 1.0 / rate, motors)
+        self.safety = SafetyMachine(replace(limits, start_pose=start_pose), 1.0 / rate, motors)
         self.loop = ControlLoop(self.bus, self.safety, 1.0 / rate, controller, hand_over)
 
     @property

@@ -15,7 +15,7 @@ from datetime import datetime
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.processes import Launcher, node_modules, stop_on_signals
+from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
 from exo_gravity.tools.cli import require_ros
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -63,7 +63,8 @@ def main(args: Sequence[str] | None = None) -> None:
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
-        dead = launcher.run(stopping)
+        with asking_on_terminal(launcher.asking):
+            dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)
         raise SystemExit(2) from None

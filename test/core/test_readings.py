@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN
-from exo_gravity.core.safety.monitors import Readings
+from exo_gravity.core.safety.trust import Readings
 
 from ..support.safety_run import LIMITS, reading
 

@@ -228,9 +228,10 @@ def test_after_a_pause_of_the_loop_itself_only_the_age_of_the_efforts_counts():
 def let_down_by(code: FaultCode) -> SafetyRun:
     arm = SafetyRun().until_active()
     arm.machine.trip(code, "test", arm.now)
-    for step in range(46):  # as a One-G descent leaves a shoulder that no gravity turns back
-        arm.changes[0].update(position=0.02 * step)
-        arm.cycle(0.02)
+    for step in range(400):  # as a One-G descent leaves a shoulder that no gravity turns back
+        arm.changes[0].update(position=0.4 * PERIOD * step, velocity=0.4)
+        arm.cycle()
+    arm.changes[0].update(velocity=0.0)
     return arm.until(State.FAULT).until_off()
 
 
@@ -284,12 +285,16 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
     run.changes[2] = {"velocity": -1.0}
     run.changes[3] = {"velocity": 0.4}
     steps = [run.drive.damping]
-    for _ in range(100):
+    for step in range(100):
+        for change in run.changes[1:]:
+            change["position"] = change["velocity"] * PERIOD * step
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping[:2] == (0.0, 0.0)
     assert run.drive.damping[2] == pytest.approx(GUIDANCE.brake)
     assert 0.5 < 0.4 * run.drive.damping[3] < GUIDANCE.brake
     run.damped = False
+    for change in run.changes[1:]:
+        change["velocity"] = 0.0
     for _ in range(100):
         steps.append(run.cycle().drive.damping)
     assert run.drive.damping == NO_TORQUE

@@ -31,7 +31,7 @@ def test_a_new_machine_keeps_the_motors_off_and_torque_begins_slowly_and_without
     ("spoil", "waits_for"),
     [
         (lambda arm: arm.silent.add(2), "c: no reply"),
-        (lambda arm: arm.changes[1].update(velocity=0.5), "at rest"),
+        (lambda arm: arm.changes[1].update(velocity=0.15), "at rest"),
         (lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"), "the watchdog to start"),
         (lambda arm: setattr(arm, "effort", None), "effort commands"),
         (lambda arm: setattr(arm, "effort_age", 0.06), "effort commands"),
@@ -82,8 +82,9 @@ def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
     arm.machine.disable(arm.now)
     arm.cycle(8.0)
     for step in range(31):  # moved by hand
-        arm.changes[1].update(position=0.02 * step)
+        arm.changes[1].update(position=0.02 * step, velocity=1.0)
         arm.cycle(0.02)
+    arm.changes[1].update(velocity=0.0)
     arm.enable()
     arm.until(State.ACTIVE)
 

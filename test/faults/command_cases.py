@@ -12,10 +12,10 @@ import time
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from .actions import change_message, in_turn, pause, send_signal, simulator
+from .actions import change_message, in_turn, pause, send_signal
 from .fault_case import Action, FaultCase
 from .rig import Rig
-from .rigs import CommandedRig, ExternalClockRig, MonitoredCommandsRig, TwoLaunchersRig, WrongSideRig
+from .rigs import CommandedRig, ExternalClockRig, MonitoredCommandsRig, TwoLaunchersRig
 
 HOUR = 3600  # s
 UNEXPLAINED = ("unexplained_torque",)
@@ -97,8 +97,6 @@ MONITOR = (
         outcomes=UNEXPLAINED),
     FaultCase("effort of joint 2 with the wrong sign", change_message(reverse), MonitoredCommandsRig, limit=0.3,
         outcomes=UNEXPLAINED),
-    FaultCase("wrong side, the trunk leans by 0.3 rad", simulator(trunk__roll=0.3), WrongSideRig, limit=3.0,
-        outcomes=UNEXPLAINED, clear=simulator(trunk__roll=0.0)),
 )
 RIDES = (
     FaultCase("compensator stopped for 0.1 s", stopped_for(0.1, "compensator"), TwoLaunchersRig, None,

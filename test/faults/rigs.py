@@ -24,7 +24,7 @@ from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support import CONFIG, ROOT
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
-from ..support.ros_probe import HOME, RosProbe
+from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .injected import injected
 from .players import BE_SOUND, EFFORTS, OPERATOR
@@ -310,8 +310,6 @@ LoadedRig = variant(
 )  # fmt: skip
 # The bridge knows what the robot needs at most; this process is in the compensator's place.
 MonitoredCommandsRig = variant(CommandedRig, bridge=STATED)
-# The arm hangs, and its compensator takes it for the left one.
-WrongSideRig = variant(Rig, pose=HOME, simulator=UPRIGHT, bridge=STATED, compensator={"side": "left"})
 # An arm half raised, which the wearer can move in both directions; and one with a long way to be pressed down.
 WornRig = variant(TwoLaunchersRig, pose=(0.0, 0.9, 0.3, 0.6))
 RaisedRig = variant(TwoLaunchersRig, pose=(0.0, 1.5, 0.3, 0.6))

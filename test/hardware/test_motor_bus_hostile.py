@@ -18,6 +18,7 @@ from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.trust import Readings
 from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -141,5 +142,9 @@ def test_a_forged_reply_with_random_values_is_nearly_always_a_fault(length, most
     for _ in range(count):
         joint = rng.randrange(4)
         sample = JOINTS[joint].sample(bytes((joint + 1,)) + rng.randbytes(length - 1), 1.004)
-        unseen += LIMITS.find_fault(joint, sample, before[joint], 1.0) is None
+        readings = Readings(LIMITS)
+        for time in (0.996, 1.0):
+            readings.step(time, [known._replace(time=time) for known in before])
+        readings.step(1.004, [sample if n == joint else known for n, known in enumerate(before)])
+        unseen += readings.joints[joint] is sample
     assert unseen / count <= most

@@ -6,10 +6,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
@@ -46,12 +50,13 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     command = Efforts(NO_TORQUE, 0.0, False, False)
     monkeypatch.setattr(EffortExchange, "efforts", lambda self, latest: command._replace(answered=time.monotonic()))
 
-    def make_bridge(autostart: bool = False) -> CanBridge:
+    def make_bridge(autostart: bool = False, start_pose: str = "hanging") -> CanBridge:
         parameters = {
             "autostart": autostart,
             "can.interface": rig.arm.address[0],
             "can.channel": rig.arm.address[1],
             "sign_check_torque": 0.0,
+            "start_pose": start_pose,
             "rate": 100.0,  # the tests share a busy machine
             "command_timeout": 0.1,
         }
@@ -111,6 +116,35 @@ def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_u
     assert bridge.trigger_cleanup() is SUCCESS
     assert_nothing_runs(bridge, rig)
     assert_bus_is_free(rig)
+
+
+def test_no_motor_is_switched_on_before_the_operator_has_confirmed_the_pose_through_the_service(rig, make_bridge):
+    bridge = make_bridge(start_pose="confirm")
+    user = Client("operator")
+    try:
+        confirm = partial(user.call, Trigger, "/can_bridge/confirm_pose", Trigger.Request(), bridge)
+        assert bridge.trigger_configure() is SUCCESS and bridge.trigger_activate() is SUCCESS
+        safety = bridge.loop.safety
+        wait_until(lambda: rclpy.spin_once(bridge, timeout_sec=0.0) or safety.pose.asked)
+        assert rig.motors_on == [False] * 4
+        response = confirm()
+        assert response.success and "right_elbow_flexion 0" in response.message, response.message
+        wait_until(lambda: rclpy.spin_once(bridge, timeout_sec=0.0) or safety.state is State.ACTIVE)
+        response = confirm()
+        assert not response.success and "nothing to confirm: the arm is active" in response.message
+    finally:
+        user.destroy_node()
+
+
+class Client(Node):
+    """A node that calls services while another one spins."""
+
+    def call(self, kind: Any, name: str, request: Any, server: Node) -> Any:
+        client = self.create_client(kind, name)
+        wait_until(client.service_is_ready)
+        sent = client.call_async(request)
+        wait_until(lambda: [rclpy.spin_once(node, timeout_sec=0.01) for node in (server, self)] and sent.done())
+        return sent.result()
 
 
 def test_no_motor_is_switched_on_before_the_watchdog_watches_nor_stays_on_without_it(rig, make_bridge, monkeypatch):

@@ -121,6 +121,19 @@ def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(visi
     assert not page.is_visible(of_arm(".resume"))
 
 
+def test_a_start_from_unknown_angles_asks_beside_the_picture_whether_the_arm_hangs_so(visit, stage):
+    page = visit()
+    stage.arms.states["right"], stage.arms.asked["right"] = "checking", "0, -2, 1, 23"
+    wait_for_state(page, "checking")
+    question = page.locator('.pose[data-arm="right"]')
+    question.wait_for()
+    assert "Elbow flexion 23°" in question.inner_text()
+    assert not page.is_visible('.pose[data-arm="left"]')
+    question.get_by_role("button").click()
+    question.wait_for(state="hidden")
+    assert stage.arms.calls[-1] == ("confirm_pose", "right")
+
+
 def test_the_support_slides_shows_the_motors_limit_and_asks_beyond_it(visit, stage):
     stage.arms.states["right"] = "active"
     stage.arms.settings["right"]["mode"] = "zero_g"

@@ -61,6 +61,7 @@ class PlayedArms:
     simulator: dict[str, str] | None = field(
         default_factory=lambda: {"longest stall (ms)": "3", "longest silence (ms)": "14", "disconnected": "no"}
     )
+    asked: dict[str, str] = field(default_factory=dict)  #: poses to confirm in degrees, by arm
     leases: list[tuple[str, str]] = field(default_factory=list)
     others: dict[str, str] = field(default_factory=dict)
 
@@ -86,6 +87,8 @@ class PlayedArms:
         if self.problem:
             return self.problem
         self.settings[arm].update(values)
+        if kind == "confirm_pose":
+            self.asked.pop(arm, None)
         if kind in ("clear_fault", "resume"):
             self.faults.pop(arm, None)
         if kind != "let_down" or self.states[arm] == "active":
@@ -104,6 +107,7 @@ class PlayedArms:
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
+        values["pose to confirm (deg)"] = self.asked.get(name, "none")
         values["resume"] = "possible" if fault == "command_stale" else "refused"
         message = f"fault: {fault}: {name} elbow" if fault != "none" else state
         bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}

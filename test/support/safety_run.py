@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.drive import OFF, Efforts, Send, State
 from exo_gravity.core.safety.limits import Limits
@@ -19,6 +20,7 @@ LIMITS = Limits(
     max_velocity=(5.0, 5.0, 5.0, 6.0),
     max_effort=(3.0, 9.0, 3.0, 3.0),
     sign_check_torque=0.0,
+    start_pose="hanging",
 )
 EFFORT = (0.5, -4.0, 2.0, 1.0)  # Nm
 
@@ -34,7 +36,8 @@ class SafetyRun:
     changes: of each joint's reading. silent: the joints whose motors do not reply. off: those whose motors have been
     switched off behind the machine's back. effort: Nm, with `effort_age` in s; damped: as while the load changes; held:
     as of a late tilt. drive: the machine's last output. applied: (4,) Nm, what the motors truly apply; a silent motor
-    keeps its torque. steps: its largest step per cycle.
+    keeps its torque. steps: its largest step per cycle. while_hanging: Nm, asked for in place of `effort` while the
+    start is checked.
     """
 
     def __init__(self, **limits: Any) -> None:
@@ -43,6 +46,7 @@ class SafetyRun:
         self.changes: list[dict[str, Any]] = [{} for _ in range(4)]
         self.silent: set[int] = set()
         self.effort: Sequence[float] | None = EFFORT
+        self.while_hanging: Sequence[float] = NO_TORQUE
         self.effort_age = 0.002
         self.damped = self.held = False
         self.joints = [UNKNOWN] * 4
@@ -62,7 +66,9 @@ class SafetyRun:
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
             before, was_proving = list(self.applied), self._is_proving
-            efforts = Efforts(self.effort, self.now - self.effort_age, self.damped, self.held)
+            hangs = self.effort is not None and self.machine.state is State.CHECKING
+            effort = self.while_hanging if hangs else self.effort
+            efforts = Efforts(effort, self.now - self.effort_age, self.damped, self.held)
             self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
             for i in range(4):
                 if i not in self.silent:

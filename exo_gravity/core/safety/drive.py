@@ -92,16 +92,24 @@ class FaultCode(str, Enum):
 
     # The motors
     MOTOR_SILENT = "motor_silent", "a motor has not replied for 0.05 s, nor in 7 cycles", RESUME
-    MOTOR_ERROR = "motor_error", "a motor reports an error", RECHECK
+    MOTOR_ERROR = "motor_error", "a motor reports an error"
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
     TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK
     TORQUE_DIPPED = "torque_dipped", "a joint fell while the loop stood still: its motor's own time-out is too short"
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than 5 rad/s, the elbow 6"
     OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
-    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than the speed of `over_speed` allows", RECHECK
+    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than the speed of `over_speed` allows"
+    READINGS_CONTRADICT = (
+        "readings_contradict",
+        "a motor's angle has turned otherwise than its velocity says: wrong `velocity_range`, or a slipping encoder",
+    )
     # The start gate
-    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start", RECHECK
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start"
+    TORQUE_WHILE_HANGING = (
+        "torque_while_hanging",
+        "at the first start, more than 1.5 Nm are asked for on a joint of an arm that hangs",
+    )
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
     SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
     # The efforts

@@ -11,7 +11,9 @@ from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 
 # The gate waits for these to pass; other faults refuse the start.
-WAITED_OUT = frozenset({FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED, FaultCode.OUTSIDE_LIMITS})
+WAITED_OUT = frozenset(
+    {FaultCode.MOTOR_SILENT, FaultCode.OVER_SPEED, FaultCode.OUTSIDE_LIMITS, FaultCode.READINGS_CONTRADICT}
+)
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,19 @@ class SignPush:
     disturbed: int = 5  #: times at most that a joint may move without a push
 
 
-START_GATE, SWITCH_ON, SIGN_PUSH = StartGate(), SwitchOn(), SignPush()
+@dataclass(frozen=True)
+class HangingArm:
+    """What an arm that hangs must show, and what its operator is asked, before a start from unknown zeros."""
+
+    #: Nm asked for on a joint: gravity of a few degrees, the whole arm of a wearer of 75 kg included. Hanging, friction
+    #: alone holds it. A trunk's IMU that is mounted otherwise than it is set asks for more
+    torque: float = 1.5
+    moved: float = 0.06  #: rad that a joint may turn after it was confirmed: a wearer breathes, and hangs on
+    valid: float = 10.0  #: s for which the confirmation holds
+    patience: float = 60.0  #: s, longer than `enable_timeout`, that a start waits for it
+
+
+START_GATE, SWITCH_ON, SIGN_PUSH, HANGING_ARM = StartGate(), SwitchOn(), SignPush(), HangingArm()
 
 
 def missing_for_a_start(
@@ -83,6 +97,61 @@ def missing_for_a_start(
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
     return "the arm to be at rest" if any(abs(joint.velocity) > START_GATE.at_rest for joint in joints) else ""
+
+
+def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | None:
+    """Return the fault that `effort` (n,) in Nm, asked for on an arm that hangs, shows, or None."""
+    for name, torque in zip(limits.joint_names, effort, strict=True):
+        if not abs(torque) <= HANGING_ARM.torque:
+            reason = (
+                f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {HANGING_ARM.torque:g}: let "
+                "the whole arm hang, or correct rotation_trunk_from_imu, can_id, joint_names, side or the masses"
+            )
+            return Fault(FaultCode.TORQUE_WHILE_HANGING, reason)
+    return None
+
+
+class PoseQuestion:
+    """Asks the operator whether the arm hangs where it is drawn: angles that are wrong by a turn look as plausible.
+
+    The answer is for one start. It lapses when the arm moves or time passes, and is asked for again.
+
+    asked: (n,) rad, the pose in question; () while there is no question.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.asked: tuple[float, ...] = ()
+        self._names = names
+        self._confirmed: tuple[float, ...] = ()  # rad
+        self._until = -math.inf  # s
+
+    @property
+    def text(self) -> str:
+        """The pose in question, or the one that was confirmed, in degrees by joint; '' for none."""
+        pose = self.asked or self._confirmed
+        shown = zip(self._names, pose, strict=True) if pose else ()
+        return ", ".join(f"{name} {round(math.degrees(angle))}" for name, angle in shown)
+
+    def withdraw(self) -> None:
+        """Forget question and answer."""
+        self.asked = self._confirmed = ()
+
+    def confirm(self, now: float) -> bool:
+        """Take the operator's answer at `now` s; return False if nothing is asked."""
+        if not self.asked:
+            return False
+        self._confirmed, self._until, self.asked = self.asked, now + HANGING_ARM.valid, ()
+        return True
+
+    def missing(self, now: float, joints: Sequence[JointSample], others: str) -> str:
+        """Return what the start lacks at `now` s, '' for nothing; others: what it lacks beside the answer."""
+        pose = tuple(joint.position for joint in joints)
+        pairs = zip(pose, self._confirmed, strict=True) if self._confirmed else ()
+        if now > self._until or any(not abs(angle - then) <= HANGING_ARM.moved for angle, then in pairs):
+            self._confirmed = ()
+        is_due = not (others or self._confirmed)
+        self.asked = pose if is_due else ()
+        return f"the operator to confirm the pose (degrees): {self.text}" if is_due else others
 
 
 def _at_least(angle: float) -> str:

@@ -1,7 +1,7 @@
 """The limits of a worn arm, and which motor readings are a fault.
 
-`find_fault` checks a motor's reading; monitors.py confirms what it finds. barrier.py keeps every drive within the
-limits. docs/safety.md compares the defaults with those of other systems.
+`find_faults` checks a motor's reading; trust.py confirms what it finds. barrier.py keeps every drive within the limits.
+docs/safety.md compares the defaults with those of other systems.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,6 +24,7 @@ from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, ch
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
 MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
+CONFIRM, HANGING = START_POSES = ("confirm", "hanging")
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
 
@@ -57,7 +58,6 @@ class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
-    jump: float = 0.05  #: rad between two readings, in addition to what the largest velocity allows
     missed: int = 7  #: cycles without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
     reply_timeout: float = 0.05  #: s, and `missed` cycles at least; an ordinary computer is late by 0.02 s
 
@@ -101,6 +101,12 @@ class Limits:
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
     #: s without a reply that makes a motor silent; `limits_of` derives it from the rate
     reply_timeout: float = READING.reply_timeout
+    start_pose: str = owned(
+        "confirm",
+        "who has seen that the arm hangs where its angles say, before a start from unknown zeros: confirm: the "
+        "operator, through the service `~/confirm_pose`, the page or the launcher; hanging: whoever starts the nodes",
+        choices=START_POSES,
+    )
     enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
@@ -137,28 +143,24 @@ class Limits:
         """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
 
-    def find_fault(self, i: int, joint: JointSample, last: JointSample, since: float) -> Fault | None:
-        """Return the first fault that the reading `joint` of joint `i` shows, or None.
-
-        last: an earlier reading, UNKNOWN for none, taken after `since` (s).
-        """
+    def find_faults(self, i: int, joint: JointSample) -> list[Fault]:
+        """Return the faults that the reading `joint` of joint `i` shows by itself."""
         name, fastest = self.joint_names[i], self.max_velocity[i]
         low, high = self.position_min[i], self.position_max[i]
+        faults = []
         if joint.error:
             text = error_text(joint.error)
-            return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
+            faults.append(Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})"))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
-            return Fault(FaultCode.OVER_TEMPERATURE, reason)
+            faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason))
         if not abs(joint.velocity) <= fastest:
-            return Fault(FaultCode.OVER_SPEED, f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}")
-        if abs(joint.position - last.position) > READING.jump + fastest * (joint.time - since):
-            reason = f"{name}: from {last.position:.3f} to {joint.position:.3f} rad in one step"
-            return Fault(FaultCode.POSITION_JUMP, reason)
+            reason = f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}"
+            faults.append(Fault(FaultCode.OVER_SPEED, reason))
         if not low - READING.overshoot <= joint.position <= high + READING.overshoot:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-            return Fault(FaultCode.OUTSIDE_LIMITS, reason)
-        return None
+            faults.append(Fault(FaultCode.OUTSIDE_LIMITS, reason))
+        return faults
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

@@ -2,7 +2,8 @@
 
 `transitions.TRANSITIONS` has every transition, `power.NEXT` those of a single motor.
 
-- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang.
+- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
+  person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
 - PROVING switches the motors on one by one (power.py). Each must show in its replies that it is on. If signs are not
   trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault switches the motors off.
 - RAMPING_IN: the torque begins as a guided motion (guidance.py), which ends at the full torque.
@@ -13,9 +14,8 @@
 
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
-Zeros and signs are trusted once they were checked, until a motor may have lost its turn count (`Readings`), or a fault
-means that they must be checked again. Until then `resume` carries an arm on from any pose after a fault that leaves
-nothing to repair.
+Zeros and signs are trusted once they were checked, for as long as the angles are continuous (trust.py). So long
+`resume` carries an arm on from any pose after a fault that leaves nothing to repair.
 """
 
 import math
@@ -30,14 +30,24 @@ from exo_gravity.core.safety.barrier import BARRIER, Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.gate import START_GATE, SWITCH_ON, SignCheck, SwitchOnCheck, missing_for_a_start
+from exo_gravity.core.safety.gate import (
+    HANGING_ARM,
+    START_GATE,
+    SWITCH_ON,
+    PoseQuestion,
+    SignCheck,
+    SwitchOnCheck,
+    missing_for_a_start,
+    torque_while_hanging,
+)
 from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
-from exo_gravity.core.safety.limits import DAMPING, Limits
-from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough
+from exo_gravity.core.safety.limits import CONFIRM, DAMPING, Limits
+from exo_gravity.core.safety.monitors import REST, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
 from exo_gravity.core.safety.stall import StallWatch
 from exo_gravity.core.safety.transitions import TRANSITIONS, Event
+from exo_gravity.core.safety.trust import Readings
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
@@ -51,6 +61,7 @@ class SafetyMachine:
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
     power: of each motor. ride: through late efforts. motion: judges the efforts by gravity alone.
+    pose: the question to the operator whether the arm hangs as it is drawn.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -74,7 +85,7 @@ class SafetyMachine:
         self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
         self._rest = RestTracker()
         self._readings = Readings(limits)
-        self._is_trusted = False  # zeros and signs
+        self.pose = PoseQuestion(limits.joint_names)
         self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._switching = SwitchingOn(self._replies)
@@ -126,7 +137,15 @@ class SafetyMachine:
             return f"the arm is {self.state.value}, must be in fault"
         if not self.fault.code.is_resumable:
             return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
-        return "" if self._is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+        is_trusted = self._readings.trusted
+        return "" if is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+
+    def confirm_pose(self, now: float) -> str:
+        """Take the operator's word that the arm hangs as it is drawn; return '' or why that is not asked."""
+        if self.pose.confirm(now):
+            return ""
+        waits = f", waiting for {self.waiting_for}" if self.state is State.CHECKING else ""
+        return f"nothing to confirm: the arm is {self.state.value}{waits}"
 
     def resume(self, now: float) -> bool:
         """Clear the fault and enable, on the operator's request only. Return False, and do nothing, if refused."""
@@ -138,7 +157,7 @@ class SafetyMachine:
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
         if code.needs_recheck:
-            self._is_trusted = False
+            self._readings.doubt()
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or Fault(code, reason)
@@ -171,7 +190,7 @@ class SafetyMachine:
         self._read(joints)
         is_fresh = efforts.effort is not None and now - efforts.answered <= self.limits.command_timeout
         if self.state is State.CHECKING:
-            self._check(is_fresh)
+            self._check(efforts.effort if is_fresh else None)
         elif self.state in CARRYING:
             self._trip(self._carried_fault(efforts))
         self._watch_stalls()
@@ -188,8 +207,6 @@ class SafetyMachine:
         """Take the newest samples: readings, rest, and what they show of the motors' power."""
         readings = self._readings
         readings.step(self._now, joints, self._sent.powered)
-        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False
         self._rest.step(self._now, readings.joints, readings.silent)
         for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
             power.step(self._now, self._dt, joint, is_silent)
@@ -240,28 +257,41 @@ class SafetyMachine:
         bounded = self.barrier.damping(self._dt, readings.joints, readings.silent, torque, tuple(damping))
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
-    def _check(self, efforts_are_fresh: bool) -> None:
-        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
+    def _check(self, effort: Sequence[float] | None) -> None:
+        """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
+
+        effort: (n,) Nm, what is asked for, None if that is not known.
+        """
         readings, limits = self._readings, self.limits
-        missing = missing_for_a_start(limits, readings.joints, readings.fault, self._is_trusted)
+        missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = self.hindrance or missing or ("" if efforts_are_fresh else "effort commands")
+        missing = self.hindrance or missing or ("effort commands" if effort is None else "")
         missing = missing or ("the motors to confirm that they are off" if not self._all_off else "")
+        asks = not readings.trusted and limits.start_pose == CONFIRM
+        patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
+        if readings.fault:
+            self.pose.withdraw()
+        if asks:
+            missing = self.pose.missing(self._now, readings.joints, missing)
         self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:
             self._calm_since = self._now
-        if self._now - self._calm_since >= START_GATE.calm:
+        if effort is not None and self._now - self._calm_since >= START_GATE.calm:
+            fault = None if readings.trusted else torque_while_hanging(limits, effort)
+            if fault:
+                self._trip(fault)
+                return
             self.waiting_for = ""
-            largest = 0.0 if self._is_trusted else limits.sign_check_torque
+            largest = 0.0 if readings.trusted else limits.sign_check_torque
             self._switching, self._attempts = SwitchingOn(self._replies), 0
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
             self._on(Event.PASSED)
-        elif self._now - self._since >= limits.enable_timeout:
-            self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
+        elif self._now - self._since >= patience:
+            self._refuse(f"not enabled within {patience:g} s: waited for {self.waiting_for}")
 
     def _prove(self) -> None:
         """Advance the checks of motors that were just switched on."""
@@ -277,7 +307,7 @@ class SafetyMachine:
         self.waiting_for = self._signs.hint
         self._trip(fault)
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
-            self._is_trusted = True
+            self._readings.prove()
             self.motion.reset()
             self._rise.begin((1.0,) * len(self.power))
             self._on(Event.PROVEN)
@@ -335,7 +365,8 @@ class SafetyMachine:
             asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
             is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
             if is_off and power.state is Power.ON and power.may_return and not joint.error:
-                power.may_return, self._is_trusted = False, False
+                power.may_return = False
+                self._readings.doubt()
                 descent.rejoin(i)
                 send[i] = Send.ENTER if self._replies[i] else Send.COMMAND
         if not delivered:
@@ -398,6 +429,7 @@ class SafetyMachine:
         if after is None:
             return
         self.state = after
+        self.pose.withdraw()
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:
             self._change_power(Change.SWITCH_ON)

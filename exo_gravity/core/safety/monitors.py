@@ -1,8 +1,4 @@
-"""What the safety machine watches: the motors' readings, the arm's rest, the age of the efforts.
-
-Chosen against ordinary equipment: 3 % of the frames lost each way, a computer that is late by 20 ms in one cycle of
-ten, adapters that deliver in batches of 1 ms, and a motor that reports one wrong reading now and then.
-"""
+"""What the safety machine watches beside the motors' readings: the arm's rest, and the age of the efforts."""
 
 import math
 from collections.abc import Sequence
@@ -11,19 +7,6 @@ from dataclasses import dataclass
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Fault, FaultCode
-from exo_gravity.core.safety.limits import READING, Limits
-
-
-@dataclass(frozen=True)
-class TurnCount:
-    """For how long in s a motor may be silent until its turn count is no longer trusted.
-
-    Until then it is, if the angle is within `home_tolerance` of the one before: a lost turn is twice as large, less
-    what the joint has moved.
-    """
-
-    on: float = 0.1  #: while the motors hold the arm: a forearm whose motor has lost its power falls by 0.3 rad
-    off: float = 0.3  #: while they are off: an arm that is down, only a person moves
 
 
 @dataclass(frozen=True)
@@ -43,68 +26,7 @@ class Ride:
     recovery: float = 0.1  #: of riding that each s with sound efforts makes good
 
 
-TURN_COUNT, REST, RIDE = TurnCount(), Rest(), Ride()
-
-
-class Readings:
-    """Follows the readings of an arm's motors, cycle by cycle.
-
-    joints: (4,) the newest ones. One that shows a fault is left out until the next one shows a fault too.
-    silent: (4,) whether a motor is silent: no reply for `reply_timeout`, nor in `missed` cycles. A loop that stood
-        still has not asked.
-    fault: what the newest readings show, or None.
-    lost: whether a motor may have lost its power in this cycle, and with it the turn count of its encoder.
-    """
-
-    def __init__(self, limits: Limits) -> None:
-        self.joints: tuple[JointSample, ...] = (UNKNOWN,) * JOINT_COUNT
-        self.silent: Sequence[bool] = (True,) * JOINT_COUNT
-        self.fault: Fault | None = None
-        self.lost = True
-        self._limits = limits
-        self._newest = [-math.inf] * JOINT_COUNT  # s
-        self._missed = [READING.missed] * JOINT_COUNT
-        self._asked = [-math.inf] * JOINT_COUNT  # s; each of `joints` was taken later
-        self._is_suspect = [False] * JOINT_COUNT
-        self._now = -math.inf  # s, of the last cycle
-
-    def step(self, now: float, joints: Sequence[JointSample], powered: bool = True) -> None:
-        """Take the newest readings of a cycle.
-
-        now: s.
-        joints: (4,) the newest readings.
-        powered: whether the motors are on.
-        """
-        limits = self._limits
-        longest = TURN_COUNT.on if powered else TURN_COUNT.off
-        counting = list(self.joints)
-        self.fault, self.lost = None, False
-        for i, joint in enumerate(joints):
-            if joint.time > self._newest[i]:
-                gap = joint.time - self._newest[i]
-                moved = abs(joint.position - self.joints[i].position)
-                self.lost |= gap > limits.reply_timeout and moved > limits.home_tolerance[i]
-                self._newest[i], self._missed[i] = joint.time, 0
-                fault = limits.find_fault(i, joint, self.joints[i], self._asked[i])
-                is_confirmed, self._is_suspect[i] = self._is_suspect[i], fault is not None
-                if is_confirmed or not fault or self.joints[i] is UNKNOWN:
-                    counting[i], self._asked[i] = joint, self._now
-                    self.fault = self.fault or (fault if is_confirmed else None)
-            else:
-                self._missed[i] += 1
-                self.lost |= self._missed[i] >= READING.missed and now - joint.time > longest
-        self.joints = tuple(counting)
-        asked = zip(joints, self._missed, strict=True)
-        self.silent = [missed >= READING.missed and limits.is_silent(now, joint) for joint, missed in asked]
-        if any(self.silent):
-            name, buses = limits.joint_names[self.silent.index(True)], set(limits.channels)
-            columns = zip(limits.channels, self._missed, strict=True)
-            replying = {bus for bus, missed in columns if missed < READING.missed}
-            reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
-            if len(buses) > 1 and (dead := buses - replying):
-                reason += f"; no motor on {' and '.join(sorted(dead))} replies: the bus is lost, or the supply is cut"
-            self.fault = Fault(FaultCode.MOTOR_SILENT, reason)
-        self._now = now
+REST, RIDE = Rest(), Ride()
 
 
 class RestTracker:

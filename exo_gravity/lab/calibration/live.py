@@ -28,7 +28,7 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.lab.processes import Launcher, stop_on_signals
+from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
 REFRESH_PERIOD = 0.1  # s, of what the person is shown
@@ -139,7 +139,8 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
         path = Path(folder, "params.yaml")
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
         launcher = Launcher(path, on_line)
-        dead = launcher.run(ending)
+        with asking_on_terminal(launcher.asking):
+            dead = launcher.run(ending)
     for number, handler in handlers.items():
         signal.signal(number, handler)
     if dead:

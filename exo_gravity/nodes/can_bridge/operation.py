@@ -1,4 +1,4 @@
-"""How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
+"""How `can_bridge` is operated: its services enable, clear_fault, resume, confirm_pose and set_zero; /diagnostics.
 
 Each service runs on the control thread between two cycles, and the executor does not wait for it: a request to let the
 arm down never waits behind others, and ends those that would arm it. A request that would arm the arm is refused once
@@ -31,7 +31,18 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
 from exo_gravity.nodes.ros.inner import Until, age_of_request, wake
-from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
+from exo_gravity.nodes.ros.messages import (
+    ERROR,
+    HELD_BY,
+    NO_POSE,
+    NOBODY,
+    OK,
+    POSE_TO_CONFIRM,
+    WARN,
+    Diagnostics,
+    milliseconds,
+    row,
+)
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
@@ -95,9 +106,9 @@ class BridgeServices:
         self._hindrance = hindrance
         self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._motors = tuple(motors)
-        services = {self.enable: SetBool, self.clear_fault: Trigger, self.resume: Trigger, self.set_zero: Trigger}
-        for function, kind in services.items():
-            node.create_service(kind, f"~/{function.__name__}", partial(self.answer, function))
+        node.create_service(SetBool, "~/enable", partial(self.answer, self.enable))
+        for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
+            node.create_service(Trigger, f"~/{function.__name__}", partial(self.answer, function))
 
     def enable(self, loop: ControlLoop, request: SetBool.Request) -> str:
         """Enable the arm, or let it down and disable it."""
@@ -117,6 +128,10 @@ class BridgeServices:
         """Clear a fault that leaves nothing to repair, and enable the arm where it is."""
         why_not = loop.safety.why_not_resumed
         return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
+
+    def confirm_pose(self, loop: ControlLoop, _request: Trigger.Request) -> str:
+        """Take the operator's word that the arm hangs as it is drawn, for the start that waits for it."""
+        return loop.safety.confirm_pose(time.monotonic())
 
     def set_zero(self, loop: ControlLoop, _request: Trigger.Request) -> str:
         """Return what to write instead: some firmware forgets a zero that is set over the bus with its power."""
@@ -163,6 +178,8 @@ class BridgeServices:
         response.success = not response.message
         if response.success:
             response.message = FOLLOWS.get(loop.safety.state, "")
+            if function == self.confirm_pose:
+                response.message = f"confirmed (degrees): {loop.safety.pose.text}; {response.message}"
         return response
 
 
@@ -250,6 +267,7 @@ class BridgeReport:
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
             "resume": safety.why_not_resumed or "possible",
+            POSE_TO_CONFIRM: row(list(map(math.degrees, safety.pose.asked)), 0) if safety.pose.asked else NO_POSE,
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,

@@ -17,6 +17,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
@@ -50,6 +51,16 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     values = declare(node, table)
     model = UrdfArm(_description(node, values), values["joint_names"])
     return table, values, lambda values: settings.urdf_settings_of(values, model)
+
+
+def check_side(namespace: str, side: str) -> None:
+    """Raise ParameterError if `side` is not the one that the arm's namespace names, which its can_bridge goes by.
+
+    side: '' for an arm that has none.
+    """
+    named = namespace.rpartition("/")[2]
+    if side and named in SIDES and named != side:
+        raise ParameterError("side", side, f"{named}, as the namespace {namespace} says, or the node in another one")
 
 
 def sentence(s: Settings) -> str:

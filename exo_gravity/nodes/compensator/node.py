@@ -26,7 +26,14 @@ from exo_gravity.core.compensation.weighing import Weighing, refusal
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.hardware.clock import request_real_time
-from exo_gravity.nodes.compensator.arm import JointStateInterface, MultiArrayInterface, declared, report, sentence
+from exo_gravity.nodes.compensator.arm import (
+    JointStateInterface,
+    MultiArrayInterface,
+    check_side,
+    declared,
+    report,
+    sentence,
+)
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.run import run
@@ -57,6 +64,7 @@ class CompensatorNode(Node):
         super().__init__("compensator", context=context, automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
         table, values, read = declared(self)
+        check_side(self.get_namespace(), values.get("side", ""))
         self._names = values["joint_names"]
         settings = read(values)
         self._control = Compensator(settings, self._names)

@@ -63,6 +63,7 @@ ASKED = {  # service and request for each request of a page; None for the parame
     "enable": (SetBool, f"{BRIDGE}/enable", SetBool.Request(data=True)),
     "clear_fault": (Trigger, f"{BRIDGE}/clear_fault", Trigger.Request()),
     "resume": (Trigger, f"{BRIDGE}/resume", Trigger.Request()),
+    "confirm_pose": (Trigger, f"{BRIDGE}/confirm_pose", Trigger.Request()),
     "weigh": (Trigger, f"{COMPENSATOR}/weigh", Trigger.Request()),
     "set": (SetParametersAtomically, f"{COMPENSATOR}/{SET}", None),
     "perform": (SetParametersAtomically, f"{SIMULATOR}/{SET}", None),  # of no page

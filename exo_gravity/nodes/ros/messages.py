@@ -22,6 +22,8 @@ from exo_gravity.core.errors import ParameterError
 
 OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level) for level in ("OK", "WARN", "ERROR", "STALE"))
 HELD_BY, NOBODY = "control held by", "nobody"  # key in can_bridge's status; value without an operator
+# Key in can_bridge's status: the pose that a start asks the operator about, in degrees; value without a question.
+POSE_TO_CONFIRM, NO_POSE = "pose to confirm (deg)", "none"
 LATE_TILT = "late tilt"  # frame_id of efforts that are computed from one
 
 REPEAT_PERIOD = 0.45  # s; a little less than a multiple of the nodes' timer periods, which jitter

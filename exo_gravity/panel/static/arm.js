@@ -23,6 +23,9 @@ export class ArmCard {
     this.limit = null; // the largest support 0..1 within the motors' rated torque
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
     this.root.dataset.arm = name;
+    this.pose = document.getElementById("pose").content.cloneNode(true).firstElementChild; // stands below the picture
+    this.pose.dataset.arm = name;
+    this.pose.querySelector("button").addEventListener("click", () => actions.send({ do: "confirm_pose", arm: name }));
     this.find = (selector) => this.root.querySelector(selector);
     this.find("h2").id = `head-${name}`;
     this.root.setAttribute("aria-labelledby", `head-${name}`);
@@ -58,6 +61,7 @@ export class ArmCard {
     this.find(".weigh").setAttribute("aria-label", t("weigh_arm", arm));
     this.find(".bar").setAttribute("aria-label", t("carries_arm", arm));
     write(this.find(".down"), t("let_down_arm", arm));
+    write(this.pose.querySelector("button"), t("confirm_pose", arm));
   }
 
   armText() {
@@ -163,6 +167,7 @@ export class ArmCard {
     this.find(".clear").disabled = !operates || name !== "fault";
     this.find(".resume").hidden = bridge?.resume !== "possible";
     this.find(".resume").disabled = !operates;
+    this.showPose(state.joints, bridge, operates);
     this.find(".home").disabled = !operates || !OFF.includes(name);
     for (const control of [this.slider, ...this.root.querySelectorAll("[data-mode]")]) control.disabled = !operates || !other || !isFinite(this.support);
     if (this.setup?.settings) this.follow();
@@ -171,6 +176,15 @@ export class ArmCard {
     const rates = bridge ? `${t("rate")}: ${number(finite(bridge["rate (Hz)"]), 1)} Hz. ${t("age")}: ${number(finite(bridge["age of efforts (ms)"]), 1)} ms.` : "";
     const limits = bridge?.["limits acting"];
     write(this.find(".rates"), limits && limits !== "none" ? `${rates} ${t("limits", limits)}` : rates);
+  }
+
+  // Whether the operator is asked if the arm hangs as it is drawn, and at which angles.
+  showPose(joints, bridge, operates) {
+    const angles = poseAsked(bridge);
+    this.pose.hidden = !angles;
+    this.pose.querySelector("button").disabled = !operates;
+    const shown = (angles ?? []).map((angle, n) => `${jointText(this.name, joints?.[n]?.name ?? "")} ${number(angle, 0)}°`);
+    write(this.pose.querySelector("p"), angles ? t("confirm_pose_ask", this.armText(), shown.join(", ")) : "");
   }
 
   // How much of their arm's weight the wearer carries, to be read from two metres: the bar, and its 95 % band.
@@ -210,6 +224,7 @@ export class ArmCard {
 
   sentence(name, moving, state, bridge, remedy) {
     if (bridge?.message.includes("may still be powered")) return t("unreached");
+    if (poseAsked(bridge)) return t("sentence.pose");
     if (moving) return t(changes(state) ? "sentence.changing" : `sentence.${moving}`);
     const outside = ["checking", "disabled"].includes(name) && bridge?.message.match(/(\S+) to be moved by ([-+][\d.]+) degrees/);
     if (outside) return t(`outside.${name}`, jointText(this.name, outside[1]), number(Math.abs(outside[2]), 1));
@@ -270,6 +285,12 @@ export class ArmCard {
   get isCarried() {
     return CARRIED.includes(this.state);
   }
+}
+
+// The pose in degrees that a start asks about; null without a question.
+function poseAsked(bridge) {
+  const text = bridge?.["pose to confirm (deg)"] ?? "none";
+  return text === "none" ? null : text.split(", ").map(Number);
 }
 
 const changes = (state) => (state.compensator?.["changing load"] ?? "none") !== "none";

@@ -105,6 +105,7 @@ function onSetup(message) {
     if (!cards.has(name)) {
       cards.set(name, new ArmCard(name, actions));
       byId("arms").append(cards.get(name).root);
+      byId("poses").append(cards.get(name).pose);
     }
     cards.get(name).configure(arm);
   }

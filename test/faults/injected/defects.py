@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
-TRUSTED = "core.safety.machine:SafetyMachine._is_trusted"  # zeros and signs
+TRUSTED = "core.safety.trust:Readings.trusted"  # zeros and signs
 ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDescent", "JointDescent.__init__"))
 DESCENT = "core.safety.descent:DESCENT"  # its tuning
 DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
