@@ -11,8 +11,8 @@ board must be set to 200 at least.
 """
 
 import contextlib
+import math
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -104,7 +104,7 @@ class BusScan(contextlib.ExitStack):
         self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
-        self._rates: Counter[int] = Counter()  # Hz of their status frames
+        self._gaps: dict[int, float] = {}  # s, the shortest between two of their status frames
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
         try:
@@ -115,9 +115,12 @@ class BusScan(contextlib.ExitStack):
                 )
             self._port = CanPort(open_bus(*address), clock)
             self.callback(self._port.close)
+            heard_at: dict[int, float] = {}
             for message, kind, answer in self._frames(LISTEN_TIME):
                 if answer and message.is_extended_id:
-                    self._rates[answer.can_id] += 1.0 / LISTEN_TIME
+                    now, last = self._now(), heard_at.get(answer.can_id, -math.inf)
+                    self._gaps[answer.can_id] = min(now - last, self._gaps.get(answer.can_id, math.inf))
+                    heard_at[answer.can_id] = now
                 heard = message.arbitration_id
                 if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                     raise BusError(
@@ -153,8 +156,8 @@ class BusScan(contextlib.ExitStack):
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
-        for can_id, rate in sorted(self._rates.items()):
-            if rate < SERVO_RATE:
+        for can_id, gap in sorted(self._gaps.items()):
+            if (rate := 1.0 / max(gap, 1e-6)) < SERVO_RATE:
                 problems[
                     f"ID {can_id}: about {rate:.0f} status frames a second: a V1 or V2 board in servo mode, to be "
                     f"set to MIT mode with the vendor's tool, or a V3 board, to be set to {MAX_STATUS_RATE:g} a second"
