@@ -1,4 +1,4 @@
-"""The true motion of the simulated arm, written to a file at every physics step, for a judge in another process.
+"""The true motion of the simulated arm at every physics step: in a file, for a judge in another process, or in memory.
 
 The file is a sequence of `RECORD`, the only description of the format. Records leave the process every `FLUSH_PERIOD`;
 what was written stays when the process is frozen or killed.
@@ -6,7 +6,7 @@ what was written stays when the process is frozen or killed.
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -31,6 +31,37 @@ RECORD = np.dtype(
     ]
 )
 FLUSH_PERIOD = 0.02  # s
+
+
+class Truth(Protocol):
+    """Receives the true motion of an arm."""
+
+    def synchronise(self, now: float) -> None:
+        """Note that the simulated time `now` (s) is the present time."""
+        ...
+
+    def note(self, now: float, *state: Any) -> None:
+        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
+        ...
+
+
+class TruthRecords:
+    """Keeps the records in memory, by simulated time: for a judge in the same process."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[Any, ...]] = []
+
+    def synchronise(self, now: float) -> None:
+        """Do nothing: the records have the simulated time."""
+
+    def note(self, now: float, *state: Any) -> None:
+        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
+        self._rows.append((now, *(tuple(part) if isinstance(part, list) else part for part in state)))
+
+    @property
+    def records(self) -> np.ndarray:
+        """All records so far, (n,) of RECORD."""
+        return np.array(self._rows, RECORD)
 
 
 class TruthLog:

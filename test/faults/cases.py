@@ -54,6 +54,7 @@ from .bus_cases import OWNERSHIP, SUPPLY, TWO_BUSES, V3_BOARDS
 from .command_cases import CLOCK, EFFORT_COMMANDS, MONITOR, RIDES
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase
 from .outer_loop_cases import LEASES, OUTER_LOOP
+from .person_cases import CONNECTIONS, FIRMWARE, REQUESTS
 from .rig import Rig
 from .rigs import (
     BothArmsRig,
@@ -247,4 +248,5 @@ ARMS = (
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
     *(*RIDES, *OWNERSHIP, *LEASES, *LOAD_CHANGES, *ACTIVE_WEARER, *SUPPLY, *MONITOR, *TWO_BUSES),
+    *(*REQUESTS, *CONNECTIONS, *FIRMWARE),
 )

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from .judge import MAX_SPEED, MAX_WORK
+from exo_gravity.sim.judge import MAX_DAMPING, MAX_SPEED, MAX_WORK
+
 from .rig import Rig
 
 REACTION = 0.10  # s from a fault until damping acts on every motor,
@@ -30,7 +31,8 @@ class FaultCase:
     fault codes or states; () for any. unreached: joints (0..3) whose motors no frame can reach. unpowered: joints that
     fall, because a motor has no power, so that nothing can brake them. steps_from: s after the fault from which on
     torque steps count, where the fault itself is a step. speed_limit, driven_limit: rad/s of any joint. work_limit: J
-    of any motor. check: of the arm's true motion. ends_rig: whether the rig is spent although its nodes run on.
+    of any motor. damping_limit: of any motor's damping by itself, as a multiple of
+    its rated torque. check: of the arm's true motion. ends_rig: whether the rig is spent although its nodes run on.
     """
 
     name: str
@@ -47,6 +49,7 @@ class FaultCase:
     speed_limit: float = MAX_SPEED
     driven_limit: float = MAX_SPEED
     work_limit: float = MAX_WORK
+    damping_limit: float = MAX_DAMPING
     check: Check = lambda records: ""
     ends_rig: bool = False
 

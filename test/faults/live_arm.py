@@ -13,11 +13,11 @@ import numpy as np
 import yaml
 
 from exo_gravity.core.safety.limits import READING
+from exo_gravity.sim.judge import measure
 
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
-from .judge import measure
 from .rigs import COMPENSATOR, BothArmsRig, WearerRig
 from .stall_clock import StallClock
 from .wearer_cases import HOLD, MOVED, PUSH_DOWN, RATED, SHAKE, THROW

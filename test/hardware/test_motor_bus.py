@@ -13,14 +13,14 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.safety.drive import OFF
+from exo_gravity.core.safety.drive import OFF, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import drive_of, frame
+from ..support.simulated_device import drive_of, frame, sending
 from .wires import wire_for_test
 
 AK60 = MOTORS["AK60-6"]
@@ -77,27 +77,26 @@ def test_every_motor_is_read_in_joint_coordinates(bus, device):
 def test_an_exchange_moves_the_simulated_arm(bus, device):
     before = device.arm.positions[3]
     end = now(bus) + 5.0
+    bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
     while device.arm.positions[3] < before + 0.2 and now(bus) < end:
         bus.exchange(drive_of((0.0, 0.0, 0.0, 2.0)), now(bus) + 1.0)
     assert device.arm.positions[3] > before + 0.2
 
 
-def test_a_zero_torque_command_precedes_switching_on_and_switching_off(bus, other):
-    bus.exchange(ON, now(bus))
-    frames = [data for can_id, data in received(other) if can_id == 1]
-    assert frames.index(ENTER) == 1
-    assert unpack_command(AK60, frames[0]).torque == pytest.approx(0.0, abs=0.004)
-    bus.exchange(OFF, now(bus))
-    frames = [data for can_id, data in received(other) if can_id == 1]
-    assert frames[-1] == EXIT
-    assert unpack_command(AK60, frames[-2]).torque == pytest.approx(0.0, abs=0.004)
+def test_each_motor_gets_the_frames_that_it_is_to_be_sent(bus, other):
+    idle = (1, MOTORS_OF_ARM[0].command(0.0, 0.0))
+    frames = {Send.ENTER: [(1, ENTER)], Send.EXIT: [(1, EXIT)], Send.CLEAR: [(1, ENTER), idle], Send.POLL: [idle]}
+    frames[Send.NOTHING] = []
+    for send, expected in frames.items():
+        bus.exchange(sending(send), now(bus))
+        assert [frame for frame in received(other) if frame[0] == 1] == expected
 
 
-def test_stop_switches_every_motor_off_twice(bus, other):
-    bus.exchange(ON, now(bus))
+def test_stop_sends_an_exit_twice_to_motors_that_were_to_be_off_and_nothing_to_others(bus, other):
+    bus.exchange(ON._replace(send=(Send.COMMAND, Send.EXIT, Send.POLL, Send.NOTHING)), now(bus))
     received(other)
     bus.stop()
-    assert [can_id for can_id, data in received(other) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
+    assert [can_id for can_id, data in received(other) if data == EXIT] == [2, 3, 2, 3]
 
 
 def commands(bus: can.BusABC, motor: JointMotor) -> list[MotorCommand]:

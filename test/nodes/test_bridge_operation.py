@@ -108,14 +108,23 @@ def ask(node):
 
     def ask(service, loop, data=None, zero=0.0):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        services = BridgeServices(node, lambda: loop, motors)
-        response = services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace())
+        services = BridgeServices(node, lambda: loop, motors, lambda: "")
+        response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
         if response.success:
             assert ("/diagnostics" in response.message) is (loop.safety.state is State.CHECKING)
             return ""
         return response.message
 
     return ask
+
+
+def finish(callback):
+    """Let a service's callback run to its end; return its response."""
+    while True:
+        try:
+            callback.send(None)
+        except StopIteration as end:
+            return end.value
 
 
 def standing():

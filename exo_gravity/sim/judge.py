@@ -1,4 +1,6 @@
-"""Judges how an arm came down after a fault, by the simulated arm's true motion, not by the frames on its bus.
+"""Judges what an arm did, by the simulated arm's true motion, not by the frames on its bus.
+
+`measure` judges one fault, for the fault matrix. `Driven` is what motors did to an arm at any time, for the search too.
 
 Wearers may move the arm as fast as they like. While they touch it, its speed is theirs. Afterwards only the speed that
 a joint gains is judged: by how much it exceeds the least that it has had since. `driven` is the part of it that a motor
@@ -13,15 +15,63 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
 HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
+MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
+SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
+LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
+WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
-PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")])
+PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in USUAL_MOTORS])
+RATED_TORQUE = np.array([MOTORS[name].rated_torque for name in USUAL_MOTORS])
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
+
+
+@dataclass(frozen=True)
+class Driven:
+    """What motors did to an arm on which no hand was, each by the motor that did most.
+
+    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
+    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. A WEAK torque
+    drives nothing, and a stretch of LITTLE energy has no speed. damping: torque by damping alone as a multiple of the
+    motor's rated torque, also while a hand is on the arm.
+    """
+
+    speed: float = 0.0
+    energy: float = 0.0
+    power: float = 0.0
+    damping: float = 0.0
+    joint: int = 0
+    time: float = 0.0
+
+
+def driven(records: np.ndarray) -> Driven:
+    """Return what the motors did in these records (sim/truth.py); at least one."""
+    is_free, _, gained = _gained(records)
+    power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
+    power[np.abs(records["torque"]) < WEAK] = 0.0
+    is_moved = (power > 0.0) & (gained > SLOW)
+    done = np.cumsum(np.where(is_moved, power, 0.0) * _lasting(records)[:, None], axis=0)
+    energy = done - np.maximum.accumulate(np.where(is_moved, 0.0, done), axis=0)
+    speed = np.where(energy > LITTLE, gained, 0.0)
+    when, joint = np.unravel_index(np.argmax(speed), speed.shape)
+    return Driven(
+        speed=float(speed[when, joint]),
+        energy=float(energy.max()),
+        power=float(power[is_moved].max(initial=0.0)),
+        damping=float(np.abs(records["damping"] * records["velocity"] / RATED_TORQUE).max()),
+        joint=int(joint) + 1,
+        time=float(records["time"][when]),
+    )
+
+
+def _lasting(records: np.ndarray) -> np.ndarray:
+    """Return how long each record lasted, (n,) s; a time in which the device did not run counts as MAX_GAP."""
+    return np.minimum(MAX_GAP, np.diff(records["time"], append=records["time"][-1:]))
 
 
 @dataclass
@@ -32,8 +82,9 @@ class Response:
     rad/s of `fastest` (joint 1..4), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
     torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
     what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
-    put into the arm while no hand was on it. off: s until the last motor was off, None if one is on at the end.
-    re_enabled: whether a motor was switched on after all had been off. gap: s, the longest time without a record.
+    put into the arm while no hand was on it. power: W, and damping, as in `Driven`. off: s until the last motor was
+    off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
+    longest time without a record.
     """
 
     reaction: float | None = None
@@ -43,6 +94,8 @@ class Response:
     largest_step: float = 0.0
     excess: float = 0.0
     work: float = 0.0
+    power: float = 0.0
+    damping: float = 0.0
     off: float | None = None
     re_enabled: bool = False
     gap: float = 0.0
@@ -72,6 +125,7 @@ def measure(
     step, excess = _steps(records, period)
     step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
     powered = np.flatnonzero(on.any(axis=1))
+    whole = driven(records[after]) if after.any() else Driven()
     off_at = powered[-1] + 1 if len(powered) else 0
     dark = np.flatnonzero(after & ~records["on"].any(axis=1))
     return Response(
@@ -82,6 +136,8 @@ def measure(
         largest_step=float(step.max(initial=0.0)),
         excess=float(excess.max(initial=0.0)),
         work=float(_work(records, after & is_free).max(initial=0.0)),
+        power=whole.power,
+        damping=whole.damping,
         off=None if off_at >= len(records) else max(0.0, float(since[off_at])),
         re_enabled=bool(len(dark) and len(powered) and powered[-1] > dark[0]),
         gap=float(np.diff(records["time"]).max(initial=0.0)),
@@ -130,5 +186,4 @@ def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
 def _work(records: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the work (4,) in J that each motor put into the arm; braking does not offset it."""
     power = np.maximum(0.0, records["torque"] * records["velocity"])[after]
-    dt = np.minimum(MAX_GAP, np.diff(records["time"], append=records["time"][-1:]))[after]
-    return np.asarray(power.T @ dt)
+    return np.asarray(power.T @ _lasting(records)[after])

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
+from exo_gravity.sim.judge import MAX_SPEED, driven, measure
 from exo_gravity.sim.truth import RECORD
-
-from .judge import MAX_SPEED, measure
 
 FAULT = 10.0  # s
 PERIOD = 0.004  # s
@@ -145,3 +144,30 @@ def test_a_motor_that_is_on_at_the_end_or_on_again_is_seen(records):
 def test_time_in_which_the_device_did_not_run_is_seen(records):
     kept = (records["time"] < FAULT + 1.0) | (records["time"] > FAULT + 1.5)
     assert measure(records[kept], FAULT, PERIOD).gap == pytest.approx(0.5, abs=0.01)
+
+
+def test_only_the_longest_stretch_in_which_a_motor_drives_counts_as_its_energy(records):
+    since = records["time"] - FAULT
+    for begin, end, speed in ((1.0, 1.5, 0.5), (2.0, 3.0, 0.4), (4.5, 6.5, 0.09)):
+        stretch = (since >= begin) & (since < end)
+        records["velocity"][stretch, 2] = speed
+        records["torque"][stretch, 2] = 2.0
+    done = driven(records)
+    assert done.energy == pytest.approx(0.8, abs=0.01)
+    assert (done.speed, done.joint) == (pytest.approx(0.5), 3)
+    assert done.power == pytest.approx(1.0)
+
+
+def test_damping_that_drives_a_joint_is_seen(records):
+    """As that of a motor whose torque is reversed."""
+    falling = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 1.5)
+    records["torque"][:, 1] = np.where(falling, 5.0 * records["velocity"][:, 1], 0.0)
+    done = driven(records)
+    assert (done.speed, done.joint) == (pytest.approx(0.3), 2)
+    assert done.energy == pytest.approx(0.5 * 1.5 * 0.3, abs=0.01)
+    assert done.damping == pytest.approx(0.5)  # 1.5 Nm of 3
+
+
+def test_a_motor_does_not_drive_what_the_wearer_moves(lifted):
+    lifted["torque"][:, 3] = np.where(lifted["wearer"][:, 3] > 0.0, 3.0, 0.0)
+    assert driven(lifted).energy == 0.0

@@ -1,0 +1,221 @@
+"""A case: an arm, and what happens to it, drawn from a seed. It is data, so that a seed replays it.
+
+Each kind of event belongs to a group: operator, hardware, computer, wearer, IMU. A case draws two kinds, mostly of
+different groups, and often an operator who clears the fault and enables the arm afterwards.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+
+JOINTS = range(len(USUAL_MOTORS))
+RATES = (100.0, 250.0)  # Hz
+BODY_MASS = 75.0  # kg, of a wearer
+HORIZONTAL = (0.4, 1.35, 0.8, 1.5)  # rad, the farthest pose of a bare arm,
+CARRIED_IN_FULL = (0.2, 0.5, 0.2, 0.5)  # and of one with a wearer's arm, which the rated torques carry
+ENABLED, CARRIED = "enabled", "carried"  # what the times of a case's events count from
+REARM = "rearm"  # clear and enable
+
+Values = dict[str, Any]
+
+
+class Event(NamedTuple):
+    """Something that happens `time` s after the case's `begin`."""
+
+    time: float
+    name: str
+    values: Values
+
+
+@dataclass(frozen=True)
+class Case:
+    """An arm and its events.
+
+    worn: with the passive arm of a wearer in it, which Zero-G carries; else One-G carries the bare arm.
+    payload: kg in the hand, known to the compensator.
+    friction: Nm, Coulomb's of each joint.
+    pose: (4,) rad, to which the wearer moves the carried arm.
+    begin: ENABLED or CARRIED.
+    """
+
+    seed: int
+    rate: float
+    worn: bool
+    payload: float
+    friction: float
+    pose: tuple[float, ...]
+    begin: str
+    events: tuple[Event, ...]
+
+
+class Bound(NamedTuple):
+    """What a motor may do to an arm: rad/s, and J in one stretch."""
+
+    speed: float = 0.6
+    energy: float = 0.3
+
+
+# Causes that nobody can see at once have bounds of their own: docs/safety.md has the reason for each.
+CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
+REVERSED = Bound(3.2, 0.1)
+
+
+class Kind(NamedTuple):
+    """A kind of event: its group, how its values are drawn, and its bound where its cause cannot be seen."""
+
+    group: str
+    draw: Callable[[random.Random], Values] = lambda random: {}
+    bound: Bound = Bound()
+
+
+def lasting(shortest: float, longest: float) -> Callable[[random.Random], Values]:
+    """Draw a duration in s, short ones as often as long ones."""
+    return lambda random: {"duration": span(random, shortest, longest)}
+
+
+def span(random: random.Random, shortest: float, longest: float) -> float:
+    return round(math.exp(random.uniform(math.log(shortest), math.log(longest))), 3)
+
+
+def some_motors(shortest: float, longest: float) -> Callable[[random.Random], Values]:
+    """Draw one motor or all of them, and a duration in s."""
+
+    def draw(random: random.Random) -> Values:
+        motors = list(JOINTS) if random.random() < 0.5 else [random.choice(JOINTS)]
+        return {"motors": motors, "duration": span(random, shortest, longest)}
+
+    return draw
+
+
+def slip(random: random.Random) -> Values:
+    joint = random.choice(JOINTS)
+    turn = 2.0 * math.pi / MOTORS[USUAL_MOTORS[joint]].gear_ratio
+    return {"joint": joint, "error": random.choice((-1.0, 1.0)) * random.choice((round(turn, 3), 0.3))}
+
+
+def wrong_speed(random: random.Random) -> Values:
+    factor = random.choice((-1.0, 0.0, 0.3, 3.0))
+    return {"joint": random.choice(JOINTS), "factor": factor, "duration": span(random, 0.1, 5.0)}
+
+
+def on_joint(**choices: tuple[float, ...]) -> Callable[[random.Random], Values]:
+    """Draw a joint, and one of the values of each name."""
+    return lambda random: {
+        "joint": random.choice(JOINTS),
+        **{name: random.choice(values) for name, values in choices.items()},
+    }
+
+
+def one_of(**choices: tuple[Any, ...]) -> Callable[[random.Random], Values]:
+    """Draw one of the values of each name."""
+    return lambda random: {name: random.choice(values) for name, values in choices.items()}
+
+
+def reach(random: random.Random) -> Values:
+    return {"pose": pose(random, HORIZONTAL), "duration": round(random.uniform(1.0, 2.0), 2)}
+
+
+def pose(random: random.Random, farthest: tuple[float, ...]) -> tuple[float, ...]:
+    least = -farthest[0], 0.2, -0.5 * farthest[2], 0.1
+    return tuple(round(random.uniform(*ends), 2) for ends in zip(least, farthest, strict=True))
+
+
+def push(random: random.Random) -> Values:
+    most = (2.0, 4.0, 1.5, 0.5)
+    torque = [round(random.uniform(-limit, limit), 2) for limit in most]
+    return {"torque": torque, "duration": round(random.uniform(0.2, 0.6), 2)}
+
+
+KINDS = {
+    "disable": Kind("operator"),
+    "enable": Kind("operator"),
+    "clear": Kind("operator"),
+    "resume": Kind("operator"),
+    "toggle": Kind("operator", lasting(0.1, 4.0)),
+    "mode": Kind("operator"),
+    "support": Kind("operator", one_of(support=(0.0, 0.3, 0.7))),
+    "max_effort": Kind("operator", one_of(share=(0.2, 0.5)), CLAMPED),
+    "body_mass": Kind("operator", one_of(mass=(50.0, 100.0))),
+    "supply_cut": Kind("hardware", some_motors(0.02, 5.0)),
+    "commands_lost": Kind("hardware", some_motors(0.05, 5.0)),
+    "replies_lost": Kind("hardware", some_motors(0.05, 5.0), REPLIES_LOST),
+    "bus_silent": Kind("hardware", lasting(0.05, 5.0), REPLIES_LOST),
+    "encoder_slip": Kind("hardware", slip),
+    "wrong_speed": Kind("hardware", wrong_speed),
+    "torque_reversed": Kind("hardware", on_joint(), REVERSED),
+    "motor_error": Kind("hardware", on_joint(code=(5, 2))),
+    "motor_warms": Kind("hardware", on_joint(most=(76.0, 90.0)), CLAMPED),
+    "stall": Kind("computer", lasting(0.02, 0.5)),
+    "efforts_late": Kind("computer", lasting(0.05, 2.0)),
+    "efforts_withdrawn": Kind("computer", lasting(0.02, 2.0)),
+    "efforts_nan": Kind("computer", lasting(0.005, 0.1)),
+    "reach": Kind("wearer", reach),
+    "limp": Kind("wearer"),
+    "lap": Kind("wearer", lasting(5.0, 20.0)),
+    "resist": Kind("wearer", lasting(1.0, 5.0)),
+    "spasm": Kind("wearer", one_of(size=(1.0, 2.0))),
+    "push": Kind("wearer", push),
+    "payload_taken": Kind("wearer", one_of(mass=(0.2, 1.0), told=(0.0, 1.0, 2.0))),
+    "payload_dropped": Kind("wearer", bound=LOAD_LOST),
+    "payload_flicked": Kind("wearer", bound=LOAD_LOST),
+    "out_of_cuff": Kind("wearer", bound=LOAD_LOST),
+    "imu_wrong": Kind("imu", one_of(pitch=(-0.52, 0.0, 0.52), roll=(-0.52, 0.52), duration=(0.05, 0.2, 2.0))),
+    "imu_creeps": Kind("imu", one_of(pitch=(-3.1, 1.0, 3.1), roll=(0.0,), duration=(0.2, 0.6))),
+    "imu_frozen": Kind("imu", lasting(0.1, 5.0)),
+    "imu_silent": Kind("imu", lasting(0.05, 2.0)),
+    "trunk_falls": Kind("wearer", one_of(bow=(-0.6, 0.8, 1.4), duration=(0.4, 0.8))),
+    "lean": Kind("wearer", one_of(lean=(-0.5, 0.5), duration=(0.5, 1.0))),
+    REARM: Kind("operator", lasting(0.1, 1.0)),
+}
+AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
+
+
+def draw(seed: int) -> Case:
+    """Return the case of `seed`, always the same one."""
+    source = random.Random(seed)
+    worn = source.random() < 0.5
+    first, second = pair(source)
+    begin = ENABLED if {first, second} & set(AT_POWER_UP) or source.random() < 0.25 else CARRIED
+    longest = 8.0 if begin == ENABLED else 1.0
+    at = source.uniform(0.0, longest)
+    apart = source.choice((span(source, 0.01, 0.5), span(source, 0.1, 6.0)))
+    events = [event(source, first, at), event(source, second, at + apart)]
+    if source.random() < 0.6:
+        events.append(event(source, REARM, at + apart + source.uniform(3.0, 14.0)))
+        if source.random() < 0.3:
+            last = source.choice(("reach", "limp", "push"))
+            events.append(event(source, last, events[-1].time + source.uniform(3.0, 9.0)))
+    payload = source.choice((0.2, 1.0)) if {first, second} & {"payload_dropped", "payload_flicked"} else 0.0
+    rate, farthest = source.choice(RATES), CARRIED_IN_FULL if worn and source.random() < 0.75 else HORIZONTAL
+    in_order = tuple(sorted(events, key=lambda event: event.time))
+    friction = source.choice((0.05, 0.2))
+    return Case(seed, rate, worn, payload, friction, pose(source, farthest), begin, in_order)
+
+
+def pair(random: random.Random) -> tuple[str, str]:
+    """Return two kinds of events, of different groups seven times in eight."""
+    while True:
+        first, second = random.choice(list(KINDS)), random.choice(list(KINDS))
+        if KINDS[first].group != KINDS[second].group or random.random() < 0.125:
+            return first, second
+
+
+def event(random: random.Random, name: str, time: float) -> Event:
+    return Event(0.0 if name in AT_POWER_UP else round(time, 3), name, KINDS[name].draw(random))
+
+
+def bound_of(case: Case, clamped: bool) -> Bound:
+    """Return what a motor may do in this case: the highest bound of its causes.
+
+    clamped: whether the compensator or the bridge had to clamp a torque.
+    """
+    bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
+    if REVERSED in bounds and all(bound in (REVERSED, Bound()) for bound in bounds):
+        return REVERSED
+    return Bound(max(bound.speed for bound in bounds), max(bound.energy for bound in bounds))

@@ -1,0 +1,78 @@
+"""Plays a case, and judges it by the truth of the simulated device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from exo_gravity.core.safety.drive import State
+from exo_gravity.sim.judge import Driven, driven
+
+from .case import CARRIED, Bound, Case, bound_of, draw
+from .events import do
+from .stage import Stage
+
+MOVE, SETTLE = 1.6, 0.8  # s in which the wearer moves the arm to its pose, and then leaves it alone
+START = 30.0  # s within which an arm without a fault is carried
+AFTERWARDS, DESCENT = 5.0, 15.0  # s after the last event, and after the operator has disabled the arm then
+
+
+@dataclass(frozen=True)
+class Played:
+    """What became of a case."""
+
+    case: Case
+    driven: Driven
+    bound: Bound
+    states: tuple[tuple[float, str, str], ...]  #: when the state changed, the state, and the fault's sentence
+    begin: float  #: s, from which the times of the events count
+    error: str = ""  #: an exception of the code under test
+
+    @property
+    def share(self) -> float:
+        """By how much the worst figure uses its bound up; above 1 it is beyond."""
+        speed = self.driven.speed / self.bound.speed
+        return 10.0 if self.error else max(speed, self.driven.energy / self.bound.energy)
+
+
+def play(seed: int) -> Played:
+    """Return what becomes of the case of `seed`."""
+    return play_case(draw(seed))[0]
+
+
+def play_case(case: Case) -> tuple[Played, np.ndarray]:
+    """Return what becomes of `case`, and the records of the truth (sim/truth.py)."""
+    stage = Stage(case)
+    begin, error = 0.0, ""
+    try:
+        begin = _play(stage, case)
+    except Exception as caught:
+        error = f"{type(caught).__name__}: {caught}"
+    stage.arm.bus.close()
+    records = stage.truth.records
+    was_clamped = stage.controller.was_clamped
+    return Played(case, driven(records), bound_of(case, was_clamped), tuple(stage.states), begin, error), records
+
+
+def _play(stage: Stage, case: Case) -> float:
+    stage.run(0.2)
+    if case.begin == CARRIED:
+        stage.between_cycles(stage.safety.enable)
+        stage.run(START, lambda: stage.safety.state is State.ACTIVE)
+        stage.act({"move": list(case.pose), "over": MOVE})
+        stage.run(MOVE + SETTLE)
+    begin = stage.now
+    for event in case.events:
+        stage.clock.later(event.time, partial(do, stage, event.name, event.values))
+    if case.begin != CARRIED:
+        stage.run(0.05)
+        stage.between_cycles(stage.safety.enable)
+    stage.run(case.events[-1].time + AFTERWARDS)
+    stage.between_cycles(stage.safety.disable)
+    off = State.DISABLED, State.FAULT
+    stage.run(DESCENT, lambda: stage.safety.state in off and not stage.device.powered)
+    stage.run(1.0)
+    stage.arm.catch_up()
+    return begin

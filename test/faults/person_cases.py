@@ -1,0 +1,199 @@
+"""Rows of the fault matrix about people and firmware between two mechanisms: each is safe only by an invariant.
+
+Operators whose requests are late, abandoned or made on a wrong picture of the arm; hardware that is connected wrongly;
+motors that hear without being heard, that refuse, or whose own time-out fires; a node that asks for too much.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+
+from ..support.launched_nodes import LaunchedNodes, Parameters, executable
+from .actions import ERROR, NO_ERROR, in_turn, pause, publish, simulator, stamped, wearer
+from .bus_cases import CUT, RELEASE, stays_off
+from .command_cases import stopped_for
+from .fault_case import ALL_JOINTS, FaultCase
+from .rig import Rig
+from .rigs import COMPENSATOR, SignCheckRig, WearerRig, variant
+
+GAP = 4.0  # s for which the bridge stands still
+LAP = [0.1, 0.5, 0.5, 1.3]  # rad
+ELBOW_TURN = 2.0 * math.pi / 6.0  # rad, of the output for one turn of the rotor
+OBSERVED = 4.0  # s
+TIMEOUT = 0.025  # s, of the open drive
+FIRMWARE_FALL = 1.3  # rad/s that a joint gains while its motor's own time-out has taken the torque away
+DIPPED = 0.033  # s after the last command in which the firmware's own step has passed
+CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the joints are
+*SHOULDER, FLEXION, ELBOW = COMPENSATOR["joint_names"]
+SUPPORT = itertools.cycle((1.0, 0.0, math.nan, 50.0, -1.0))
+
+AskingRig = variant(WearerRig, bridge={"start_pose": "confirm"})
+TimeoutRig = variant(Rig, simulator={"firmware": {"timeout": TIMEOUT}})
+ExchangedRig = variant(SignCheckRig, bridge={**SignCheckRig.bridge, "can_id": [1, 2, 4, 3]})
+PermutedRig = variant(Rig, bridge={"joint_names": [*SHOULDER, ELBOW, FLEXION]})
+
+
+class AdaptiveRig(WearerRig):
+    """Zero-G with a support that adapts, and the node `wearer`, which asks for it."""
+
+    compensator: ClassVar[Parameters] = {**WearerRig.compensator, "support": 0.5, "support_adapts": True}
+
+    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
+        bridge = {"rate": self.rate}
+        nodes = self._nodes(without=("simulator",), port=port, can_bridge=bridge, compensator=self.compensator)
+        nodes.wearer = True
+        return [nodes]
+
+
+def ask(rig: Rig, service_type: Any, name: str, request: Any) -> None:
+    """Call a service of the bridge, and do not wait for the answer."""
+    client = rig.probe.node.create_client(service_type, f"/right/can_bridge/{name}")
+    rig.probe.wait_until(client.service_is_ready)
+    client.call_async(request)
+
+
+def switch_off(rig: Rig) -> None:
+    """Let the arm down, and wait until its motors are off."""
+    assert rig.probe.enable(False).success
+    rig.probe.wait_until(lambda: rig.truth.motors_are_off() and rig.probe.state == "disabled")
+
+
+def enable_across_a_gap(rig: Rig) -> float:
+    """Enable the arm while the bridge stands still, which then goes on."""
+    switch_off(rig)
+    start, bridge = time.time(), rig.pid("can_bridge")
+    os.kill(bridge, signal.SIGSTOP)
+    ask(rig, SetBool, "enable", SetBool.Request(data=True))
+    time.sleep(GAP)
+    os.kill(bridge, signal.SIGCONT)
+    time.sleep(OBSERVED)
+    return start
+
+
+def activate_while_deactivating(rig: Rig) -> float:
+    """Deactivate the bridge, and activate it meanwhile without waiting for either answer."""
+    start = time.time()
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+        ask(rig, ChangeState, "change_state", ChangeState.Request(transition=Transition(id=transition)))
+        time.sleep(0.3)
+    rig.probe.wait_until(rig.truth.motors_are_off)
+    time.sleep(OBSERVED)
+    return start
+
+
+def stop_in_the_lap(rig: Rig) -> float:
+    """Press the emergency stop, lay the arm in the lap, release it, clear the fault and enable; the wearer relaxes.
+
+    The elbow's encoder has lost a turn.
+    """
+    start = time.time()
+    CUT(rig)
+    wearer(rig, [{"move": LAP, "over": 20.0}, {"hold": 600.0}])
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    time.sleep(GAP)
+    simulator(fault__encoder_error=[0.0, 0.0, 0.0, -ELBOW_TURN])(rig)
+    RELEASE(rig)
+    time.sleep(1.0)
+    assert rig.probe.trigger("clear_fault").success
+    rig.probe.enable(True)
+    time.sleep(OBSERVED)
+    wearer(rig, [{"hold": 600.0}])
+    time.sleep(OBSERVED)
+    return start
+
+
+def refused_again(rig: Rig) -> None:
+    """Check that clear and enable do not switch on a motor that still reports its error."""
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    start = time.time()
+    assert rig.probe.trigger("clear_fault").success
+    rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
+    rig.probe.enable(True)
+    time.sleep(OBSERVED)
+    assert not rig.truth.since(start)["on"].any(), "a motor was switched on"
+    NO_ERROR(rig)
+
+
+def await_refusal(rig: Rig) -> None:
+    """Wait until the start has failed."""
+    rig.probe.wait_until(lambda: rig.probe.state in ("fault", "disabled"), 30.0)
+
+
+def connect_a_second_arm(rig: Rig) -> float:
+    """Connect another arm to the bus, whose motors have the same IDs; return when."""
+    start = time.time()
+    device = second_device(rig)
+    try:
+        rig.probe.wait_until(lambda: rig.probe.state == "fault", 30.0)
+    finally:
+        device.terminate()
+        device.wait(10.0)
+    return start
+
+
+def second_device(rig: Rig) -> subprocess.Popen[str]:
+    """Start another simulated arm, which hangs, on the bus of the first one."""
+    parameters = yaml.safe_load(rig.nodes[-1].path.read_text())["/right/simulator"]
+    for name in ("imu", "truth"):
+        parameters["ros__parameters"].pop(name, None)
+    path: Path = rig.folder / f"second_device_{time.monotonic_ns()}.yaml"
+    path.write_text(yaml.safe_dump({"/other/simulator": parameters}))
+    command = [executable("simulator"), "--ros-args", "-r", "__ns:=/other", "--params-file", str(path)]
+    return subprocess.Popen(command, text=True, start_new_session=True)
+
+
+def hostile_support(rig: Rig) -> JointState:
+    """Return a request for support that contradicts the one before it."""
+    message: JointState = stamped(rig, JointState(name=["support"], position=[next(SUPPORT)]))
+    return message
+
+
+def muted(*joints: int) -> Callable[[Rig], object]:
+    """Lose the replies of these motors for GAP s; the motors obey."""
+    mute = [joint in joints for joint in ALL_JOINTS]
+    return in_turn(simulator(fault__mute=mute), pause(GAP), simulator(fault__mute=[False] * len(mute)))
+
+
+# fmt: off
+REQUESTS = (
+    FaultCase("enabled while can_bridge stands still for 4 s", enable_across_a_gap, limit=None,
+        outcomes=("disabled", "stopped"), check=stays_off),
+    FaultCase("activate, abandoned while can_bridge deactivates", activate_while_deactivating,
+        outcomes=("disabled", "inactive", "stopped"), ends_rig=True),
+    FaultCase("supply cut, the arm laid in the lap, then clear and enable", stop_in_the_lap, AskingRig,
+        unpowered=ALL_JOINTS, steps_from=0.1, check=stays_off, ends_rig=True),
+    FaultCase("hostile requests for support, Zero-G, 75 kg", in_turn(*[publish(JointState, "/right/support_request",
+        hostile_support)] * 4), AdaptiveRig, limit=None, outcomes=("active",), speed_limit=0.6),
+)
+CONNECTIONS = (
+    FaultCase("CAN IDs of motors 3 and 4 exchanged", await_refusal, ExchangedRig, None, "proving signs",
+        outcomes=("wrong_sign", "sign_unproven", "torque_while_hanging", "disabled"), ends_rig=True),
+    FaultCase("joint names of can_bridge permuted", await_refusal, PermutedRig, None, "checking", ends_rig=True),
+    FaultCase("a second arm with the same IDs on the bus", connect_a_second_arm, limit=None, ends_rig=True,
+        outcomes=("position_jump", "over_speed", "readings_contradict", "torque_not_delivered", "outside_limits")),
+)
+FIRMWARE = (
+    *(FaultCase(f"can_bridge stopped for {milliseconds} ms, motors with a time-out of 25 ms",
+        stopped_for(milliseconds / 1000.0, "can_bridge"), TimeoutRig, None, speed_limit=FIRMWARE_FALL,
+        steps_from=DIPPED) for milliseconds in (40, 60, 75)),
+    FaultCase("all motors mute for 4 s", muted(*ALL_JOINTS), speed_limit=CARELESS, driven_limit=CARELESS,
+        outcomes=("motor_silent",)),
+    FaultCase("motor 2 mute for 4 s", muted(1), outcomes=("motor_silent",), driven_limit=0.6),
+    FaultCase("motor 2 reports an encoder error, then clear and enable", ERROR, clear=lambda rig: None,
+        afterwards=refused_again, outcomes=("motor_error",)),
+)
+# fmt: on
