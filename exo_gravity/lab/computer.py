@@ -36,6 +36,7 @@ CPUS, CLOCKS = "sys/devices/system/cpu", "sys/devices/system/clocksource/clockso
 GROUP = "239.255.0.1"  # of the multicast datagram
 IFF_UP = 1
 LIMITS = "sudo tee -a /etc/security/limits.d/exo_gravity.conf; then log in again"
+LONGEST_QUEUE = 2  # times the frames until a silent motor is noticed: a longer queue lets commands grow old unseen
 UP = "sudo ip link set {0} down; sudo ip link set {0} up type can bitrate {1} restart-ms 100"
 REMEDIES = {  # the command for each finding about the computer
     "kernel": "Ubuntu: sudo pro enable realtime-kernel; Debian: sudo apt install linux-image-rt-amd64",
@@ -232,8 +233,11 @@ def of_interface(name: str, root: Path, bitrate: int, frames: int) -> Iterator[F
         return
     remedy = f"check bit rate, termination and plugs, docs/wiring.md; then {up}"
     yield judged(f"{name}: state", state, wanted, state == wanted, Level.WARNING, remedy)
-    queue, remedy = int(_text(folder / "tx_queue_len") or 0), f"sudo ip link set {name} txqueuelen 1000"
-    yield judged(f"{name}: txqueuelen", f"{queue}", f"{frames}", queue >= frames, Level.WARNING, remedy)
+    queue, remedy = int(_text(folder / "tx_queue_len") or 0), f"sudo ip link set {name} txqueuelen {frames}"
+    fits = frames <= queue <= LONGEST_QUEUE * frames
+    yield judged(
+        f"{name}: txqueuelen", f"{queue}", f"{frames} to {LONGEST_QUEUE * frames}", fits, Level.WARNING, remedy
+    )
     actual, restart = data.get("bittiming", {}).get("bitrate"), data.get("restart_ms", 0)
     found, wanted = f"{actual} bit/s" if actual else "", f"{bitrate} bit/s"
     yield judged(f"{name}: bit rate", found, wanted, actual == bitrate, Level.FAULT, up)

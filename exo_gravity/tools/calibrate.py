@@ -19,8 +19,10 @@ from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.tools.cli import extras, require_ros
 
 if TYPE_CHECKING:
+    from exo_gravity.lab.calibration.live import Person
     from exo_gravity.lab.calibration.result import CalibrationResult
 
+ACCEPTANCE = "acceptance"
 # Module in lab/calibration, and what the command finds.
 COMMANDS = {
     "motors": ("motors", "each joint's motor, direction and zero, found by moving the joints by hand"),
@@ -29,6 +31,7 @@ COMMANDS = {
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
     "wearer": ("tours", "the moments of the wearer's relaxed arm"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
+    ACCEPTANCE: ("", "nothing: a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
 }
 MAX_POSES = 12
 
@@ -41,10 +44,13 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
         option = command.add_argument
         option("--params", required=True, type=Path, metavar="FILE", help="ROS 2 parameter file of the device")
-        option("--output", required=True, type=Path, metavar="NEW.yaml", help="new parameter file to write")
+        option("--output", required=True, type=Path, metavar="NEW.yaml", help="new file to write")
         if name != "imu":
             option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
-        if name == "motors":
+        if name == ACCEPTANCE:
+            option("--mass", type=float, required=True, metavar="KG", help="of the weight that is lifted")
+            option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
+        elif name == "motors":
             option(
                 "--pose", type=float, nargs=4, default=(0.0,) * 4, metavar="DEG",
                 help="joint angles at which zero is measured, if the arm is in a jig (default: 0 0 0 0, it hangs)",
@@ -84,6 +90,8 @@ def _run(options: argparse.Namespace) -> int:
     from exo_gravity.lab.calibration.result import check_output, page_of, write_changes
 
     command: str = options.command
+    if command == ACCEPTANCE:
+        return _accept(options, Person())
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.output, options.record, page):
         check_output(path)
@@ -109,3 +117,13 @@ def _run(options: argparse.Namespace) -> int:
     for refusal in result.refusals:
         print(f"calibrate: not calibrated: {refusal}", file=sys.stderr)
     return 1 if result.refusals else 0
+
+
+def _accept(options: argparse.Namespace, person: "Person") -> int:
+    """Run the bench acceptance; return the exit code."""
+    from exo_gravity.lab.acceptance import Weight, accept_arm
+    from exo_gravity.lab.calibration.result import check_output
+
+    check_output(options.output)
+    arm, weight = configured_arm(options.params, options.side), Weight(options.mass, options.lever)
+    return 0 if accept_arm(options.params, options.output, arm, weight, person) else 1

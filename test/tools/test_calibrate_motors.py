@@ -37,9 +37,12 @@ HANGING = (0.0,) * 4
 UP = [[0.6 * (i == joint) for i in range(4)] for joint in range(4)]  # rad, where the hand moves each joint
 
 
-def params_of(folder: Path, channel: str = "none") -> Path:
-    """Write a parameter file that knows neither IDs nor directions nor zeros; return its path."""
-    bridge = {"joint_names": list(JOINTS), "can": {"interface": "virtual", "channel": channel}}
+def params_of(folder: Path, channel: str = "none", **firmware: object) -> Path:
+    """Write a parameter file that knows neither IDs nor directions nor zeros; return its path.
+
+    firmware: what it knows of the motors' firmware.
+    """
+    bridge = {"joint_names": list(JOINTS), "can": {"interface": "virtual", "channel": channel}, **firmware}
     content = {"/right/can_bridge": bridge, "/right/compensator": {"joint_names": list(JOINTS), "side": "right"}}
     text = yaml.safe_dump({node: {"ros__parameters": values} for node, values in content.items()})
     (folder / "params.yaml").write_text(text, encoding="utf-8")
@@ -105,8 +108,8 @@ class Arm(BusScan):
         else:
             self._move(self.motions.get(request, HANGING), watch)
 
-    def calibrate(self, folder: Path, pose: tuple[float, ...] = HANGING) -> CalibrationResult:
-        arm = configured_arm(params_of(folder), "right")
+    def calibrate(self, folder: Path, pose: tuple[float, ...] = HANGING, **firmware: object) -> CalibrationResult:
+        arm = configured_arm(params_of(folder, **firmware), "right")
         return MotorSearch(self, arm, self.wait, self.said.append, lambda: self._now).result(pose)
 
 
@@ -131,6 +134,12 @@ def test_a_jig_gives_the_zero_at_its_own_angles(tmp_path: Path) -> None:
     result = arm.calibrate(tmp_path, jig)
     assert value(result, "zero") == pytest.approx(arm.zeros, abs=0.001)
     assert "measured at 0 30 0 90 deg" in result.changes[3].note
+
+
+def test_the_zero_of_a_motor_with_another_position_range_is_scaled_by_it(tmp_path: Path) -> None:
+    arm = Arm(3)
+    result = arm.calibrate(tmp_path, position_range=[12.56, 0.0, 12.5, 0.0])
+    assert value(result, "zero") == pytest.approx(arm.zeros * (1.0048, 1.0, 1.0, 1.0), abs=0.001)
 
 
 def test_a_silent_motor_and_a_problem_of_the_bus_are_reported_before_anything_is_asked(tmp_path: Path) -> None:
@@ -179,7 +188,7 @@ def test_an_arm_that_swings_gives_no_zero(tmp_path: Path) -> None:
 def test_a_zero_that_does_not_survive_a_power_up_is_refused(tmp_path: Path) -> None:
     arm = Arm(9)
     arm.power_up = np.radians((0.0, 40.0, 0.0, -60.0)).tolist()
-    assert [refusal.partition(": call")[0] for refusal in arm.calibrate(tmp_path).refusals] == [
+    assert [refusal.partition(": store")[0] for refusal in arm.calibrate(tmp_path).refusals] == [
         "abduction: +40 degrees off after the power-up, +1 rotor turns",
         "elbow: -60 degrees off after the power-up, -1 rotor turns",
     ]
@@ -198,7 +207,7 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
     formats = (MIT_V3, MIT, MIT, MIT_V3)
     specs = [each.ranged(spec) for each, spec in zip(formats, SPECS, strict=True)]
     columns = zip(specs, arm.ids, arm.directions, arm.zeros.tolist(), (1.0,) * 4, formats, strict=True)
-    boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=100.0)) for column in columns]
+    boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=400.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
     with ExitStack() as opened:
         names = channels_of(channel)

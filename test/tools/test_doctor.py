@@ -58,7 +58,7 @@ def computer(tmp_path, monkeypatch):
         files |= {f"{CPU}/cpu0/cpuidle/state{state}/{name}": text for name, text in
                   {"latency": latency, "disable": disabled}.items()}  # fmt: skip
     for name in ("can0", "can1"):
-        files |= {f"sys/class/net/{name}/flags": "0x40041", f"sys/class/net/{name}/tx_queue_len": "1000"}
+        files |= {f"sys/class/net/{name}/flags": "0x40041", f"sys/class/net/{name}/tx_queue_len": "64"}
     for path, content in files.items():
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text(f"{content}\n")
@@ -167,7 +167,8 @@ INTERFACE = {  # what `ip` reports, changes of files, what is bad, its level, an
     "bus off": ({"state": "BUS-OFF"}, {}, "state", Level.FAULT, "up type can bitrate 1000000"),
     "bit rate": ({"bittiming": {"bitrate": 500_000}}, {}, "bit rate", Level.FAULT, "bitrate 1000000"),
     "no restart": ({"restart_ms": 0}, {}, "restart", Level.WARNING, "restart-ms 100"),
-    "short queue": ({}, {"tx_queue_len": "10"}, "txqueuelen", Level.WARNING, "txqueuelen 1000"),
+    "short queue": ({}, {"tx_queue_len": "10"}, "txqueuelen", Level.WARNING, "txqueuelen 50"),
+    "long queue": ({}, {"tx_queue_len": "1000"}, "txqueuelen", Level.WARNING, "txqueuelen 50"),
     "down": ({}, {"flags": "0x40040"}, "state", Level.FAULT, "up"),
 }
 
@@ -220,7 +221,7 @@ def test_a_warning_is_exit_code_1_and_a_fault_2_each_with_its_command(run, compu
     queue = computer / "sys/class/net/can1/tx_queue_len"
     queue.write_text("10\n")
     code, text = run("--params", CONFIG / "exo.yaml")
-    assert code == 1 and "-> sudo ip link set can1 txqueuelen 1000\n" in text
+    assert code == 1 and "-> sudo ip link set can1 txqueuelen 50\n" in text
     code, text = run("--params", CONFIG / "exo.yaml", woken=wakeups(1, 0.06))
     assert code == 2 and "No one may wear an arm" in text
 

@@ -6,13 +6,13 @@ is never sent, so torque never flows; a motor that was left on lowers its joint 
 are not scanned: there, an echoed command could be taken for a reply.
 
 V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on. V1
-and V2 boards in servo mode send the same frames, and are told apart by their rate alone: as delivered 50 a second, where
-a V3 board must be set to 200 at least.
+and V2 boards in servo mode send the same frames. Only their rate tells them apart: 50 a second as delivered, where a V3
+board must be set to 200 at least.
 """
 
 import contextlib
+import math
 import os
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -28,12 +28,12 @@ from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 
-SPEC = next(iter(MOTORS.values()))  # the position range is the same for all
+SPEC = next(iter(MOTORS.values()))  # it scales positions alone, with the usual range
 DAMPED = pack_command(SPEC, 0.0, 0.0, 0.0, DAMPING, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 COMMANDS = 2  # to each ID, in case a frame is lost
-SERVO_RATE = 100.0  # status frames a second below which a board is no V3 board that an arm can use
+SERVO_RATE = 75.0  # status frames a second below which a board is no V3 board that an arm can use
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
 IDS = frozenset(range(1, 256))
 
@@ -104,7 +104,7 @@ class BusScan(contextlib.ExitStack):
         self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
-        self._rates: Counter[int] = Counter()  # Hz of their status frames
+        self._gaps: dict[int, float] = {}  # s, the shortest between two of their status frames
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
         try:
@@ -115,9 +115,12 @@ class BusScan(contextlib.ExitStack):
                 )
             self._port = CanPort(open_bus(*address), clock)
             self.callback(self._port.close)
+            heard_at: dict[int, float] = {}
             for message, kind, answer in self._frames(LISTEN_TIME):
                 if answer and message.is_extended_id:
-                    self._rates[answer.can_id] += 1.0 / LISTEN_TIME  # type: ignore[assignment]
+                    now, last = self._now(), heard_at.get(answer.can_id, -math.inf)
+                    self._gaps[answer.can_id] = min(now - last, self._gaps.get(answer.can_id, math.inf))
+                    heard_at[answer.can_id] = now
                 heard = message.arbitration_id
                 if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                     raise BusError(
@@ -153,11 +156,11 @@ class BusScan(contextlib.ExitStack):
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
-        for can_id, rate in sorted(self._rates.items()):
-            if rate < SERVO_RATE:
+        for can_id, gap in sorted(self._gaps.items()):
+            if (rate := 1.0 / max(gap, 1e-6)) < SERVO_RATE:
                 problems[
-                    f"ID {can_id}: about {rate:.0f} status frames a second: if it is a V1 or V2 board in servo mode, set "
-                    f"it to MIT mode with the vendor's tool; if it is a V3 board, set it to {MAX_STATUS_RATE:g} a second"
+                    f"ID {can_id}: about {rate:.0f} status frames a second: a V1 or V2 board in servo mode, to be "
+                    f"set to MIT mode with the vendor's tool, or a V3 board, to be set to {MAX_STATUS_RATE:g} a second"
                 ] = None
         return tuple(found[can_id] for can_id in sorted(found)), tuple(problems)
 

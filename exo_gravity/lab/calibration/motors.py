@@ -144,8 +144,8 @@ class MotorSearch:
             count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"
             problems = (
                 *problems,
-                f"{count}: check power, plugs, terminators and the bit rate. A V1 or V2 board must be in MIT mode; a V3 "
-                "board must report unasked, not in query-reply mode",
+                f"{count}: check power, plugs, terminators and the bit rate. A V1 or V2 board must be in MIT mode; "
+                "a V3 board must report unasked, not in query-reply mode",
             )
         if problems:
             raise DataError("; ".join(problems))

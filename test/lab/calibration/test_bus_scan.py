@@ -175,6 +175,14 @@ def test_a_v3_board_that_falls_silent_is_missing(wire: Wire) -> None:
         assert sorted(bus.poll((1, 2, 3, 4))) == [1, 2, 4]
 
 
+def test_a_board_in_servo_mode_is_not_taken_for_a_v3_board(wire: Wire) -> None:
+    wire.repeat(frame(0x2903, bytes(8), is_extended_id=True), 0.02)  # as a V1 or V2 board is delivered
+    with scan_of(wire) as bus:
+        (problem,) = bus.scan(range(1, 5))[1]
+    assert problem.startswith("ID 3: about 50 status frames a second: a V1 or V2 board in servo mode")
+    assert problem.endswith("or a V3 board, to be set to 500 a second")
+
+
 def test_a_v3_board_with_an_id_that_no_parameter_can_have_is_reported(wire: Wire) -> None:
     wire.repeat(frame(0x29C8, bytes(8), is_extended_id=True), 0.01)
     with scan_of(wire) as bus:

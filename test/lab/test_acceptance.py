@@ -1,0 +1,115 @@
+"""The bench acceptance, run on the simulated device in virtual time, where its motors can be set up wrongly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.acceptance import STEPS, Bench, Lift, Step, Weight, accept, record
+from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.virtual_arm import VirtualArm
+
+from ..support.simulated_device import SPECS
+
+RATE = 250.0  # Hz
+WEIGHT = Weight(0.6, 0.2)  # on a forearm that the device carries from the beginning
+MOTORS = tuple(JointMotor(spec, can_id) for can_id, spec in enumerate(SPECS, 1))
+LIMITS = Limits(("a", "b", "c", "elbow"))
+NAMES = [step.__name__ for step in STEPS]
+
+
+class Person:
+    """Does what is asked; the loop runs meanwhile."""
+
+    def __init__(self) -> None:
+        self.arm: VirtualArm | None = None
+        self.said: list[str] = []
+        self.forgets_the_supply = False
+
+    def ask(self, request: str, watch: Callable[[], str]) -> None:
+        is_switched = "switch the motors' supply off and on" in request and not self.forgets_the_supply
+        for on in (False, True) if is_switched else (True,):
+            for motor in self.arm.device.motors:
+                motor.unplugged = not on
+            for _ in range(20):
+                self.arm.run(0.05)
+                watch()
+
+
+def loaded_links():
+    """The simulated arm's links with the weight on the last one."""
+    mass, cog = DEFAULT_LINKS.mass.copy(), DEFAULT_LINKS.cog.copy()
+    cog[-1] = (mass[-1] * cog[-1] + WEIGHT.mass * WEIGHT.lever) / (mass[-1] + WEIGHT.mass)
+    mass[-1] += WEIGHT.mass
+    return replace(DEFAULT_LINKS, mass=mass, cog=cog)
+
+
+def acceptance(true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor, ...] = MOTORS, **spoil) -> list[Step]:
+    """Run the acceptance of a device with the motors `true`, which the file takes for `assumed`.
+
+    spoil: attributes of the person, or `temperature` of the first motor.
+    """
+    device = SimulatedDevice(SimulatedArm(ArmConfig(links=loaded_links())), [SimulatedMotor(one) for one in true])
+    person, lift = Person(), Lift(LIMITS, 1.0 / RATE)
+    device.motors[0].temperature = spoil.pop("temperature", 25.0)
+    for motor in device.motors[1:]:
+        motor.temperature = 25.0
+    for name, value in spoil.items():
+        setattr(person, name, value)
+    person.arm = arm = VirtualArm(device, lift, assumed, LIMITS, RATE)
+    bench = Bench(arm.loop, lift, assumed, DEFAULT_LINKS, WEIGHT, arm.run, person.ask, arm.clock)
+    results = accept(bench, person.said.append)
+    assert not device.powered
+    assert len(person.said) == len(results)
+    arm.bus.stop()
+    return results
+
+
+def failed(results: list[Step]) -> str:
+    """The name of the only step that did not pass, which is the last one, '' for none."""
+    assert [result.name for result in results] == NAMES[: len(results)]
+    assert all(result.passed for result in results[:-1])
+    return "" if results[-1].passed else results[-1].name
+
+
+def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
+    results = acceptance()
+    assert failed(results) == "", results[-1].sentence
+    written = json.loads(json.dumps(record(results, "right", is_simulated=True), default=float))
+    assert written["passed"] and written["simulated"] and [step["name"] for step in written["steps"]] == NAMES
+    measured = results[NAMES.index("torque")].measured
+    assert measured["ratio"] == pytest.approx(1.0, abs=0.15)
+    assert not record(results[:-1], "right", is_simulated=False)["passed"]  # a step is missing
+
+
+def test_a_motor_without_the_offset_of_its_temperature_fails_when_cold():
+    assert failed(acceptance(temperature=-15.0)) == "cold"
+
+
+def test_a_supply_that_was_not_switched_proves_no_zero():
+    assert failed(acceptance(forgets_the_supply=True)) == "zero"
+
+
+def test_a_torque_range_that_is_not_the_firmwares_fails_at_the_known_weight():
+    wrong = (*MOTORS[:3], replace(MOTORS[3], spec=replace(MOTORS[3].spec, torque_range=9.0)))
+    results = acceptance(true=wrong)
+    assert failed(results) == "torque"
+    assert "ratio" in results[-1].sentence
+
+
+def test_a_time_out_that_the_file_does_not_know_of_fails():
+    assumed = (*MOTORS[:3], replace(MOTORS[3], timeout=0.2))
+    results = acceptance(assumed=assumed)  # this simulated motor never lets go
+    assert failed(results) == "time_out" and "the motor held; it must let go" in results[-1].sentence
+
+
+def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
+    bench = Bench(None, None, MOTORS, DEFAULT_LINKS, WEIGHT, None, None, None)
+    assert bench.moments == pytest.approx(moments_of(loaded_links()))
