@@ -79,7 +79,8 @@ def _timeout(f: Firmware) -> str:
 
 def _reply(f: Firmware) -> str:
     if not _is_v3(f):
-        return f"{f.reply_length} bytes, with {'the ID 0' if f.reply_to_master else 'its own ID'}"
+        sender = "the ID 0" if f.reply_to_master else "its own ID"
+        return f"{f.reply_length} bytes with {sender}, within {1e6 * f.reply_delay[1]:.0f} us"
     return f"{f.status_rate:g} status frames a second" if f.reports else "none: silent until asked"
 
 

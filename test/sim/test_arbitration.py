@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import can
 import pytest
 
@@ -121,7 +123,13 @@ def test_three_frames_to_a_motor_that_owes_a_reply_collide_8_to_24_times_and_awa
 
 
 def test_replies_of_two_motors_to_the_masters_id_collide_unless_each_is_awaited(wire):
-    wire.play(make_device(FIRMWARES["open_drive"]))
+    late = replace(FIRMWARES["open_drive"], reply_delay=FIRMWARES["ak"].reply_delay)
+    wire.play(make_device(late))
     host = wire.open()
     assert enable(wire, host, is_awaiting=True) == 0
     assert enable(wire, host, is_awaiting=False) > 0
+
+
+def test_replies_that_are_sent_at_once_to_the_masters_id_follow_each_other(wire):
+    wire.play(make_device(FIRMWARES["open_drive"]))
+    assert enable(wire, wire.open(), is_awaiting=False) == 0

@@ -27,6 +27,7 @@ WARM, SHUT_OFF = 2, 4  # bits of its error byte, which reads 2 and then 6
 WARM_ABOVE, SHUT_OFF_AT = 81.0, 120.0  # degC at which it sets them
 ENCODER_ERROR = 5  # MOTOR_ERRORS
 BROADCAST_ID = 0xFF
+REPLY_DELAY = (200e-6, 400e-6)  # s, as measured on AK motors
 _NO_CONSTANTS: Mapping[str, float] = MappingProxyType({})
 
 
@@ -42,6 +43,7 @@ class Firmware:
     #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
     status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
+    reply_delay: tuple[float, float] = REPLY_DELAY  #: s from the end of a command to its reply, at least and at most
     name: str = ""  #: the value of `firmware.variant`
     wire_format: str = ""  #: the only one that it speaks; "" for any
     remembers_off: bool = True  #: a command while off is kept, and ENTER carries it out; otherwise it is ignored
@@ -100,6 +102,7 @@ OPEN_DRIVE = Firmware(
     name="open_drive",
     reply_to_master=True,
     reply_length=7,
+    reply_delay=(20e-6, 30e-6),
     wire_format=MIT.name,
     zero_silence=0.0,
     exit_clears=True,
