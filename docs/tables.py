@@ -1,4 +1,4 @@
-"""Writes the tables of docs/parameters.md, docs/safety.md and docs/topics.md from the declarations in the code.
+"""Writes the tables of docs/parameters.md, motors.md, safety.md and topics.md from the declarations in the code.
 
 `python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -->`. Needs the extra `sim`, not ROS.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import argparse
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
+from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.wire_formats import MIT_V3
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
@@ -23,6 +25,7 @@ from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.calibration.tour import CALIBRATOR
 from exo_gravity.lab.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL
+from exo_gravity.sim.motors.firmware import FIRMWARES, FIRST_SPECIAL, SHUT_OFF_AT, WARM_ABOVE, Firmware
 from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent
@@ -45,6 +48,92 @@ HEAD = ("parameter", "default", "unit", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
+def _is_v3(firmware: Firmware) -> bool:
+    return firmware.wire_format == MIT_V3.name
+
+
+def _command_while_off(f: Firmware) -> str:
+    if _is_v3(f):
+        return "switches the motor on"
+    return "kept for ENTER; replies" if f.remembers_off else "ignored; replies"
+
+
+def _enter(f: Firmware) -> str:
+    if _is_v3(f):
+        return "no such frame"
+    if f.exit_clears:
+        return "carries out a command that came while off; EXIT clears the last one"
+    return "resumes the last command" + ("" if f.remembers_off else " of motor mode")
+
+
+def _set_zero(f: Firmware) -> str:
+    if _is_v3(f):
+        return "no such frame"
+    reply = f"no reply, silent for {f.zero_silence:g} s" if f.zero_silence else "replies at once"
+    return reply + ("" if f.zero_while_on else "; ignored while on")
+
+
+def _timeout(f: Firmware) -> str:
+    return f"{1000.0 * f.timeout:g} ms: torque and gains are 0 at once, until the next command" if f.timeout else "none"
+
+
+def _reply(f: Firmware) -> str:
+    if not _is_v3(f):
+        sender = "the ID 0" if f.reply_to_master else "its own ID"
+        return f"{f.reply_length} bytes with {sender}, within {1e6 * f.reply_delay[1]:.0f} us"
+    return f"{f.status_rate:g} status frames a second" if f.reports else "none: silent until asked"
+
+
+def _special(f: Firmware) -> str:
+    if _is_v3(f):
+        return "none"
+    return "FF x 7 and FC, FD, FE" if f.first_special == FIRST_SPECIAL else "FF x 7 and EE to FE: FB leaves the bus"
+
+
+def _also_obeyed(f: Firmware) -> str:
+    also = [
+        "IDs with the same lowest 7 bits" if f.id_bits < 11 else "",
+        "frames of 1 to 7 bytes" if f.shortest_command == 1 else "",
+        "frames of 1 to 7 bytes and remote frames" if f.shortest_command == 0 else "",
+        "ID 0xFF" if f.obeys_broadcast else "",
+    ]
+    return ", ".join(filter(None, also)) or "nothing"
+
+
+# What docs/motors.md asks of a firmware, the fields that may be assumed, and the answer.
+FIRMWARE_QUESTIONS: tuple[tuple[str, tuple[str, ...], Callable[[Firmware], str]], ...] = (
+    ("a command while off", ("remembers_off",), _command_while_off),
+    ("ENTER", ("remembers_off", "exit_clears"), _enter),
+    ("SET_ZERO", ("zero_silence", "zero_while_on"), _set_zero),
+    (
+        "zero after a power cycle",
+        ("zero_kept",),
+        lambda f: "-" if _is_v3(f) else "the new one" if f.zero_kept else "the old one",
+    ),
+    ("CAN time-out", ("timeout",), _timeout),
+    (
+        "error byte",
+        (),
+        lambda f: f"mask: 2 above {WARM_ABOVE:g} degC, 6 and off at {SHUT_OFF_AT:g}" if f.error_is_mask else "a code",
+    ),
+    (
+        "switching on with an encoder error",
+        ("refuses_encoder_error",),
+        lambda f: "refused, as if nothing were wrong" if f.refuses_encoder_error else "obeyed",
+    ),
+    ("reply or status", ("reports",), _reply),
+    ("position range", (), lambda f: f"{f.position_range} rad" if f.position_range else "that of the wire format"),
+    ("special frames", (), _special),
+    ("also obeyed", ("shortest_command",), _also_obeyed),
+    (
+        "Nm per A of an AK60-6",
+        (),
+        lambda f: f"{f.torque_per_ampere.get('AK60-6', MOTORS['AK60-6'].torque_per_ampere):.4g}" if _is_v3(f) else "-",
+    ),
+    ("after a bus error", ("retransmits",), lambda f: "sends again" if f.retransmits else "the frame is lost"),
+)
+
+
 def parameter_table(params: Sequence[Param]) -> str:
     """Return the Markdown table of one node's parameters."""
     usual, expert = ([p for p in params if p.expert is wanted] for wanted in (False, True))
@@ -60,6 +149,15 @@ def fault_table() -> str:
         named = [limits[name] for name in re.findall(r"`(\w+)`", code.meaning) if name in limits]
         rows.append((f"`{code}`", code.meaning, "; ".join(named)))
     return markdown(("fault", "meaning", "default limit"), rows)
+
+
+def firmware_table() -> str:
+    """Return the Markdown table of what each firmware does; what is not known is marked as the worst case."""
+    rows = []
+    for question, names, answer in FIRMWARE_QUESTIONS:
+        marks = ("; worst case" if firmware.assumed & set(names) else "" for firmware in FIRMWARES.values())
+        rows.append((question, *(f"{answer(f)}{mark}" for f, mark in zip(FIRMWARES.values(), marks, strict=True))))
+    return markdown(("", *(f"`{name}`" for name in FIRMWARES)), rows)
 
 
 def topic_table() -> str:
@@ -94,6 +192,7 @@ def renewed(text: str) -> str:
     """Return a document's text with every table as the code declares it. Raises KeyError for an unknown table."""
     tables = {name: parameter_table(params) for name, params in PARAMETERS.items()} | {
         "faults": fault_table(),
+        "firmwares": firmware_table(),
         "topics": topic_table(),
     }
     return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)

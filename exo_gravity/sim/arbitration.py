@@ -49,12 +49,10 @@ class Later(Protocol):
 
 @dataclass
 class CanController:
-    """One CAN controller."""
+    """One CAN controller. pending: senders, frames and their bits, first in, first out."""
 
     retransmits: bool  #: It sends a frame again after an error, as all do unless they are told not to.
-    pending: deque[tuple[object, can.Message]] = field(
-        default_factory=deque
-    )  #: Senders and frames, first in, first out.
+    pending: deque[tuple[object, can.Message, list[int]]] = field(default_factory=deque)
     tec: int = 0  #: Transmit error counter.
     highest_tec: int = 0
     ready: float = -math.inf  #: s from which it may begin.
@@ -104,7 +102,7 @@ class Arbitration:
         """Let the controller `name` send a frame of `sender` when it can."""
         controller = self._controllers.setdefault(name, CanController(retransmits))
         if self._clock.monotonic() >= controller.off_until:
-            controller.pending.append((sender, message))
+            controller.pending.append((sender, message, frame_bits(message)))
             self._clock.later(0.0, self._begin)
 
     def _begin(self) -> None:
@@ -118,7 +116,7 @@ class Arbitration:
             self._clock.later(min(controller.ready for controller in waiting) - now, self._begin)
             return
         self._is_busy = True
-        streams = [(frame_bits(controller.pending[0][1]), controller) for controller in rivals]
+        streams = [(controller.pending[0][2], controller) for controller in rivals]
         failed: list[CanController] = []
         while (at := _first_difference([bits for bits, _ in streams])) is not None:
             kept = [(bits, controller) for bits, controller in streams if not bits[at]]
@@ -153,7 +151,8 @@ class Arbitration:
             controller.suspend(self._clock.monotonic(), self._bitrate)
         self._is_busy = False
         self._clock.later(0.0, self._begin)
-        self._deliver(*sent[0])
+        sender, message, _ = sent[0]
+        self._deliver(sender, message)
 
     def _become_idle(self) -> None:
         self._is_busy = False

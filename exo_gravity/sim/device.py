@@ -2,8 +2,8 @@
 
 `run` plays it in real time on python-can buses. `advance` and `exchange` play it without a bus, as fast as possible.
 Physics catches up with the clock in steps of 1 ms before a frame is processed, so a motor always replies with the
-present state of the arm. A reply is sent 200 to 400 us after its command, as measured on AK motors. V3 boards send
-status frames on their own timer, only in `run`.
+present state of the arm. A reply is sent as long after its command as its firmware takes. V3 boards send status frames
+on their own timer, only in `run`.
 
 udp_multicast returns every frame to its sender, unmarked; most buses do not. An echo is known as no command: the first
 byte of a reply is its ID.
@@ -30,7 +30,6 @@ from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import Truth
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
-REPLY_DELAY = (200e-6, 400e-6)  # s
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
 IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
 
@@ -179,7 +178,8 @@ class SimulatedDevice:
             self.advance(min(now - last, MAX_CATCH_UP))
             last = now
             for joint, reply in self.replies(*frame, reached[source]) if frame else ():
-                delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
+                delays = self.motors[joint].firmware.reply_delay
+                delay = self._random.uniform(*delays) - min(age, delays[0])
                 heapq.heappush(outbox, (now + delay, joint, reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 _, joint, reply = heapq.heappop(outbox)

@@ -22,7 +22,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
 from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.sim.arbitration import Arbitration
-from exo_gravity.sim.device import REPLY_DELAY, SimulatedDevice
+from exo_gravity.sim.device import SimulatedDevice
 
 TICK = 0.002  # s between two looks at the arm
 
@@ -164,7 +164,8 @@ class Played:
         self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         for joint, reply in self._device.replies(frame_id, bytes(message.data)):
-            self._wire.clock.later(self._random.uniform(*REPLY_DELAY), partial(self._send, joint, reply))
+            delay = self._random.uniform(*self._device.motors[joint].firmware.reply_delay)
+            self._wire.clock.later(delay, partial(self._send, joint, reply))
 
     def catch_up(self) -> None:
         """Let the device's time pass until now."""

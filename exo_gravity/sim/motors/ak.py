@@ -140,9 +140,10 @@ class SimulatedMotor:
         data: of a remote frame, none.
         frame_id: arbitration ID, one of `received_ids`; by default that of a command.
         """
-        if self.unplugged or self.has_left or self.cable or now < self._silent_until:
-            return None
         joint = self.joint
+        is_deaf = self.has_left or (self.cable and not joint.wire_format.replies)
+        if self.unplugged or is_deaf or now < self._silent_until:
+            return None
         own_id = joint.command_id if frame_id is None else self._own_ids[frame_id]
         if own_id == joint.command_id and self.firmware.shortest_command <= len(data) < _FULL_LENGTH:
             data += self._frame[len(data) :]

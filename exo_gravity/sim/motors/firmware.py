@@ -27,12 +27,13 @@ WARM, SHUT_OFF = 2, 4  # bits of its error byte, which reads 2 and then 6
 WARM_ABOVE, SHUT_OFF_AT = 81.0, 120.0  # degC at which it sets them
 ENCODER_ERROR = 5  # MOTOR_ERRORS
 BROADCAST_ID = 0xFF
+REPLY_DELAY = (200e-6, 400e-6)  # s, as measured on AK motors
 _NO_CONSTANTS: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class Firmware:
-    """One firmware. The defaults are those of `ak`. Raises ParameterError."""
+    """One firmware. The defaults are what boards do of which only the frames are known. Raises ParameterError."""
 
     reply_to_master: bool = owned(False, "replies carry ID 0 instead of the motor's own")
     reply_length: int = 8  #: bytes: 6 without temperature and error, 7 without error
@@ -42,6 +43,8 @@ class Firmware:
     #: Standard deviation of one reply.
     current_noise: float = owned(0.0, "noise of the torque in replies, as a share of it", (0.0, 0.5))
     status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
+    reply_delay: tuple[float, float] = REPLY_DELAY  #: s from the end of a command to its reply, at least and at most
+    name: str = ""  #: the value of `firmware.variant`
     wire_format: str = ""  #: the only one that it speaks; "" for any
     remembers_off: bool = True  #: a command while off is kept, and ENTER carries it out; otherwise it is ignored
     exit_clears: bool = False  #: EXIT clears the last command, which ENTER would resume
@@ -71,16 +74,18 @@ class Firmware:
     def check(self, wire_format: WireFormat) -> None:
         """Raise ParameterError if boards of `wire_format` never have this firmware."""
         if self.wire_format not in ("", wire_format.name):
-            own = [name for name, other in FIRMWARES.items() if other.wire_format in ("", wire_format.name)]
-            name = next((name for name, other in FIRMWARES.items() if other.wire_format == self.wire_format), "")
+            own = [other.name for other in FIRMWARES.values() if other.wire_format == wire_format.name]
             expected = f"one of {', '.join(own)} for a motor with wire_format = {wire_format.name}"
-            raise ParameterError("firmware.variant", name, expected)
+            raise ParameterError("firmware.variant", self.name, expected)
 
 
 AK = Firmware(
-    assumed=frozenset(("remembers_off", "exit_clears", "zero_kept", "refuses_encoder_error", "retransmits")),
+    name="ak",
+    wire_format=MIT.name,
+    assumed=frozenset(("remembers_off", "exit_clears", "refuses_encoder_error", "retransmits")),
 )
 VENDOR = Firmware(
+    name="vendor",
     wire_format=MIT.name,
     zero_silence=0.0,
     remembers_off=False,
@@ -89,11 +94,15 @@ VENDOR = Firmware(
     position_range=12.56,
     first_special=QUERY,
     shortest_command=0,
-    assumed=frozenset(("zero_silence", "zero_while_on", "refuses_encoder_error", "timeout", "retransmits")),
+    assumed=frozenset(
+        ("zero_silence", "zero_while_on", "refuses_encoder_error", "timeout", "shortest_command", "retransmits")
+    ),
 )
 OPEN_DRIVE = Firmware(
+    name="open_drive",
     reply_to_master=True,
     reply_length=7,
+    reply_delay=(20e-6, 30e-6),
     wire_format=MIT.name,
     zero_silence=0.0,
     exit_clears=True,
@@ -106,19 +115,20 @@ OPEN_DRIVE = Firmware(
     retransmits=False,
 )
 _V3_ASSUMED = frozenset(("refuses_encoder_error", "retransmits"))
-V3 = Firmware(wire_format=MIT_V3.name, assumed=_V3_ASSUMED | {"timeout"})
+V3 = Firmware(name="v3", wire_format=MIT_V3.name, assumed=_V3_ASSUMED | {"timeout"})
 V3_2 = replace(
     V3,
+    name="v3_2",
     timeout=0.1,
     status_rate=50.0,
     torque_per_ampere=MappingProxyType({"AK60-6": 0.2997}),
     obeys_broadcast=True,
     assumed=_V3_ASSUMED,
 )
-V3_QUERY = replace(V3_2, reports=False, assumed=_V3_ASSUMED | {"reports"})
-FIRMWARES = {"ak": AK, "vendor": VENDOR, "open_drive": OPEN_DRIVE, "v3": V3, "v3_2": V3_2, "v3_query": V3_QUERY}
+V3_QUERY = replace(V3_2, name="v3_query", reports=False, assumed=_V3_ASSUMED | {"reports"})
+FIRMWARES = {firmware.name: firmware for firmware in (AK, VENDOR, OPEN_DRIVE, V3, V3_2, V3_QUERY)}
 
 
 def usual_firmware(wire_format: WireFormat) -> Firmware:
     """Return the firmware of boards of which only the wire format is known."""
-    return V3 if wire_format.name == V3.wire_format else AK
+    return {AK.wire_format: AK, V3.wire_format: V3}.get(wire_format.name, Firmware())
