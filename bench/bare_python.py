@@ -13,7 +13,8 @@ import time
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import NO_MOTOR, Drive
+from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.clock import favour
 
 from .direct_arm import DirectArm, run_paced
@@ -28,12 +29,14 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
     favour(20)
     bus = arm.open()
+    switching = SwitchingOn(bus.replies)
 
     def cycle() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NO_TORQUE
-        bus.exchange(Drive(effort, NO_TORQUE, all_replied, NO_MOTOR, NO_MOTOR), now + REPLY_SHARE * period)
+        send = switching.step() if all_replied else OFF.send
+        bus.exchange(Drive(effort, NO_TORQUE, send, all_replied), now + REPLY_SHARE * period)
 
     try:
         run_paced(period, cycle, stopping)

@@ -23,7 +23,8 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import NO_MOTOR, Drive
+from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine
 
@@ -35,6 +36,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool]) -> threading.Thread:
     """Return the thread that commands the motors and publishes what they reply."""
     bus, newest = arm.open(), {"effort": NO_TORQUE}
+    switching = SwitchingOn(bus.replies)
 
     def on_effort_commands(message: JointState) -> None:
         newest["effort"] = tuple(message.effort)
@@ -44,7 +46,7 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
 
     def cycle() -> None:
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        drive = Drive(newest["effort"], NO_TORQUE, all_replied, NO_MOTOR, NO_MOTOR)
+        drive = Drive(newest["effort"], NO_TORQUE, switching.step() if all_replied else OFF.send, all_replied)
         bus.exchange(drive, time.monotonic() + REPLY_SHARE * period)
         if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)

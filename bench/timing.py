@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import SPECIAL_FRAMES
+from exo_gravity.core.motors.specs import is_special
 
 DISTINCT = 8  # cycles before, from whose answers an answer must differ
 GIVE_UP = 0.1  # s after which an answer is treated as lost
@@ -61,7 +61,7 @@ def split_cycles(frames: dict[str, np.ndarray], motors: Sequence[JointMotor], be
     for i in order:
         joint = joint_of.get(int(frames["id"][i]))
         data = frames["data"][i, : frames["length"][i]].tobytes()
-        if joint is None or data in SPECIAL_FRAMES:
+        if joint is None or is_special(data):
             continue
         is_reply = data[0] == motors[joint].can_id
         if joint == 0 and not is_reply:

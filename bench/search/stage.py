@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Hashable, Callable, Sequence
 from dataclasses import replace
 
 import can
@@ -64,11 +64,13 @@ class LossyWire(Wire):
         self.commands_lost: set[int] = set()
         self.replies_lost: set[int] = set()
 
-    def carry(self, sender: object, message: can.Message) -> None:
+    def carry(
+        self, sender: object, message: can.Message, controller: Hashable = None, retransmits: bool = True
+    ) -> None:
         """Deliver a frame to every end but its sender's, unless it is lost."""
         lost = self.commands_lost if isinstance(sender, VirtualBus) else self.replies_lost
         if message.arbitration_id not in {self._ids[joint] for joint in lost}:
-            super().carry(sender, message)
+            super().carry(sender, message, controller, retransmits)
 
 
 class FailingController:

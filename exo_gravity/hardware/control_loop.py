@@ -11,19 +11,19 @@ last noted drive; without a watchdog, the loop lowers the arm without the state 
 
 import contextlib
 import math
-import operator
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any, Protocol
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
-from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, OFF, Drive, Efforts, FaultCode, State
+from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, OFF, Drive, Efforts, FaultCode, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.monitors import RestTracker, SupplyMonitor
+from exo_gravity.core.safety.monitors import RestTracker
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -33,10 +33,17 @@ SUSPENDED = 1.0  # s; less may be a thread that waited between two looks at a cl
 LONGEST_ABSENCE = 5.0  # s without a sign of the owner, while the arm is carried; its longest request takes 2 s
 HAND_OVER_TIME = 0.5  # s in which a watchdog that takes over has ended this process
 
-# Lowering an arm without the state machine.
-LOWERING_FADE = 10.0  # s in which the torque fades
-REST_TIME = 10.0  # s for which the joints must be at rest
-REPLY_TIMEOUT = 0.1  # s without a reply after which a motor's position is not known
+
+@dataclass(frozen=True)
+class Lowering:
+    """How an arm is lowered without the state machine, in s."""
+
+    fade: float = 10.0  #: in which the torque fades
+    rest: float = 10.0  #: for which the joints must be at rest
+    reply_timeout: float = 0.1  #: without a reply, after which a motor's position is not known
+
+
+LOWERING = Lowering()
 
 
 class Controller(Protocol):
@@ -142,7 +149,7 @@ class ControlLoop:
                 return True
         except BaseException as error:  # whatever happened, the arm must come down
             self.failure = error
-            if self.bus.may_be_powered:  # the watchdog ends this process; without one, the arm is lowered here
+            if self._drive.powered:  # the watchdog ends this process; without one, the arm is lowered here
                 with contextlib.suppress(Exception):
                     if self._hand_over(f"the control loop failed: {type(error).__name__}: {error}"):
                         self._clock.sleep(HAND_OVER_TIME)
@@ -165,9 +172,7 @@ class ControlLoop:
     @property
     def is_off(self) -> bool:
         """Whether the arm is down and its motors have confirmed that they are off."""
-        safety = self.safety
-        is_down = safety.state in (State.DISABLED, State.FAULT) and not safety.is_unreached
-        return is_down and not self.bus.may_be_powered
+        return self.safety.is_off
 
     def trip(self, code: FaultCode, reason: str) -> None:
         """Let the arm down for a fault detected outside the loop."""
@@ -227,6 +232,9 @@ class ControlLoop:
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
+        self.safety.unsent = self.bus.unsent
+        if late := self.bus.late_replies:
+            self.safety.trip(FaultCode.REPLIES_LATE, late, self._now())
         if self.bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self.bus.foreign_commands
             self.safety.trip(FaultCode.FOREIGN_COMMAND, self.bus.foreign_command, self._now())
@@ -259,29 +267,32 @@ class ControlLoop:
 def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     """Lower an arm whose motors receive `drive`, without the state machine; return once each has replied to EXIT.
 
-    The torque fades slowly under full damping. The damping stays until the joints have been at rest for a while: a
-    joint under damping creeps, and would fall if it were switched off before it hangs. While no motor replies the
-    torque is held, and one that then returns without torque stays off. No exception ends this.
+    The torque fades slowly under full damping, also of a motor that does not reply: it may obey. The damping stays
+    until the joints have been at rest for a while: a joint under damping creeps, and would fall if it were switched off
+    before it hangs. No motor is switched on. No exception ends this.
     """
-    clock, faded, is_down = bus.clock, 0.0, False
-    rest, supply = RestTracker(), SupplyMonitor()
-    if any(drive.unsure):
-        supply.suspect(drive.effort)
-    while True:
-        time, joints = clock.monotonic(), tuple(bus.samples)
-        silent = [time - joint.time > REPLY_TIMEOUT for joint in joints]
-        rest.step(time, joints, silent)
-        is_down |= faded >= LOWERING_FADE and not any(silent) and time - rest.since >= REST_TIME
-        if is_down and not bus.may_be_powered:
-            return
-        effort = tuple(max(0.0, 1.0 - faded / LOWERING_FADE) * effort for effort in drive.effort)
-        if all(silent):
-            supply.suspect(effort)
+    clock, start, exits = bus.clock, bus.clock.monotonic(), 0
+    rest = RestTracker()
+    confirmed = [False] * len(drive.effort)
+    while not all(confirmed):
+        now, joints = clock.monotonic(), tuple(bus.samples)
+        silent = [now - joint.time > LOWERING.reply_timeout for joint in joints]
+        rest.step(now, joints, silent)
+        left = max(0.0, 1.0 - (now - start) / LOWERING.fade)
+        is_down = exits or (not left and not any(silent) and now - rest.since >= LOWERING.rest)
+        if is_down:
+            exits += 1
+            send = (Send.EXIT,) * len(joints)
         else:
-            faded += period
-        supply.step(period, joints, silent)
-        unsure = tuple(map(operator.or_, silent, supply.unsure))
-        lowered = Drive(effort, (DAMPING,) * len(effort), True, (False,) * len(effort), unsure)
+            send = tuple(
+                [Send.COMMAND if bus.replies[i] or not silent[i] else Send.NOTHING for i in range(len(joints))]
+            )
+        effort = tuple([left * torque for torque in drive.effort])
         with contextlib.suppress(Exception):
-            bus.exchange(OFF if is_down else lowered, time + period)
-        clock.sleep(max(0.0, time + period - clock.monotonic()))
+            bus.exchange(Drive(effort, (DAMPING,) * len(effort), send, True), now + period)
+        if exits > 1:  # a reply after the second EXIT is none to the command before the first
+            samples = zip(confirmed, bus.samples, strict=True)
+            confirmed = [was or sample.time >= now for was, sample in samples]
+        clock.sleep(max(0.0, now + period - clock.monotonic()))
+    with contextlib.suppress(Exception):
+        bus.exchange(OFF, clock.monotonic() + period)

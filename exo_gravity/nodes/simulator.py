@@ -156,7 +156,7 @@ class Simulator(Node):
     def _apply(self, accepted: tuple[dict[str, Any], TrialScript | None], changed: set[str]) -> None:
         values, script = accepted
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
-        set_faults(self._device, values)
+        set_faults(self._device, values, changed)
         if "trial" in changed:
             self._queued.append((script or IDLE, None))
 

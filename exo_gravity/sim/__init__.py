@@ -14,10 +14,12 @@ if TYPE_CHECKING:
     from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
     from exo_gravity.sim.device import SimulatedDevice
     from exo_gravity.sim.imu import ImuConfig, SimulatedImu
-    from exo_gravity.sim.motor import Firmware, SimulatedMotor
+    from exo_gravity.sim.motors.ak import SimulatedMotor
+    from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
     from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 __all__ = [
+    "FIRMWARES",
     "STEP",
     "ArmConfig",
     "Firmware",
@@ -32,7 +34,8 @@ MODULES = {
     "arm": ("STEP", "ArmConfig", "SimulatedArm"),
     "device": ("SimulatedDevice",),
     "imu": ("ImuConfig", "SimulatedImu"),
-    "motor": ("Firmware", "SimulatedMotor"),
+    "motors.ak": ("SimulatedMotor",),
+    "motors.firmware": ("FIRMWARES", "Firmware"),
     "virtual_wearer": ("VirtualWearer",),
 }
 

@@ -15,7 +15,7 @@ import operator
 import random
 import select
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import can
 
@@ -24,7 +24,7 @@ from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.can.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
-from exo_gravity.sim.motor import SimulatedMotor
+from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
 from exo_gravity.sim.truth import Truth
@@ -57,7 +57,10 @@ class SimulatedDevice:
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0
         self.trunk_motion: TrunkMotion | None = None  #: of the wearer's current step; None if that moves no trunk
-        self._joint_of_id = {can_id: joint for joint, motor in enumerate(motors) for can_id in motor.received_ids}
+        self._joints_of_id: dict[int, list[int]] = {}
+        for joint, motor in enumerate(motors):
+            for can_id in motor.received_ids:
+                self._joints_of_id.setdefault(can_id, []).append(joint)
         self._random = random.Random(0)  # of the delays of replies
         self._steps = 0
         self._clock = 0.0  # s elapsed, of which `time` is the part in whole steps
@@ -66,7 +69,7 @@ class SimulatedDevice:
         self._trunk_step: int | None = None  # the step that `trunk_motion` belongs to
         self._base = TrunkState()  # the arm's base moves like this
         self._frames = [0] * JOINT_COUNT  # received by each motor
-        self._power_returns = math.inf  # simulated s
+        self._power_returns = [math.inf] * len(motors)  # simulated s
 
     @property
     def time(self) -> float:
@@ -88,9 +91,10 @@ class SimulatedDevice:
         """The trunk's tilt and motion."""
         return self._base if self.trunk_motion else TrunkState(self.pitch, self.roll)
 
-    def return_power(self, delay: float) -> None:
-        """Return the power of unplugged motors in `delay` s; they come back switched off."""
-        self._power_returns = self.time + delay
+    def unplug(self, joint: int, duration: float = math.inf) -> None:
+        """Take the power of a motor away for `duration` s; it comes back switched off."""
+        self.motors[joint].unplugged = True
+        self._power_returns[joint] = self.time + duration
 
     def start(self, wearer: VirtualWearer, delay: float = 0.0) -> None:
         """Let `wearer` start the script in `delay` s; replaces any other wearer."""
@@ -111,14 +115,25 @@ class SimulatedDevice:
 
     def exchange(self, can_id: int, data: bytes) -> Frame | None:
         """Pass the frame `data` with arbitration ID `can_id` to the motors; return (ID, data) of the reply, if any."""
-        joint = self._joint_of_id.get(can_id)
-        if joint is None or self.bus_silent or self.cut_off[joint]:
-            return None
-        motor, arm = self.motors[joint], self.arm
-        self._frames[joint] += 1
-        position = arm.positions[joint] + self.encoder_error[joint]
-        reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
-        return None if reply is None or self.mute[joint] else (motor.reply_id, reply)
+        replies = self.replies(can_id, data)
+        return replies[0][1] if replies else None
+
+    def replies(self, can_id: int, data: bytes, among: Collection[int] = range(JOINT_COUNT)) -> list[tuple[int, Frame]]:
+        """Pass a frame to the motors that obey its ID; return those that reply (0..3), each with (ID, data).
+
+        among: the motors (0..3) that the frame reaches.
+        """
+        replies, arm = [], self.arm
+        for joint in self._joints_of_id.get(can_id, ()):
+            if joint not in among or self.bus_silent or self.cut_off[joint]:
+                continue
+            motor = self.motors[joint]
+            self._frames[joint] += 1
+            position = arm.positions[joint] + self.encoder_error[joint]
+            reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
+            if reply is not None and not self.mute[joint]:
+                replies.append((joint, (motor.reply_id, reply)))
+        return replies
 
     def status(self, joint: int) -> Frame | None:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
@@ -141,6 +156,7 @@ class SimulatedDevice:
         """
         bus_of = list(bus) if isinstance(bus, Sequence) else [bus] * JOINT_COUNT
         buses = list(dict.fromkeys(bus_of))
+        reached = {bus: [joint for joint, own in enumerate(bus_of) if own is bus] for bus in buses}
         outbox: list[tuple[float, int, Frame]] = []  # a heap of replies: when due, joint, frame
         last = heard = time.monotonic()
         was_on = False
@@ -162,8 +178,7 @@ class SimulatedDevice:
             self.slip += max(0.0, now - last - MAX_CATCH_UP)
             self.advance(min(now - last, MAX_CATCH_UP))
             last = now
-            joint = self._joint_of_id[frame[0]] if frame else 0
-            if frame and bus_of[joint] is source and (reply := self.exchange(*frame)):
+            for joint, reply in self.replies(*frame, reached[source]) if frame else ():
                 delay = self._random.uniform(*REPLY_DELAY) - min(age, REPLY_DELAY[0])
                 heapq.heappush(outbox, (now + delay, joint, reply))
             while outbox and outbox[0][0] <= time.monotonic():
@@ -190,7 +205,7 @@ class SimulatedDevice:
         if message is None or message.is_error_frame or message.is_fd:
             return None, 0.0
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        if frame_id not in self._joint_of_id or list(message.data[:1]) == [frame_id]:
+        if frame_id not in self._joints_of_id or list(message.data[:1]) == [frame_id]:
             return None, 0.0
         return (frame_id, bytes(message.data)), max(0.0, time.time() - message.timestamp)
 
@@ -220,10 +235,10 @@ class SimulatedDevice:
             self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))
 
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
-        if self.time >= self._power_returns:
-            self._power_returns = math.inf
-            for motor in self.motors:
-                motor.unplugged = False
+        for joint, returns in enumerate(self._power_returns):
+            if self.time >= returns:
+                self._power_returns[joint] = math.inf
+                self.motors[joint].unplugged = False
         at = zip(self.motors, theta, velocity, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         elapsed = self.time - self._script_start

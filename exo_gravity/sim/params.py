@@ -1,18 +1,20 @@
 """The parameters of `simulator`, and the device that they describe."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.arm.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.arm.tilt import SIDES
-from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, motors_of
+from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, JointMotor, motors_of
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param, param_of, params_of
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motor import Firmware, SimulatedMotor
+from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
+from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware, usual_firmware
 from exo_gravity.sim.truth import TruthLog
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
@@ -33,12 +35,43 @@ ROTOR_INERTIA = replace(
     default=[0.0] * JOINT_COUNT,
     description="rotor inertia at the gear's output; 0: that of the motor",
 )
+USUAL = "usual"  # the firmware that a motor's wire format suggests
+OF_VARIANT = -1.0  # the time-out of the variant
+FIRMWARE = (
+    Param(
+        "firmware.variant",
+        [USUAL] * JOINT_COUNT,
+        "what the boards' firmware does, docs/motors.md; usual: ak, or v3",
+        choices=(USUAL, *FIRMWARES),
+        fixed=True,
+    ),
+    Param(
+        "firmware.timeout",
+        OF_VARIANT,
+        "CAN time-out of the motors; 0: none, -1: that of the variant",
+        (-1.0, 60.0),
+        "s",
+        fixed=True,
+    ),
+    Param(
+        "firmware.status_rate",
+        0.0,
+        "status frames of a V3 board; 0: as the variant sends",
+        (0.0, MAX_STATUS_RATE),
+        "1/s",
+        fixed=True,
+    ),
+    param_of(Firmware, "reply_to_master", fixed=True),
+    Param("reply_length", 0, "bytes of a reply, 6 to 8; 0: as the variant sends", (0, 8), fixed=True),
+    param_of(Firmware, "current_noise", fixed=True),
+    *(replace(param, name=f"heat.{param.name}") for param in params_of(Heat, fixed=True)),
+)
 IMU_FIELDS = ("rate", "rotation_trunk_from_imu", "delay")
 _LENGTH, _MASS, _COG = (a.tolist() for a in (DEFAULT_LINKS.length, DEFAULT_LINKS.mass, DEFAULT_LINKS.cog))
 SIMULATOR = (
     Param("side", "right", "which arm; the right arm mirrors the left", choices=SIDES, fixed=True),
     *MOTOR_PARAMETERS,
-    *params_of(Firmware, fixed=True),
+    *FIRMWARE,
     Param("gravity", STANDARD_GRAVITY, "acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2", fixed=True),
     Param("link_length", _LENGTH, "true link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     Param("robot.mass", _MASS, "true link masses", (0.0, MAX_MASS), "kg", fixed=True),
@@ -54,6 +87,8 @@ SIMULATOR = (
     Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
     Param("fault.unplugged", [False] * 4, "motors without power"),
     Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
+    Param("fault.cable", [False] * 4, "V3 boards with their configuration cable plugged in, which ignore commands"),
+    Param("fault.strength", [1.0] * 4, "share of its torque that a motor still gives, and does not report", (0.1, 1.0)),
     Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
     Param("fault.mute", [False] * 4, "motors that obey, but whose replies are lost"),
     Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
@@ -70,8 +105,9 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     given = zip(values[ROTOR_INERTIA.name], joints, strict=True)
     rotors = [inertia or joint.spec.rotor_inertia for inertia, joint in given]
     arm = ArmConfig(links, rotor_inertia=rotors, **{field: values[name] for field, name in ARM_FIELDS.items()})
-    firmware = Firmware(**{param.name: values[param.name] for param in params_of(Firmware)})
-    motors = [SimulatedMotor(joint, firmware) for joint in joints]
+    heat = Heat(**{param.name: values[f"heat.{param.name}"] for param in params_of(Heat)})
+    variants = zip(joints, values["firmware.variant"], strict=True)
+    motors = [SimulatedMotor(joint, firmware_of(joint, variant, values), heat) for joint, variant in variants]
     device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if values["truth"]:
@@ -79,16 +115,40 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     return device
 
 
-def set_faults(device: SimulatedDevice, values: Mapping[str, Any]) -> None:
-    """Set the faults of `device` that parameter values describe."""
+def firmware_of(joint: JointMotor, variant: str, values: Mapping[str, Any]) -> Firmware:
+    """Return the firmware of a motor: that of a variant, as parameter values change it. Raises ParameterError."""
+    firmware = usual_firmware(joint.wire_format) if variant == USUAL else FIRMWARES[variant]
+    timeout = values["firmware.timeout"]
+    return replace(
+        firmware,
+        reply_to_master=values["reply_to_master"] or firmware.reply_to_master,
+        reply_length=values["reply_length"] or firmware.reply_length,
+        current_noise=values["current_noise"],
+        status_rate=values["firmware.status_rate"] or firmware.status_rate,
+        timeout=firmware.timeout if timeout < 0.0 else timeout,
+    )
+
+
+def set_faults(device: SimulatedDevice, values: Mapping[str, Any], changed: Collection[str] | None = None) -> None:
+    """Set the faults of `device` that parameter values describe.
+
+    changed: the parameters that have changed; by default all. A motor's power is cut only by a change that asks for it.
+    """
     device.bus_silent = values["fault.bus_silent"]
     device.cut_off, device.encoder_error = values["fault.cut_off"], values["fault.encoder_error"]
     device.mute = values["fault.mute"]
-    if values["fault.unplugged_time"]:
-        device.return_power(values["fault.unplugged_time"])
-    faults = (values["fault.unplugged"], values["fault.temperature"], values["fault.error"])
-    for motor, unplugged, temperature, error in zip(device.motors, *faults, strict=True):
-        motor.unplugged, motor.temperature, motor.error = unplugged, temperature, error
+    if changed is None or "fault.unplugged" in changed:
+        for joint, unplugged in enumerate(values["fault.unplugged"]):
+            if unplugged:
+                device.unplug(joint, values["fault.unplugged_time"] or math.inf)
+            else:
+                device.motors[joint].unplugged = False
+    if changed is None or "fault.temperature" in changed:
+        for motor, temperature in zip(device.motors, values["fault.temperature"], strict=True):
+            motor.ambient = motor.temperature = temperature
+    faults = (values["fault.error"], values["fault.cable"], values["fault.strength"])
+    for motor, error, cable, strength in zip(device.motors, *faults, strict=True):
+        motor.error, motor.cable, motor.strength = error, cable, strength
 
 
 def imu_of(values: Mapping[str, Any]) -> ImuConfig:

@@ -66,7 +66,7 @@ class VirtualArm:
         wire: Wire | None = None,
         ports: Sequence[CanPort | None] | None = None,
         look: Callable[[], None] | None = None,
-        note: Callable[[Drive, bool], None] = lambda drive, powered: None,
+        note: Callable[[Drive], None] = lambda drive: None,
         hand_over: Callable[[str], bool] = lambda reason: False,
     ) -> None:
         self.device = device

@@ -1,7 +1,8 @@
 """A CAN bus in virtual time, with a simulated device on it: the same frames as in real time, without threads or waits.
 
 Time passes only while a thread waits for a frame or sleeps. Everything that is due meanwhile (replies, status
-frames, frames of other senders) happens then, in order. Sending takes no time.
+frames, frames of other senders) happens then, in order. Sending takes no time, unless the wire has a bit rate: then its
+frames take turns by arbitration, and collide where two senders use one ID (`arbitration`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import itertools
 import math
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import partial
 from typing import Protocol
 
@@ -20,6 +21,7 @@ from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
 from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.sim.arbitration import Arbitration
 from exo_gravity.sim.device import REPLY_DELAY, SimulatedDevice
 
 TICK = 0.002  # s between two looks at the arm
@@ -161,8 +163,8 @@ class Played:
             return
         self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        if reply := self._device.exchange(frame_id, bytes(message.data)):
-            self._wire.clock.later(self._random.uniform(*REPLY_DELAY), partial(self._send, reply))
+        for joint, reply in self._device.replies(frame_id, bytes(message.data)):
+            self._wire.clock.later(self._random.uniform(*REPLY_DELAY), partial(self._send, joint, reply))
 
     def catch_up(self) -> None:
         """Let the device's time pass until now."""
@@ -175,10 +177,11 @@ class Played:
     def _report(self, joint: int) -> None:
         self.catch_up()
         if status := self._device.status(joint):
-            self._send(status)
+            self._send(joint, status)
 
-    def _send(self, frame: Frame) -> None:
-        self._wire.carry(self, message_of(frame))
+    def _send(self, joint: int, frame: Frame) -> None:
+        motor = self._device.motors[joint]
+        self._wire.carry(self, message_of(frame), motor, motor.firmware.retransmits)
 
 
 class Wire:
@@ -186,12 +189,15 @@ class Wire:
 
     clock: by default one of its own, which begins at `start` s.
     echoes: whether it returns each frame to its sender too, unmarked, as udp_multicast.
+    bitrate: bit/s; 0: frames take no time, and none collide.
 
     refusal: what opening it raises, None if it can be opened. opened: how many ends were opened. loss: share of the
     frames that are lost. batch: s between two deliveries of the CAN adapters, 0 if they deliver at once.
     """
 
-    def __init__(self, clock: VirtualClock | None = None, echoes: bool = False, start: float = 100.0) -> None:
+    def __init__(
+        self, clock: VirtualClock | None = None, echoes: bool = False, start: float = 100.0, bitrate: int = 0
+    ) -> None:
         self.clock = clock or VirtualClock(start)
         self.ends: list[End] = []
         self.refusal: Exception | None = None
@@ -201,6 +207,22 @@ class Wire:
         self.broken: set[VirtualBus] = set()
         self.error: Exception = OSError()
         self._echoes = echoes
+        self._arbitration = Arbitration(self.clock, bitrate, self._deliver) if bitrate else None
+
+    @property
+    def collisions(self) -> int:
+        """How often two frames with one ID met."""
+        return self._arbitration.collisions if self._arbitration else 0
+
+    @property
+    def tec(self) -> int:
+        """The highest transmit error counter that an end has had: above 127 it is error passive."""
+        return self._arbitration.tec if self._arbitration else 0
+
+    @property
+    def bus_offs(self) -> int:
+        """How often an end was off the bus."""
+        return self._arbitration.bus_offs if self._arbitration else 0
 
     def open(self, *_: object) -> VirtualBus:
         """Open another end."""
@@ -226,10 +248,22 @@ class Wire:
         """Let another sender send `message` every `period` s; return a function that ends it."""
         return self.clock.every(period, partial(self.carry, None, message))
 
-    def carry(self, sender: object, message: can.Message) -> None:
-        """Deliver a frame to every end but its sender's, unless it is lost."""
+    def carry(
+        self, sender: object, message: can.Message, controller: Hashable = None, retransmits: bool = True
+    ) -> None:
+        """Deliver a frame to every end but its sender's, unless it is lost.
+
+        controller: what sends it, if `sender` is a device with several.
+        retransmits: whether that sends it again after an error.
+        """
         if self.loss and self._random.random() < self.loss:
             return
+        if self._arbitration:
+            self._arbitration.send(controller or sender, sender, message, retransmits)
+        else:
+            self._deliver(sender, message)
+
+    def _deliver(self, sender: object, message: can.Message) -> None:
         for end in tuple(self.ends):
             if end is not sender or (self._echoes and isinstance(end, VirtualBus)):
                 end.deliver(message)

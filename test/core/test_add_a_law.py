@@ -4,11 +4,11 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME, Compensator
-from exo_gravity.core.compensation.guidance import GUIDANCE, RAMP
 from exo_gravity.core.compensation.laws import LAWS
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.guidance import GUIDANCE
 
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 INSIDE, OUTSIDE = (0.1, 0.2, 0.3, 0.4), (0.1, 1.2, 0.3, 0.4)
@@ -40,13 +40,13 @@ def held(compensator, start, theta, seconds):
 
 def test_a_law_of_ones_own_is_a_value_of_the_parameter_and_carries_the_arm():
     settings = settings_of(values_of(COMPENSATOR, {"law": "springs", "use_imu": False}))
-    _, answer = held(Compensator(settings), 1.0, INSIDE, RAMP.time + 0.1)
+    _, answer = held(Compensator(settings), 1.0, INSIDE, 0.1)
     assert answer.effort == pytest.approx([0.5 * angle for angle in INSIDE]) and not answer.fallback
 
 
 def test_where_it_does_not_apply_the_exact_law_carries_the_arm_until_it_does_again():
     compensator = Compensator(Settings("right", ROBOT, "springs", use_imu=False))
-    now, _ = held(compensator, 1.0, INSIDE, RAMP.time + 0.1)
+    now, _ = held(compensator, 1.0, INSIDE, 0.1)
     now, answer = held(compensator, now, OUTSIDE, GUIDANCE.longest)
     assert answer.fallback == "the springs reach to 1 rad"
     exact, _ = compensator.settings.torque(OUTSIDE, compensator.tilt.at(now), exact=True)

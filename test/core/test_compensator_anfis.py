@@ -13,8 +13,8 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.anfis import Anfis, AnfisLaw
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME
-from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety.guidance import GUIDANCE
 
 from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
 
@@ -72,8 +72,8 @@ def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_ch
     run.cycle(2.0)
     run.efforts.clear()
     replaced = wobble(run, 3.0, width, hertz)
-    # The laws differ by up to 2 Nm, which fades over 2 s; the exact law changes by up to 3 Nm/rad along the path.
-    remainders = 2.0 * PERIOD / GUIDANCE.fade_time
+    # The exact law changes by up to 3 Nm/rad along the path.
+    remainders = GUIDANCE.rate * PERIOD
     path = 3.0 * width * 2 * math.pi * hertz * PERIOD
     assert run.largest_step <= 2 * remainders + path
     switches = np.flatnonzero(np.diff(replaced))

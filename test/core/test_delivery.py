@@ -10,7 +10,6 @@ from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, Moto
 from exo_gravity.core.safety.gate import SwitchOnCheck
 
 from ..support.safety_run import LIMITS, PERIOD
-from ..support.simulated_device import drive_of
 
 PEAK = (9.0, 18.0, 9.0, 9.0)
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
@@ -115,15 +114,6 @@ def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
     replies, random = Replies(), np.random.default_rng(1)
     noise = 0.05 * np.maximum(2.0, np.abs(EFFORT))
     assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(10_000))
-
-
-def test_a_silent_motor_applies_what_it_last_replied_to():
-    replies = Replies()
-    replies.take(EFFORT)
-    later = drive_of((0.0,) * 4, (5.0,) * 4)
-    effort, damping = replies.monitor.applied(later, (False, True, False, False))
-    assert effort == (0.0, EFFORT[1], 0.0, 0.0)
-    assert damping == (5.0, 0.0, 5.0, 5.0)
 
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])

@@ -12,21 +12,36 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
 from exo_gravity.core.motors.specs import (
+    ENTER,
+    EXIT,
     MOTORS,
-    SPECIAL_FRAMES,
+    SET_ZERO,
     MotorReply,
+    error_text,
+    is_special,
     pack_command,
     pack_reply,
     unpack_command,
     unpack_reply,
 )
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, FORMATS, MIT, MIT_V3, OTHER, REPLY
+from exo_gravity.core.motors.wire_formats import (
+    BROADCAST_ID,
+    COMMAND,
+    EXTENDED,
+    FORMATS,
+    MALFORMED,
+    MIT,
+    MIT_V3,
+    OTHER,
+    REPLY,
+    SERVO,
+)
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 
@@ -34,7 +49,9 @@ AK60 = MOTORS["AK60-6"]
 V3_AK60, V3_AK80 = MIT_V3.ranged(AK60), MIT_V3.ranged(MOTORS["AK80-9"])
 SPECS = pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
 OF_COMMAND, OF_REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
-SPECIAL_NUDGE = 3  # codes by which the torque is reduced at most if the command would spell a special frame
+# Seven bytes FF and one of EE to FF are special on some firmware: codes by which the torque is then reduced at most.
+SPECIAL_FRAMES = [b"\xff" * 7 + bytes((last,)) for last in range(0xEE, 0x100)]
+SPECIAL_NUDGE = len(SPECIAL_FRAMES)
 LONGEST = 80  # bytes; CAN FD has up to 64
 IDS = frozenset((1, 2, 3, 126))
 
@@ -144,9 +161,9 @@ def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(mo
     try:
         reply = motor.wire_format.unpack_reply(motor.spec, motor.can_id, data)
     except FrameError as error:
-        assert len(data) not in ((6, 8) if is_mit else (8,)) and error.data == data
+        assert len(data) not in ((6, 7, 8) if is_mit else (8,)) and error.data == data
         return
-    assert (reply.temperature is None) == (reply.error is None) == (len(data) == 6)
+    assert (reply.temperature is None) == (reply.error is None) == (len(data) < 8)
     if is_mit:
         assert_within(motor.spec, OF_REPLY, reply[1:4])
     assert all(map(math.isfinite, motor.sample(data, 0.0)[:3]))
@@ -166,12 +183,17 @@ def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(
 
 
 @seeded
-@given(boards(), st.integers(0, 2047) | st.integers(0, 0x2FFF).map(lambda i: i | EXTENDED), st.binary(max_size=64))
-def test_any_frame_is_a_reply_that_can_be_read_or_a_command_or_neither(board, frame_id, data):
+@given(
+    boards(),
+    st.integers(0, 2047) | st.integers(0, 0x2FFF).map(lambda i: i | EXTENDED),
+    st.binary(max_size=64),
+    st.booleans(),
+)
+def test_any_frame_is_a_reply_that_can_be_read_or_a_command_or_neither(board, frame_id, data, is_remote):
     wire_format, spec = board
-    assume((frame_id >= EXTENDED) is (wire_format.first_id >= EXTENDED))
-    kind, can_id = wire_format.classify(frame_id, data, IDS)
-    assert (kind, can_id) == (OTHER, 0) or (kind in (REPLY, COMMAND) and can_id in IDS)
+    kind, can_id = wire_format.classify(frame_id, data, IDS, is_remote)
+    assert (kind, can_id) == (OTHER, 0) or kind in (REPLY, COMMAND, MALFORMED, SERVO)
+    assert can_id in IDS or kind == OTHER or (kind, can_id) == (COMMAND, BROADCAST_ID)
     if kind == REPLY:
         assert all(map(math.isfinite, wire_format.unpack_reply(spec, can_id, data)[1:4]))
 
@@ -231,12 +253,57 @@ def test_the_codes_of_every_field_survive_unpack_and_pack(spec, field, width):
             assert pack_reply(spec, *unpack_reply(spec, reply)) == reply
 
 
-@pytest.mark.parametrize("codes_below_top", [1, 2, 3])
+@pytest.mark.parametrize("codes_below_top", range(20))
 def test_a_command_that_would_spell_a_special_frame_gets_a_slightly_lower_torque(codes_below_top):
-    torque = 15.0 - codes_below_top * 30.0 / 4095
+    code = 30.0 / 4095
+    torque = 15.0 - codes_below_top * code
     data = pack_command(AK60, 12.5, 45.0, 500.0, 5.0, torque)
     assert data not in SPECIAL_FRAMES
-    assert 0.0 <= torque - unpack_command(AK60, data).torque < 0.025
+    lowered = torque - unpack_command(AK60, data).torque
+    assert lowered == pytest.approx(max(0, SPECIAL_NUDGE - codes_below_top) * code, abs=1e-6)
+    for field in range(4):  # one other field below its maximum, and no torque is lowered
+        fields = [12.5, 45.0, 500.0, 5.0]
+        fields[field] *= 0.99
+        assert unpack_command(AK60, pack_command(AK60, *fields, torque)).torque == pytest.approx(torque)
+
+
+def test_every_frame_that_some_firmware_takes_for_another_is_special():
+    assert all(is_special(data) for data in (*SPECIAL_FRAMES, ENTER, EXIT, SET_ZERO))
+    assert not is_special(b"\xff" * 7 + b"\xed") and not is_special(b"\xff" * 6 + b"\xfe\xfc")
+    assert not is_special(ENTER[1:])
+
+
+@pytest.mark.parametrize(
+    ("frame_id", "length", "is_remote"),
+    [(3, 6, False), (3, 1, False), (3, 0, False), (3, 0, True), (0x83, 8, False), (0x703, 1, False), (0x103, 0, True)],
+)
+def test_a_motor_may_obey_short_and_remote_frames_and_ids_whose_lowest_7_bits_are_its_own(frame_id, length, is_remote):
+    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (COMMAND, 3)
+    assert MIT.classify(frame_id + 1, b"\xff" * length, IDS, is_remote) == (OTHER, 0)
+
+
+def test_a_reply_of_another_length_is_malformed_and_a_status_frame_is_no_reply_of_a_v1_board():
+    for length in (1, 5):
+        assert MIT.classify(0, bytes((3,)) + bytes(length - 1), IDS) == (MALFORMED, 3)
+    assert MIT.classify(EXTENDED | 0x2903, bytes(8), IDS) == (SERVO, 3)
+    assert MIT.classify(EXTENDED | 0x2904, bytes(8), IDS) == (OTHER, 0)
+
+
+def test_the_seventh_byte_of_the_open_drive_is_no_temperature():
+    reply = unpack_reply(AK60, pack_reply(AK60, 3, 0.5, 0.0, 0.0) + b"\x4d")
+    assert reply[:2] == (3, pytest.approx(0.5, abs=0.001)) and reply[4:] == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("byte", "text"),
+    [
+        (2, "over-current; as a bit mask: warm, above 81 degC"),
+        (6, "MOSFET over-temperature; as a bit mask: warm, above 81 degC, shut off, above 120 degC"),
+        (9, "unknown; as a bit mask: unknown, unknown"),
+    ],
+)
+def test_an_error_byte_is_printed_with_both_readings(byte, text):
+    assert error_text(byte) == text
 
 
 def test_a_reply_has_any_temperature_of_a_byte_and_no_angle_beyond_its_range():
@@ -272,11 +339,11 @@ def test_a_v3_command_has_the_bytes_worked_out_by_hand():
 
 
 def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
-    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 3 Nm / 7.4 A, -5 degC, error 7
+    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 0.2997 Nm/A, -5 degC, error 7
     data = bytes.fromhex("0384 0348 ff38 fb 07")
     reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
     assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
-    assert reply[3:] == (pytest.approx(-2.0 * 3.0 / 7.4), -5, 7)
+    assert reply[3:] == (pytest.approx(-2.0 * 0.2997), -5, 7)
     assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
     assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
 
@@ -288,8 +355,9 @@ def test_a_v3_board_is_switched_off_by_a_current_of_0_and_obeys_every_control_mo
     for mode in range(16):
         assert MIT_V3.classify(EXTENDED | mode << 8 | 2, bytes(4), IDS) == (COMMAND, 2)
         assert MIT_V3.classify(EXTENDED | mode << 8 | 9, bytes(4), IDS) == (OTHER, 0)
+        assert MIT_V3.classify(EXTENDED | mode << 8 | 0xFF, bytes(4), IDS) == (COMMAND, BROADCAST_ID)
     for length in (0, 7, 9):  # of a status frame
-        assert MIT_V3.classify(MIT_V3.reply_id(1), bytes(length), IDS) == (OTHER, 0)
+        assert MIT_V3.classify(MIT_V3.reply_id(1), bytes(length), IDS) == (MALFORMED, 1)
 
 
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():
@@ -314,3 +382,34 @@ def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():
     with pytest.raises(ParameterError, match=r"torque_range = 15\.0: must be 12 or 0 for an AK60-6 with wire_format"):
         motors_of(parameters(**given))
     assert motors_of(parameters(**{**given, "torque_range": [9.0, 0.0, 0.0, 0.0]}))[0].spec.torque_range == 9.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sentence"),
+    [
+        ("motor_timeout", 0.1, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("motor_timeout", 3.0, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("motor_timeout", math.nan, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
+        ("position_range", 10.0, r"must be 0, the usual one of the motor, or from 12\.4 to 12\.6"),
+        ("torque_per_ampere", 0.3, "must be 0 with wire_format = mit, whose replies carry the torque itself"),
+    ],
+)
+def test_a_value_that_no_firmware_has_is_refused(name, value, sentence):
+    with pytest.raises(ParameterError, match=f"{name} = .*: {sentence}"):
+        motors_of(parameters(**{name: [0.0, value, 0.0, 0.0]}))
+
+
+def test_each_motor_has_the_time_out_and_position_range_of_its_own_firmware():
+    motors = motors_of(parameters(motor_timeout=[0.0, 0.15, 0.5, 0.3], position_range=[12.56, 0.0, 12.5, 12.566]))
+    assert [motor.timeout for motor in motors] == [0.0, 0.15, 0.5, 0.3]
+    assert [motor.spec.position_range for motor in motors] == [12.56, 12.5, 12.5, 12.566]
+    quarter_turn = pack_reply(motors[0].spec, 1, math.pi / 2, 0.0, 0.0)
+    assert motors[0].sample(quarter_turn, 0.0).position == pytest.approx(math.pi / 2, abs=0.001)
+    assert motors[1].sample(quarter_turn, 0.0).position == pytest.approx(math.radians(90.0 - 0.43), abs=0.001)
+
+
+def test_the_torque_of_a_v3_board_is_its_current_times_the_torque_per_ampere_of_its_firmware():
+    given = {"wire_format": ["mit_v3"] * 4, "torque_per_ampere": [0.0, 0.0, 0.45, 0.0]}
+    data = bytes.fromhex("0000 0000 03e8 19 00")  # 10 A
+    efforts = [motor.sample(data, 0.0).effort for motor in motors_of(parameters(**given))]
+    assert efforts == pytest.approx([2.997, 10.0 * 9.0 / 10.3, 4.5, 2.997])

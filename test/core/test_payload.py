@@ -14,12 +14,13 @@ from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
-from exo_gravity.core.compensation.guidance import GUIDANCE, DropWatch
+from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -111,7 +112,7 @@ def test_a_load_that_is_set_live_comes_and_goes_as_a_guided_change():
         assert run.cycle().damped
         first = np.array(run.efforts[-1])
         run.cycle(0.5)
-        assert np.abs(np.array(run.efforts[-1]) - first).max() <= 0.5 * GUIDANCE.max_rate + 1e-6
+        assert np.abs(np.array(run.efforts[-1]) - first).max() <= 0.5 * GUIDANCE.rate + 1e-6
         run.cycle(9.0)
         assert run.efforts[-1] == pytest.approx(gravity_torque(settings_with(payload_mass=mass).arm, THETA))
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from exo_gravity.core.safety.drive import OFF, Fault, FaultCode, State
+from exo_gravity.core.safety.drive import OFF, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import SIGN_PUSH, SWITCH_ON, SignCheck
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
@@ -148,7 +148,7 @@ def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_ref
     assert arm.machine.state is State.FAULT
     assert arm.fault_code == code
     assert arm.machine.fault.reason.startswith("c: ")
-    assert arm.largest_effort[3] == SWITCH_ON.torque
+    assert arm.largest_effort[3] == 0.0
 
 
 def assert_a_wrong_angle_is_refused(arm):
@@ -172,18 +172,32 @@ def test_after_a_fault_that_may_have_moved_them_or_a_jump_while_the_arm_is_off_z
     assert_a_wrong_angle_is_refused(arm)
 
 
-def test_a_motor_that_is_found_off_is_switched_on_again_with_the_torque_that_held_the_arm():
+def test_a_motor_that_is_found_off_is_switched_on_again_once_with_damping_and_without_torque():
     arm = SafetyRun().until_active()
     arm.off.add(1)
-    arm.steps.clear()
     since = arm.now
-    while not any(arm.drive.enter):
+    while Send.ENTER not in arm.drive.send:
         arm.cycle()
     assert arm.now - since <= 0.06
-    assert arm.drive.enter == (False, True, False, False)
+    assert arm.drive.send == (Send.COMMAND, Send.ENTER, Send.COMMAND, Send.COMMAND)
     assert arm.fault_code == "torque_not_delivered"
     assert "b: -4.00 Nm commanded" in arm.machine.fault.reason
-    assert arm.drive.effort[1] < -3.0
+    assert abs(arm.drive.effort[1]) < 0.1
+    arm.changes[1] = {"velocity": 1.0}  # it sinks
+    arm.cycle(0.3)
+    assert arm.drive.damping[1] > 3.0 and arm.drive.effort[1] < -3.0
+    arm.off.add(1)
+    sent = [arm.cycle().drive.send[1] for _ in range(500)]
+    assert Send.ENTER not in sent
+
+
+def test_a_motor_with_an_error_is_not_switched_on_again():
+    arm = SafetyRun().until_active()
+    arm.off.add(1)
+    arm.changes[1] = {"error": 5}
+    sent = [arm.cycle().drive.send[1] for _ in range(2500)]
+    assert Send.ENTER not in sent
+    assert arm.fault_code == "motor_error"
 
 
 def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():

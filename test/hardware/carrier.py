@@ -32,7 +32,7 @@ def main(arm: ArmOnBus, drive: Drive) -> None:
         raise SystemExit(1) from None
     notes = owned.notes
     ports = arm.ports(notes.clock)
-    bus = MotorBus(ports, arm.motors, powered=True, note=notes.note)  # the rig has switched the motors on
+    bus = MotorBus(ports, arm.motors, note=notes.note)  # the rig has switched the motors on
     is_announced = False
     while True:
         end = time.monotonic() + arm.period

@@ -25,7 +25,6 @@ from ..support.simulated_device import joints_of, make_device
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
 CYCLE = 0.004  # s
 POSE = (0.0, 0.4, 0.2, 0.5)  # rad, in which the rated torques carry the arm of 75 kg
-START = 2.2  # s until the bridge carries the arm
 MOVE = 2.0  # s in which a hand brings the arm to its pose
 WEARER = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 Hand = Callable[[float, Sequence[float], Sequence[float]], Sequence[float]]  # s, angles, velocities -> (4,) Nm
@@ -74,10 +73,11 @@ class CompensatedArm(DirectController, VirtualArm):
         DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
         VirtualArm.__init__(self, device, self, joints_of(formats), limits, 1.0 / CYCLE, look=self._look)
         self.person = Person(pose)
-        device.start(self.person, START)
         self.enable()
-        self.run(START + MOVE + 0.5)
-        assert self.safety.state is State.ACTIVE, (self.safety.fault, self.safety.waiting_for)
+        assert self.run_until(lambda: self.safety.state is State.ACTIVE), (self.safety.fault, self.safety.waiting_for)
+        device.start(self.person)
+        self.run(MOVE + 0.5)
+        assert self.safety.state is State.ACTIVE, self.safety.fault
         self.top_speed = 0.0
         self.torques.clear()
 

@@ -135,7 +135,7 @@ class VirtualRig(Rig):
         """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
         self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
         self.notes.clock = self.clock
-        self.notes.note(drive or self.drive, True)
+        self.notes.note(drive or self.drive)
         return let_down(self.arm, ArmNotes([self.notes] * 4), log, lambda: is_wanted)
 
 
@@ -173,18 +173,18 @@ class CarriedArm:
         self, echoes: bool = False, wire_format: WireFormat = MIT, kind: type[VirtualRig] = VirtualRig, **options: Any
     ) -> None:
         self.rig = kind(pose=NO_TORQUE, carried=False, echoes=echoes, wire_format=wire_format)
-        self.drives: list[tuple[Drive, bool]] = []
+        self.drives: list[Drive] = []
         self.controller = Raising(self.rig)
         self._arm = arm = self.rig.loop_with(
             self.controller,
             replace(self.rig.arm.limits, sign_check_torque=0.0),
-            note=lambda *noted: self.drives.append(noted),
+            note=self.drives.append,
             **options,
         )
         self.clock, self.wire, self.bus, self.safety, self.loop = arm.clock, arm.wire, arm.bus, arm.safety, arm.loop
         self.run = arm.run
         arm.enable()
-        self.run_until(lambda: self.safety.fault or self.rig.is_raised)
+        self.run_until(lambda: self.safety.fault or (self.rig.is_raised and self.safety.state is State.ACTIVE))
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self.controller.is_raised = True
         self.rig.top_speed = 0.0

@@ -94,7 +94,7 @@ def test_a_bus_is_asked_for_only_while_someone_waits_for_it(asks):
 
 def test_a_refused_owner_leaves_the_notes_unchanged():
     lock = lock_of("first")
-    lock.notes.note(DRIVE, True)
+    lock.notes.note(DRIVE)
     with pytest.raises(BusError):
         lock_of("second")
     assert (lock.notes.drive, lock.notes.owner) == (DRIVE, "first")
@@ -105,11 +105,11 @@ def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     lock = lock_of("first")
     assert lock.notes.drive == OFF and not lock.problem
     assert stat.S_IMODE(notes_file(CAN0).stat().st_mode) == 0o666  # the next owner may be another user
-    lock.notes.note(DRIVE, True)
+    lock.notes.note(DRIVE)
     lock.release()
     lock = lock_of("second")
     assert lock.notes.drive == DRIVE
-    lock.notes.note(OFF, False)
+    lock.notes.note(OFF)
     lock.release()
     assert not list(lock_folder.iterdir())
 
@@ -229,5 +229,5 @@ def test_a_watchdog_stays_with_an_arm_that_the_next_owner_cannot_reach(monkeypat
 def leave_on(rig: VirtualRig) -> None:
     """Note that the arm of `rig` is carried, and release its bus."""
     lock = BusLock(rig.arm.address, "/right/can_bridge (PID 1)")
-    lock.notes.note(rig.drive, True)
+    lock.notes.note(rig.drive)
     lock.release()

@@ -28,7 +28,7 @@ def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
     arm = CarriedArm()
     assert arm.loop.stop()
     arm.rig.assert_let_down()
-    assert not arm.drives[-1][1]
+    assert not arm.drives[-1].powered
     assert not arm.loop.cycle()
 
 
@@ -55,19 +55,19 @@ def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_agai
 
 def test_a_bus_that_stays_away_is_tried_again_and_the_torque_continues_from_what_the_motors_hold():
     arm = CarriedArm()
-    held = arm.drives[-1][0].effort[1]
+    held = arm.drives[-1].effort[1]
     arm.wire.refusal = BusError("no such device")
     arm.wire.break_down(OSError("no such device"))
     arm.run_until(lambda: arm.safety.is_unreached)
     arm.run(1.0)
     assert arm.rig.motors_on == [True] * 4
     assert not arm.loop.is_off
-    assert arm.drives[-1][1]
+    assert arm.drives[-1].powered
     count = len(arm.drives)
     arm.wire.refusal = None
     arm.run_until(lambda: arm.wire.opened == 2)
     arm.run_until(lambda: len(arm.drives) > count + 10)
-    first = [drive.effort[1] for drive, _ in arm.drives[count:]]
+    first = [drive.effort[1] for drive in arm.drives[count:]]
     assert max(abs(effort - held) for effort in first[:5]) < 0.3
     arm.assert_let_down()
 
@@ -136,7 +136,7 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
         arm.run(1.0)
     assert all(len(message.data) == 8 and message.data[0] < 5 for message in listeners[0].received)  # replies
     assert arm.rig.motors_on == [True] * 4
-    assert arm.drives[-1][1]
+    assert arm.drives[-1].powered
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 

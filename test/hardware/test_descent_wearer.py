@@ -39,7 +39,7 @@ def test_an_arm_that_is_let_down_neither_fights_nor_throws_its_wearer(wearer):
     speed = np.abs(velocity[free:])
     driven = (speed - np.minimum.accumulate(speed))[torque[free:] * velocity[free:] > 0.0]
     assert driven.max(initial=0.0) < MOVED
-    most = [max(abs(drive.effort[joint]) for drive, _ in carried.drives) for joint in range(4)]
+    most = [max(abs(drive.effort[joint]) for drive in carried.drives) for joint in range(4)]
     assert all(np.array(most) <= np.maximum(carried.safety.limits.max_effort, np.abs(carried.rig.carrying)))
     assert arm.positions[1] < POSE[1] + 1.0
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.compensation.guidance import GUIDANCE
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.safety.limits import GUIDE
+from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_time import TICK
 
@@ -102,7 +101,7 @@ def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_els
     arm.run(4.5)
     assert arm.answer.remainder == ()
     of_tenth = np.array(arm.torques)[:: round(0.1 / TICK)]
-    assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * GUIDANCE.max_rate + 2 * CODE
+    assert np.abs(np.diff(of_tenth, axis=0)).max() < 0.1 * GUIDANCE.rate + 2 * CODE
     assert arm.top_speed < 0.1
 
 
@@ -121,4 +120,4 @@ def test_a_wearer_who_moves_on_is_not_stopped():
         assert arm.top_speed < 1.3 * speed + 0.05
         felt[is_damped] = np.array(hand.torques)
     length = min(map(len, felt.values()))
-    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDE.brake + 1.0  # Nm that damping costs
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDANCE.brake + 1.0  # Nm that damping costs

@@ -11,9 +11,9 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT, MotorReply
+from exo_gravity.core.motors.specs import ENTER, EXIT
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import OFF, State
+from exo_gravity.core.safety.drive import OFF, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -21,7 +21,7 @@ from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 from exo_gravity.sim.virtual_time import Wire
 
-from ..support.simulated_device import drive_of, joints_of, make_device
+from ..support.simulated_device import drive_of, joints_of, make_device, sending
 from .rig import CYCLE, LIMITS
 from .test_motor_bus import WEIGHTLESS, now
 from .wires import wire_for_test
@@ -80,14 +80,11 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wi
     sent(other)
     for _ in range(3):
         assert bus.exchange(OFF, now(bus) + 1.0)
+        bus.exchange(sending(Send.EXIT), now(bus) + 1.0)
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
         assert (sample.temperature, sample.error) == (30, 0)
     frames, boards = sent(other), [joint for joint in joints_of(formats) if joint.wire_format is MIT_V3]
-    end = now(bus) + 1.0
-    while now(bus) < end and not all(frames.count(*joint.exit) > 1 for joint in boards):
-        bus.exchange(OFF, now(bus) + 1.0)
-        frames += sent(other)
     for joint in boards:  # a command would switch it on
         received = [frame for frame in frames if frame[0] >= EXTENDED and frame[0] & 0xFF == joint.can_id]
         assert received == list(joint.exit) * len(received)
@@ -98,38 +95,15 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wi
 def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wire, other, start) -> None:
     device, joints = start(MIXED), joints_of(MIXED)
     bus = motor_bus(wire, MIXED)
+    bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
     for _ in range(3):
         assert bus.exchange(ON, now(bus) + 1.0)
     assert [motor.entered for motor in device.motors] == [True] * 4
     assert [sample.effort for sample in bus.samples] == pytest.approx(ON.effort, abs=0.02)
-    assert bus.may_be_powered
     sent(other)
-    bus.exchange(OFF, now(bus) + 1.0)
-    off = sent(other)
-    for joint in joints:
-        assert set(joint.exit) <= set(off)
-    end = now(bus) + 1.0
-    while bus.may_be_powered and now(bus) < end:  # a status may have been on its way
-        assert bus.exchange(OFF, now(bus) + 1.0)
-    assert not bus.may_be_powered and not device.powered
-
-
-def test_a_v3_board_that_still_reports_torque_may_be_powered(wire, other) -> None:
-    bus = motor_bus(wire, V3)
-    bus.exchange(ON, now(bus))
-    bus.exchange(OFF, now(bus))
-
-    def report(torque: float) -> None:
-        for joint in joints_of(V3):
-            data = MIT_V3.pack_reply(joint.spec, MotorReply(joint.can_id, 0.0, 0.0, torque, 30, 0))
-            status_id = MIT_V3.reply_id(joint.can_id) & ID_BITS
-            other.send(can.Message(arbitration_id=status_id, data=data, is_extended_id=True))
-        bus.exchange(OFF, now(bus))
-
-    report(1.0)
-    assert bus.may_be_powered
-    report(0.0)
-    assert not bus.may_be_powered
+    bus.exchange(sending(Send.EXIT), now(bus) + 1.0)
+    assert sent(other) == [frame for joint in joints for frame in joint.exit]
+    assert not device.powered
 
 
 @pytest.mark.parametrize("mode", [0, 1, 5, 8])
@@ -159,11 +133,15 @@ def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wire,
         bus.listen()
 
 
-def test_a_motor_without_a_frame_for_its_zero_refuses_set_zero_for_the_whole_arm(wire, other) -> None:
+def test_a_broadcast_that_v3_boards_obey_is_opposed_at_each_of_them(wire, other) -> None:
     bus = motor_bus(wire, MIXED)
-    with pytest.raises(BusError, match="set_zero: motor 2 has a board without such a frame"):
-        bus.set_zero()
-    assert sent(other) == []
+    bus.exchange(ON, now(bus))
+    sent(other)
+    other.send(can.Message(arbitration_id=0x8FF, data=bytes(8), is_extended_id=True))
+    bus.receive_until(now(bus) + CYCLE)
+    reporting = [joint.command_id for joint in joints_of(MIXED) if not joint.wire_format.replies]
+    assert sorted(frame_id for frame_id, _ in sent(other)) == sorted(reporting)
+    assert bus.foreign_commands == len(reporting) == 2
 
 
 def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other) -> None:
@@ -176,9 +154,8 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
     bus.receive_until(now(bus) + 1.0, lambda: bus.foreign_commands == 2)
     answers = sent(other)
     v3 = joints[1].command_id
-    assert [frame_id for frame_id, _ in answers] == [1, 1, 1, v3, v3]
-    assert answers[1] == (1, ENTER)
-    assert answers[0] == answers[2] and answers[3] == answers[4]  # our commands, under damping
+    assert [frame_id for frame_id, _ in answers] == [1, 1, v3]
+    assert answers[0] == (1, ENTER)  # then our commands, under damping
 
 
 @pytest.mark.parametrize("formats", [(MIT,) * 4, V3], ids=["v2", "v3"])

@@ -13,14 +13,14 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.safety.drive import OFF
+from exo_gravity.core.safety.drive import OFF, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import drive_of, frame
+from ..support.simulated_device import drive_of, frame, sending
 from .wires import wire_for_test
 
 AK60 = MOTORS["AK60-6"]
@@ -77,27 +77,26 @@ def test_every_motor_is_read_in_joint_coordinates(bus, device):
 def test_an_exchange_moves_the_simulated_arm(bus, device):
     before = device.arm.positions[3]
     end = now(bus) + 5.0
+    bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
     while device.arm.positions[3] < before + 0.2 and now(bus) < end:
         bus.exchange(drive_of((0.0, 0.0, 0.0, 2.0)), now(bus) + 1.0)
     assert device.arm.positions[3] > before + 0.2
 
 
-def test_a_zero_torque_command_precedes_switching_on_and_switching_off(bus, other):
-    bus.exchange(ON, now(bus))
-    frames = [data for can_id, data in received(other) if can_id == 1]
-    assert frames.index(ENTER) == 1
-    assert unpack_command(AK60, frames[0]).torque == pytest.approx(0.0, abs=0.004)
-    bus.exchange(OFF, now(bus))
-    frames = [data for can_id, data in received(other) if can_id == 1]
-    assert frames[-1] == EXIT
-    assert unpack_command(AK60, frames[-2]).torque == pytest.approx(0.0, abs=0.004)
+def test_each_motor_gets_the_frames_that_it_is_to_be_sent(bus, other):
+    idle = (1, MOTORS_OF_ARM[0].command(0.0, 0.0))
+    frames = {Send.ENTER: [(1, ENTER)], Send.EXIT: [(1, EXIT)], Send.CLEAR: [(1, ENTER), idle], Send.POLL: [idle]}
+    frames[Send.NOTHING] = []
+    for send, expected in frames.items():
+        bus.exchange(sending(send), now(bus))
+        assert [frame for frame in received(other) if frame[0] == 1] == expected
 
 
-def test_stop_switches_every_motor_off_twice(bus, other):
-    bus.exchange(ON, now(bus))
+def test_stop_sends_an_exit_twice_to_motors_that_were_to_be_off_and_nothing_to_others(bus, other):
+    bus.exchange(ON._replace(send=(Send.COMMAND, Send.EXIT, Send.POLL, Send.NOTHING)), now(bus))
     received(other)
     bus.stop()
-    assert [can_id for can_id, data in received(other) if data == EXIT] == [1, 2, 3, 4, 1, 2, 3, 4]
+    assert [can_id for can_id, data in received(other) if data == EXIT] == [2, 3, 2, 3]
 
 
 def commands(bus: can.BusABC, motor: JointMotor) -> list[MotorCommand]:
@@ -144,13 +143,6 @@ def test_after_a_foreign_set_zero_the_motor_damps_and_does_not_hold(bus, device,
     assert {command.kd for command in answers} == {DAMPING}
 
 
-def test_set_zero_is_refused_while_the_motors_are_on(bus, other):
-    bus.exchange(ON, now(bus))
-    with pytest.raises(BusError, match="motors are on"):
-        bus.set_zero()
-    assert SET_ZERO not in [data for _, data in received(other)]
-
-
 REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
 
 
@@ -159,17 +151,19 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
     [
         (frame(1, MOTORS_OF_ARM[0].command(1.0, 0.0)), "foreign command"),
         (frame(1, ENTER), "foreign command"),
-        (frame(1, b""), "foreign frame"),
+        (frame(1, b""), "foreign command"),
+        (frame(1, ENTER[:6]), "foreign command"),
+        (frame(0x83, ENTER), "foreign command"),  # the open drive compares 7 bits of the ID
+        (frame(0x703, b"\x05"), "foreign command"),
         (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
-        (frame(1, REPLY[:5]), "foreign frame"),
+        (frame(1, REPLY[:5]), "malformed reply"),
+        (frame(0x2901, REPLY, is_extended_id=True), "servo mode"),
         (frame(0, b"\x09" + REPLY[1:]), "foreign frame"),
         (frame(1, REPLY, is_extended_id=True), "foreign frame"),
-        (frame(1, REPLY, is_fd=True), "remote or FD frame"),
-        (
-            can.Message(arbitration_id=1, dlc=8, is_remote_frame=True, is_extended_id=False),
-            "remote or FD frame",
-        ),
+        (frame(1, REPLY, is_fd=True), "FD frame"),
+        (can.Message(arbitration_id=1, dlc=8, is_remote_frame=True, is_extended_id=False), "foreign command"),
+        (can.Message(arbitration_id=9, dlc=8, is_remote_frame=True, is_extended_id=False), "foreign frame"),
         (frame(1, REPLY, is_error_frame=True), "error frame"),
     ],
 )
@@ -181,7 +175,7 @@ def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(bus, other, message,
 
 
 @pytest.mark.parametrize("can_id", [0, 1])
-@pytest.mark.parametrize("length", [6, 8])
+@pytest.mark.parametrize("length", [6, 7, 8])
 def test_a_reply_may_have_the_motors_id_or_the_masters(bus, other, can_id, length):
     other.send(frame(can_id, REPLY[:length]))
     bus.exchange(OFF, now(bus))

@@ -119,8 +119,7 @@ def test_a_bus_that_is_silent_for_a_moment_lets_the_arm_down_and_one_press_carri
     assert arm.top_speed < SPEED
     arm.forget()
     assert arm.safety.resume(arm.clock.monotonic()), arm.safety.why_not_resumed
-    arm.run(2.4)
-    assert arm.safety.state is State.ACTIVE
+    assert arm.run_until(lambda: arm.safety.state is State.ACTIVE, 6.0)
     assert arm.top_speed < SPEED and arm.largest_step < STEP
 
 

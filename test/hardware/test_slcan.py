@@ -15,20 +15,20 @@ import pytest
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.specs import MotorReply
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
-from exo_gravity.core.safety.drive import OFF
+from exo_gravity.core.safety.drive import OFF, Send
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
-from ..support.simulated_device import drive_of, joints_of, make_device
+from ..support.simulated_device import drive_of, joints_of, make_device, sending
 from ..support.waiting import pause, wait_until
 from .test_motor_bus import WEIGHTLESS
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 OPTIONS = {"bitrate": 1_000_000, "sleep_after_open": 0.01, "timeout": 0.0002}
 POSE = (0.1, 0.2, 0.3, 0.4)
-FIRST_FRAMES = 6  # to motors that are off: EXIT for each, and a command for those that reply to one
+FIRST_FRAMES = 2  # to motors that are off: a command for those that reply to one
 ON = drive_of((0.0, 0.5, 0.4, 0.0))
 CHANNELS = itertools.count()
 
@@ -76,6 +76,7 @@ def motors(adapter: FakeSlcan, tmp_path: Path) -> Iterator[MotorBus]:
 
 
 def test_frames_with_11_and_29_bit_ids_pass_the_adapter_both_ways(adapter, device, motors) -> None:
+    motors.exchange(sending(Send.ENTER), in_1_s())
     assert motors.exchange(ON, in_1_s())
     assert motors.exchange(ON, in_1_s())
     assert [sample.position for sample in motors.samples] == pytest.approx(POSE, abs=0.01)
@@ -86,6 +87,7 @@ def test_frames_with_11_and_29_bit_ids_pass_the_adapter_both_ways(adapter, devic
 
 
 def test_after_the_adapter_was_unplugged_and_plugged_in_again_the_motors_are_reached(adapter, device, motors) -> None:
+    motors.exchange(sending(Send.ENTER), in_1_s())
     assert motors.exchange(ON, in_1_s())
     adapter.unplug()
     errors = [""]
@@ -99,11 +101,10 @@ def test_after_the_adapter_was_unplugged_and_plugged_in_again_the_motors_are_rea
 
     def switch_off() -> None:
         with contextlib.suppress(BusError):
-            motors.exchange(OFF, in_1_s())
+            motors.exchange(sending(Send.EXIT), in_1_s())
         pause()
 
-    wait_until(lambda: not motors.may_be_powered, switch_off)
-    assert not device.powered
+    wait_until(lambda: not device.powered, switch_off)
 
 
 @pytest.mark.parametrize("acknowledges", [True, False])

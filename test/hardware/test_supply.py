@@ -80,14 +80,15 @@ def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
     arm = CarriedArm(wire_format=wire_format)
     arm.rig.device.bus_silent = True
-    arm.run(8.0)
+    arm.run(14.0)
     assert arm.safety.state is State.FAULT and arm.safety.is_unreached
     assert arm.rig.motors_on == [True] * 4
     arm.rig.device.bus_silent = False
     arm.run(0.1)
     assert arm.safety.state is State.LETTING_DOWN
     arm.assert_let_down()
-    assert arm.rig.top_speed < CAUSED_SPEED
+    # Motors of V1 and V2 boards drop what they held at the first command that they hear, under damping.
+    assert arm.rig.top_speed < (CAUSED_SPEED if wire_format is MIT_V3 else SAFE_SPEED)
 
 
 def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others() -> None:

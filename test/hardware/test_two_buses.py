@@ -12,12 +12,13 @@ from typing import Any
 import can
 import pytest
 
-from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import channels_of
 from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import OFF, FaultCode, State
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.safety.power import Power
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
@@ -104,7 +105,7 @@ def test_an_arm_on_two_buses_is_carried_and_each_motor_is_commanded_on_its_own(w
 def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awaited() -> None:
     """The replies take 0.2 to 0.4 ms on each bus: awaited one after the other they take longer than together."""
     rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, powered=True, clock=rig.clock)
+    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
     rig.first.batch = rig.second.batch = 0.003  # the adapters deliver both together
     for _ in range(20):
         start = rig.clock.monotonic()
@@ -148,20 +149,18 @@ def test_a_bus_that_fails_does_not_keep_the_other_from_its_commands() -> None:
 
 
 def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_for_off() -> None:
-    """The first bus replies to zero commands as motors do that are still on: that confirms no EXIT."""
-    rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, powered=True, clock=rig.clock)
-    bus.exchange(drive_of(NO_TORQUE), rig.clock.monotonic() + CYCLE)
+    arm = carried()
+    rig = halves(arm)
+    arm.safety.disable(arm.clock.monotonic())
+    arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
+    rig.second.refusal = BusError("no such device")
     rig.second.break_down(can.CanOperationError("Network is down"))
-    for _ in range(3):
-        with pytest.raises(BusError, match="Network is down"):
-            bus.exchange(OFF, rig.clock.monotonic() + CYCLE)
-    assert bus.may_be_powered and rig.motors_on[2:] == [True, True]
+    arm.run(0.5)
+    assert not arm.loop.is_off
+    rig.second.refusal = None
     rig.second.broken = set()
-    for _ in range(10):
-        bus.exchange(OFF, rig.clock.monotonic() + CYCLE)
-        rig.clock.sleep(CYCLE)
-    assert rig.motors_on == [False] * 4 and not bus.may_be_powered
+    arm.run_until(lambda: arm.loop.is_off)
+    assert rig.motors_on == [False] * 4
 
 
 def test_motors_that_all_lost_their_supply_stay_off_and_those_of_one_bus_are_held_again() -> None:
@@ -177,7 +176,7 @@ def test_motors_that_all_lost_their_supply_stay_off_and_those_of_one_bus_are_hel
 
 def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -> None:
     rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, powered=True, clock=rig.clock)
+    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
     command = message_of((3, rig.motors[2].command(1.0, 0.0)))
     rig.first.carry(None, command)
     bus.receive_until(rig.clock.monotonic() + CYCLE)
@@ -192,7 +191,7 @@ def notes_of(rig: VirtualRig) -> tuple[DriveNotes, DriveNotes]:
     notes = tuple(DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes))) for _ in range(2))
     for page in notes:
         page.clock = rig.clock
-        page.note(rig.drive, True)
+        page.note(rig.drive)
     return notes[0], notes[1]
 
 
@@ -207,7 +206,7 @@ def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
             rig.device.exchange(*frame)
     near, far = notes_of(rig)
     for page in (near, far):
-        page.note(drive_of(carrying), True)
+        page.note(drive_of(carrying))
     damped: list[float] = []
     rig.clock.later(0.15, lambda: damped.extend(rig.damping))
     on: list[tuple[bool, bool]] = []
@@ -290,7 +289,7 @@ def leave_on(rig: TwoBusRig) -> None:
     for part in rig.arm.parts:
         lock = BusLock(part.address, "a dead bridge")
         own = [torque if joint in part.joints else 7.0 for joint, torque in enumerate(rig.carrying)]
-        lock.notes.note(drive_of(own), True)
+        lock.notes.note(drive_of(own))
         lock.release()
 
 

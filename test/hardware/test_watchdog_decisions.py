@@ -60,7 +60,7 @@ class Bridge:
         self.log: list[str] = []
         self.inhibited: list[bool] = []
         self.drive = self.rig.drive
-        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive, self.drive.powered))
+        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive))
         self.listener = Responder(self.rig.wire)
 
     def kill(self) -> None:
@@ -109,7 +109,7 @@ def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_brid
     assert asked < bridge.clock.monotonic() < asked + 0.5
     assert bridge.notes.drive.powered
     lock = BusLock(bridge.rig.arm.address, "left behind")
-    lock.notes.note(bridge.notes.drive, bridge.notes.drive.powered)
+    lock.notes.note(bridge.notes.drive)
     lock.release()
     bridge.clock.later(2.0, lambda: setattr(bridge.rig.device, "bus_silent", False))
     OwnedBus(bridge.rig.arm, "the next bridge", bridge.log.append, bridge.clock).close()

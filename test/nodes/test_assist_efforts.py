@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.compensation import guidance
+from exo_gravity.core.safety import guidance
 from exo_gravity.hardware.network import keep_to_this_machine
 
 from ..support.compensator_rig import CompensatorRig
@@ -64,7 +64,7 @@ class Rig(CompensatorRig):
 def running() -> Iterator[Rig]:
     """A node that changes its load sooner than a wearer may feel, which test_compensator.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, fade_time=0.2))
+        patch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, time=0.2))
         rig = Rig()
         yield rig
         rig.close()

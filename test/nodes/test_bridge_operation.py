@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
 from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
@@ -31,15 +32,19 @@ from ..hardware.rig import CarriedArm
 from ..support.waiting import wait_until
 
 NAMES = ("a", "b", "c", "elbow")
+MOTORS_OF_ARM = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
 
 
-def carrying(effort, cycles=0):
+def carrying(effort, cycles=0, temperature=40):
     """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
     safety = SafetyMachine(Limits(NAMES), 0.004)
     safety.state = State.ACTIVE
     samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
+    boards = Boards(MOTORS_OF_ARM)
+    for joint, sample in enumerate(samples):
+        boards.take(joint, sample if joint else sample._replace(temperature=temperature))
     counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
-    bus = SimpleNamespace(ignored={})
+    bus = SimpleNamespace(ignored={}, boards=boards)
     return SimpleNamespace(safety=safety, samples=samples, bus=bus, failure=None, cycles=cycles, **counts)
 
 
@@ -54,8 +59,7 @@ def sent(node, monkeypatch):
     monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
 
     def sent(loop, count, answered=None):
-        motors = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
-        arm = ArmOnBus(("virtual", "arm", {}), motors, Limits(NAMES), 0.004)
+        arm = ArmOnBus(("virtual", "arm", {}), MOTORS_OF_ARM, Limits(NAMES), 0.004)
         report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
         for n in range(count):
             report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), "none")
@@ -79,6 +83,13 @@ def test_a_loop_below_its_rate_is_reported(sent):
     assert sent(lambda n: carrying(1.0, 20 * n), 30)[-1][:2] == (WARN, "active, slower than 225 Hz")
 
 
+def test_a_motor_that_did_not_read_room_temperature_when_it_was_switched_on_is_reported(sent):
+    assert sent(lambda n: carrying(1.0, 25 * n), 30)[-1][2]["temperatures when switched on"] == "plausible"
+    level, message, values = sent(lambda n: carrying(1.0, 25 * n, temperature=-15), 30)[-1]
+    assert level == WARN and "motor 1 read -15 degC when it was switched on, the others 40 to 40" in message
+    assert values["temperatures when switched on"] == "implausible"
+
+
 def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
     def riding(n):
         loop = carrying(1.0, 25 * n)
@@ -97,8 +108,8 @@ def ask(node):
 
     def ask(service, loop, data=None, zero=0.0):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        services = BridgeServices(node, lambda: loop, motors)
-        response = services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace())
+        services = BridgeServices(node, lambda: loop, motors, lambda: "")
+        response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
         if response.success:
             assert ("/diagnostics" in response.message) is (loop.safety.state is State.CHECKING)
             return ""
@@ -107,9 +118,18 @@ def ask(node):
     return ask
 
 
+def finish(callback):
+    """Let a service's callback run to its end; return its response."""
+    while True:
+        try:
+            callback.send(None)
+        except StopIteration as end:
+            return end.value
+
+
 def standing():
-    """A control loop whose arm is off and at rest, and which runs a call at once. zeroed: times that zero was set."""
-    loop = SimpleNamespace(safety=SafetyMachine(Limits(NAMES), 0.004), zeroed=0)
+    """A control loop whose arm is off and at rest, and which runs a call at once."""
+    loop = SimpleNamespace(safety=SafetyMachine(Limits(NAMES), 0.004))
     loop.samples = (JointSample(0.0, 0.0, 0.0, 40, 0, math.inf),) * 4
 
     def call(function):
@@ -117,10 +137,7 @@ def standing():
         future.set_result(function())
         return future
 
-    def set_zero():
-        loop.zeroed += 1
-
-    loop.call, loop.bus = call, SimpleNamespace(set_zero=set_zero)
+    loop.call = call
     loop.safety.step(0.0, loop.samples, NO_EFFORTS)
     return loop
 
@@ -147,19 +164,12 @@ def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
     assert (loop.safety.state, loop.safety.fault) == (State.CHECKING, None)
 
 
-def test_the_zero_is_set_only_for_an_arm_that_is_off_at_rest_and_replies(ask, monkeypatch):
+def test_set_zero_is_refused_with_the_zeros_to_write_in_the_file(ask):
     loop = standing()
-    assert "must be all 0" in ask("set_zero", loop, zero=0.1)
-    assert ask("set_zero", loop) == ""
-    loop.safety.enable(0.0)
-    assert ask("set_zero", loop).startswith("refused: the arm is checking")
-    loop.safety.disable(0.0)
-    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(time=-math.inf))
-    assert ask("set_zero", loop).startswith("refused: the arm is disabled")
-    assert loop.zeroed == 1
-    monkeypatch.setattr(operation, "ZERO_TIMEOUT", 0.0)
-    loop.samples = (*loop.samples[:3], JointSample(0.5, 0.0, 0.0, 40, 0, math.inf))
-    assert "elbow at 0.500 rad" in ask("set_zero", loop)
+    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(position=-0.25))
+    assert "write zero: [0.1000, 0.1000, 0.1000, -0.1500] for can_bridge" in ask("set_zero", loop, zero=0.1)
+    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(position=math.nan))
+    assert ask("set_zero", loop).endswith("write zero: in the file, once all reply")
 
 
 def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):

@@ -16,8 +16,9 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation import compensator, guidance
+from exo_gravity.core.compensation import guidance
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.safety import guidance as guided
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
@@ -91,9 +92,8 @@ class Rig(CompensatorRig):
 def quick() -> Iterator[None]:
     """Shorter ramps and fades, which test_limiter.py times."""
     with pytest.MonkeyPatch.context() as patch:
-        short = replace(guidance.RAMP, time=0.2, last_fade=0.4)
-        patch.setattr(guidance, "RAMP", short)
-        patch.setattr(compensator, "RAMP", short)
+        patch.setattr(guided, "GUIDANCE", replace(guided.GUIDANCE, time=0.2, rate=100.0))
+        patch.setattr(guidance, "LAST_FADE", 0.4)
         yield
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import yaml
 
-from exo_gravity.core.motors.specs import MOTORS, SPECIAL_FRAMES, unpack_command
+from exo_gravity.core.motors.specs import MOTORS, is_special, unpack_command
 
 from ..faults.live_arm import resident
 from ..support.bus_listener import CAN_IDS, BusListener, Frame
@@ -55,7 +55,7 @@ def first_fading(frames: list[Frame], since: float) -> float:
     """Return the time of the first frame with damping. Raises ValueError unless it comes after `since`."""
     for frame in frames:
         is_ours = frame.can_id in CAN_IDS and frame.data[0] in COMMANDS  # a reply carries the motor's ID as well
-        if not is_ours or frame.data in SPECIAL_FRAMES:
+        if not is_ours or is_special(frame.data):
             continue
         if unpack_command(SPECS[frame.can_id - 1], frame.data).kd > 0.0:
             if frame.time < since:

@@ -9,7 +9,7 @@ from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor
 from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.safety.drive import NO_EFFORTS, OFF, State
+from exo_gravity.core.safety.drive import NO_EFFORTS, Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -58,15 +58,15 @@ class Lowered:
         self.machine.take_over(self.holding.tolist(), (0.0,) * 4, 0.0)
         while self._now < 60.0:
             drive = self.machine.step(self._now, tuple(self._samples), NO_EFFORTS)
-            if drive == OFF:
+            if self.machine.is_off:
                 break
-            self.switched_on_again = self.switched_on_again or any(drive.enter)
-            for motor, effort, damping in zip(self.motors, drive.effort, drive.damping, strict=True):
-                self._take(motor, self.device.exchange(motor.can_id, motor.command(effort, damping)))
+            self.switched_on_again = self.switched_on_again or Send.ENTER in drive.send
+            for motor, effort, damping, send in zip(self.motors, *drive[:3], strict=True):
+                data = EXIT if send is Send.EXIT else motor.command(effort, damping)
+                self._take(motor, self.device.exchange(motor.can_id, data))
             self.top_speed = max(self.top_speed, self._advance(1.0 / RATE))
             self._track.append((self._now, *self.arm.positions))
-        for motor in self.motors:
-            self.device.exchange(motor.can_id, EXIT)
+        assert not self.device.powered
         self.switched_off = self._now
         track = np.array(self._track)[:, 2:]  # joint 1 turns about the vertical: it has no ground
         far = np.flatnonzero(np.abs(track - np.array(self.arm.positions[1:])).max(axis=1) > 0.2)

@@ -206,4 +206,4 @@ def test_a_motor_that_is_plugged_in_again_keeps_only_its_zero():
 
 def test_an_impossible_length_of_replies_is_rejected_by_name():
     with pytest.raises(ParameterError, match="reply_length"):
-        Firmware(reply_length=7)
+        Firmware(reply_length=5)

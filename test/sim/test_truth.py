@@ -83,8 +83,7 @@ def test_what_was_written_survives_a_kill(tmp_path):
 
 def test_a_motor_that_loses_power_for_30_ms_comes_back_switched_off(device):
     device.exchange(2, ENTER)
-    device.motors[1].unplugged = True
-    device.return_power(0.03)
+    device.unplug(1, 0.03)
     device.advance(0.02)
     assert device.exchange(2, JOINTS[1].command(0.0, 0.0)) is None
     device.advance(0.02)

@@ -47,7 +47,7 @@ def test_its_exit_frame_switches_it_off_and_a_current_drives_it():
     assert not motor.entered and motor.torque(0.5, 3.0) == 0.0
     assert reported(motor).effort == 0.0
     motor.receive((2000).to_bytes(4, "big", signed=True), 0.5, 0.0, 0.0, CURRENT_ID)
-    assert motor.torque(0.5, 0.0) == pytest.approx(-0.8 * 2.0 * 3.0 / 7.4)
+    assert motor.torque(0.5, 0.0) == pytest.approx(-0.8 * 2.0 * 0.2997)
 
 
 def test_without_power_it_reports_nothing_and_forgets_its_command():

@@ -49,7 +49,9 @@ class SwappedFormat(WireFormat):
         values = unpack_fields(spec, int.from_bytes(data, "big"), *ORDER)
         return MotorCommand(**dict(zip(ORDER, values, strict=True)))
 
-    def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
+    def classify(
+        self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int], is_remote: bool = False
+    ) -> tuple[str, int]:
         if frame_id in motor_ids:
             return COMMAND, frame_id
         motor_id = frame_id - 0x200

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
-from exo_gravity.core.safety.drive import OFF, Efforts, State
+from exo_gravity.core.safety.drive import OFF, Efforts, Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 
@@ -50,6 +50,7 @@ class SafetyRun:
         self.drive = OFF
         self.applied = [0.0] * 4
         self.steps: list[float] = []
+        self._is_proving = False
 
     def cycle(self, seconds: float = PERIOD) -> SafetyRun:
         """Run the machine for `seconds`, at least one cycle."""
@@ -60,15 +61,18 @@ class SafetyRun:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
-            before = list(self.applied)
+            before, was_proving = list(self.applied), self._is_proving
             efforts = Efforts(self.effort, self.now - self.effort_age, self.damped, self.held)
             self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
             for i in range(4):
                 if i not in self.silent:
-                    self.applied[i] = self.drive.effort[i]
-                if self.drive.enter[i]:
+                    self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
+                if self.drive.send[i] is Send.ENTER:
                     self.off.discard(i)
-            self.steps.append(max(abs(a - b) for a, b in zip(self.applied, before, strict=True)))
+            self._is_proving = self.machine.state is State.PROVING
+            if not was_proving:  # its small pushes end at once
+                own = [i for i in range(4) if i not in self.off]
+                self.steps.append(max([abs(self.applied[i] - before[i]) for i in own], default=0.0))
         return self
 
     def enable(self) -> SafetyRun:
@@ -85,6 +89,13 @@ class SafetyRun:
         while self.machine.state is not state:
             assert self.now < end, (self.machine.state, self.machine.fault)
             self.cycle()
+        return self
+
+    def until_off(self) -> SafetyRun:
+        """Run the machine until each motor has confirmed that it is off, and receives nothing else."""
+        self.cycle(0.1)
+        assert self.machine.is_off and not self.drive.powered
+        assert self.drive.effort == self.drive.damping == OFF.effort
         return self
 
     @property

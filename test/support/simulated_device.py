@@ -11,7 +11,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.core.safety.drive import NO_MOTOR, Drive
+from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive, Send
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
@@ -38,7 +38,12 @@ def joints_of(formats: Sequence[WireFormat], ids: Sequence[int] = (1, 2, 3, 4)) 
 
 def drive_of(effort: Sequence[float], damping: Sequence[float] = NO_TORQUE) -> Drive:
     """Return the drive of motors that are on, all of them for sure. effort: (4,) Nm, damping: (4,) Nm s/rad."""
-    return Drive(tuple(effort), tuple(damping), True, NO_MOTOR, NO_MOTOR)
+    return Drive(tuple(effort), tuple(damping), COMMANDS, True)
+
+
+def sending(send: Send, drive: Drive = OFF) -> Drive:
+    """Return `drive` with the same frame for all motors, which may be on."""
+    return drive._replace(send=(send,) * len(drive.send), powered=True)
 
 
 def command(joint: int, torque: float = 0.0, kd: float = 0.0) -> bytes:

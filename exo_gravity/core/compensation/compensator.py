@@ -1,21 +1,23 @@
 """Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
 `Compensator.step` is the whole way: it checks the input and the tilt, evaluates the law, adds the terms and what a
-weighing needs, clamps, guides a change of the settings, and limits ramp and rate. Where the chosen law does not apply,
-the exact law replaces it as a guided change, for at least FALLBACK_TIME.
+weighing needs, clamps, guides whatever changes, and limits the rate. Where the chosen law does not apply, the exact law
+replaces it as a guided change, for at least FALLBACK_TIME. How the torque begins is for who applies it
+(core/safety/guidance.py).
 """
 
 import math
 import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import Torque, exact_torque
 from exo_gravity.core.arm.kinematics import turning_torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, GUIDANCE, RAMP, DropWatch, GuidedChange, limited
+from exo_gravity.core.compensation.guidance import DROP, DropWatch, GuidedChange, limited
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
@@ -25,6 +27,12 @@ from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
+# s without an answer, after which nothing is left to change from. This is longer than any command_timeout: the arm is
+# already being let down.
+PAUSE = 0.2
+LONGEST_STEP = (
+    0.01  # s that the rate limit allows for after a shorter one, so that the torque does not catch up at once
+)
 
 
 class Compensation(NamedTuple):
@@ -60,7 +68,7 @@ class Load(NamedTuple):
 
 
 class Compensator:
-    """The control law and its state: ramp, rate limit, and the change of load that is under way.
+    """The control law and its state: rate limit, and the change of load that is under way.
 
     names: of the joints (4,), for the outer loop's input.
     """
@@ -77,15 +85,11 @@ class Compensator:
         self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
         self.weighing: Weighing | None = None  #: the last one
         self._pending: Settings | None = None
-        self._zeros = (0.0,) * len(settings.max_effort)
-        self._effort: Torque = self._zeros  # of the last step that had efforts,
-        self._last_time = -math.inf  # its time,
-        self._torque: Torque = self._zeros  # and its torque before ramp and rate limit
-        self._ramp_start = -math.inf  # s
-        self._change = GuidedChange(len(settings.max_effort))
-        self._origins: list[Load | None] = []  # where each joint's change began; None where no settings say
+        self._torque: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts, before the limit
+        self._effort = self._torque  # of its rate,
+        self._last_time = -math.inf  # and its time
+        self._change: GuidedChange[Load] = GuidedChange(len(settings.max_effort))
         self._drop_watch = DropWatch()
-        self._damped_until = -math.inf  # s
         self._fallback = ""  # why the exact law replaces the chosen one
         self._fallback_until = -math.inf
 
@@ -123,9 +127,9 @@ class Compensator:
                 return Compensation.withdrawn(late)
             held = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         self._follow_request(now)
-        before = self._replace_load(self._pending) if self._pending else None
         if self.settings.payload_mass and velocity:
             self._withdraw_lost_load(now, theta, velocity)
+        before = self._replace_load(self._pending) if self._pending else None
         was_replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
@@ -137,28 +141,22 @@ class Compensator:
         weighing = self._active_weighing if velocity else None
         if weighing and velocity:
             torque = weighing.torque(dt, theta, velocity, self.tilt.at(now), torque)
-        ended = weighing if weighing and weighing.is_over else None
         torque = clamped(torque, s.max_effort)
-        if not 0.0 <= dt <= RAMP.pause:
-            self._restart(now)
-            dt = 0.0
-        elif ended and ended.is_thrown:
-            self._damped_until = now + GUIDANCE.watch  # a guided change would be too slow
-        elif before or ended or bool(self._fallback) != was_replaced:
-            self._begin_change(before, torque, Reading(now, theta, velocity))
+        needs = partial(self._torque_of, Reading(now, theta, velocity))
         change = self._change
+        if not 0.0 <= dt <= PAUSE:
+            change.stop()
+            dt, self._effort = 0.0, torque
+        elif before or bool(self._fallback) != was_replaced or (weighing and weighing.is_over):
+            change.begin(before, self._torque, needs, torque)
         if not change.is_over:
-            start = self._torque_of_origins(self._origins, torque, Reading(now, theta, velocity))
-            torque = change.step(dt, velocity, start, torque)
+            torque = change.step(dt, velocity, needs, torque)
         self._torque, self._last_time = torque, now
-        ramp = min(1.0, (now - self._ramp_start) / RAMP.time)
-        most_change = s.max_effort_rate * min(dt, RAMP.longest_step)
-        pairs = zip(torque, self._effort, strict=True)
-        self._effort = tuple([limited(ramp * wanted, last, math.inf, most_change) for wanted, last in pairs])
+        most = s.max_effort_rate * min(dt, LONGEST_STEP)
+        self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
-        damped = change.is_large or now < self._damped_until
-        return Compensation(self._effort, "", over, self._fallback, remainder, damped, held)
+        return Compensation(self._effort, "", over, self._fallback, remainder, change.is_large, held)
 
     def _follow_request(self, now: float) -> None:
         """Carry as much of the wearer's arm as is asked for."""
@@ -176,10 +174,6 @@ class Compensator:
     def _replace_load(self, settings: Settings) -> Load:
         """Use new settings; return what was carried before them."""
         before = Load(self.settings, self.terms.in_force if self.terms else None)
-        self._use(settings)
-        return before
-
-    def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
@@ -188,9 +182,10 @@ class Compensator:
         self.tilt.timeout = settings.tilt_timeout
         if self.terms is not None:
             self.terms.apply(settings.terms, settings.moving)
+        return before
 
     def _withdraw_lost_load(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> None:
-        """Withdraw the torque of a load that has left the hand, without a guided change: that would be too slow."""
+        """Carry a load that has left the hand no longer."""
         s = self.settings
         per_mass = exact_torque(s.unit_load, theta, self.tilt.at(now))  # m that each joint lifts it, per rad
         if self.applied:  # motors that do not carry the load cannot throw the arm
@@ -199,9 +194,7 @@ class Compensator:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
         if self._drop_watch.step(now - self._last_time, speed, s.payload_mass):
-            self.dropped, self._damped_until = s.payload_mass, now + GUIDANCE.watch
-            self._use(replace(s, payload_mass=0.0))
-            self._change.stop()
+            self.dropped, self._pending = s.payload_mass, replace(self._pending or s, payload_mass=0.0)
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""
@@ -228,29 +221,7 @@ class Compensator:
     def _active_weighing(self) -> Weighing | None:
         return self.weighing if self.weighing and not self.weighing.is_over else None
 
-    def _restart(self, now: float) -> None:
-        """Ramp the torque in from zero, as at the start."""
-        self._change.stop()
-        self._effort, self._ramp_start = self._zeros, now
-
-    def _begin_change(self, before: Load | None, torque: Torque, reading: Reading) -> None:
-        """Begin a change to `torque` (n,) Nm, from `before` or from where a joint's unfinished change began.
-
-        Of the two, each joint takes the one that explains its present torque better. There is no `before` where the
-        exact law replaces the chosen one, which may not apply here.
-        """
-        ways: list[list[Load | None]] = [] if self._change.is_over else [self._origins]
-        ways.append([before] * len(torque))
-        starts = [self._torque_of_origins(way, torque, reading) for way in ways]
-        chosen = self._change.begin(self._torque, starts, torque)
-        self._origins = [ways[index][joint] for joint, index in enumerate(chosen)]
-
-    def _torque_of_origins(self, origins: Sequence[Load | None], torque: Torque, reading: Reading) -> Torque:
-        """Return the torque (n,) in Nm that each joint's load of `origins` would need here, `torque` for None."""
-        needed = {id(load): self._torque_of(load, reading) if load else torque for load in origins}
-        return tuple([needed[id(load)][joint] for joint, load in enumerate(origins)])
-
-    def _torque_of(self, load: Load, reading: Reading) -> Torque:
+    def _torque_of(self, reading: Reading, load: Load) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
         torque, _ = self._gravity(load.settings, reading.time, reading.theta)
         if self.terms and load.terms and reading.velocity:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.compensation.guidance import GUIDANCE
+from exo_gravity.core.safety.guidance import GUIDANCE
 
 TOPIC, NAME = "support_request", "support"  # of the message, and of its one entry
 
@@ -22,7 +22,7 @@ class RequestTuning:
     max_lead: float = 0.05  #: s that a stamp may be ahead: the clocks of two computers differ by ms
     distrust: float = 2.0  #: s without a second sender, after which requests count again
     least_change: float = 0.005  #: of the wearer's arm: less is not felt
-    pause: float = GUIDANCE.fade_time  #: s between two changes: one guided change ends before the next
+    pause: float = 2.0 * GUIDANCE.time  #: s between two changes: one guided change ends before the next
 
 
 REQUEST = RequestTuning()

@@ -74,13 +74,12 @@ class Weighing:
     """One weighing, from the first call of `torque` on.
 
     names: of the joints (4,). rate: of the calls, Hz. empty: result of the empty hand, if known.
-    result: None while there is none. trouble: why there is none, or ''. is_thrown: whether the load must have left the
-    hand, so that its torque throws the arm.
+    result: None while there is none. trouble: why there is none, or ''.
     """
 
     def __init__(self, settings: Settings, names: Sequence[str], rate: float, empty: Weighed | None = None) -> None:
         self.result: Weighed | None = None
-        self.trouble, self.is_thrown = "", False
+        self.trouble = ""
         self._settings, self._names, self._empty = settings, names, empty
         self._tracker, friction = Tracker(rate, settings.max_effort), settings.terms.friction
         if any(friction.coulomb):  # less what the term `friction` compensates
@@ -191,8 +190,8 @@ class Weighing:
         if not dt <= WEIGHING.pause:
             self.trouble = f"no joint states for {1000.0 * dt:.0f} ms"
         elif abs(error[worst]) > WEIGHING.largest_error:
-            self.is_thrown = float(error @ self._lever) < 0.0
-            why = "was the load dropped?" if self.is_thrown else "relax gradually, and touch nothing"
+            is_thrown = float(error @ self._lever) < 0.0
+            why = "was the load dropped?" if is_thrown else "relax gradually, and touch nothing"
             self.trouble = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
         elif self._foreign > WEIGHING.persistence:
             self.trouble = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"

@@ -18,6 +18,12 @@ from exo_gravity.core.params import Param
 # joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like replies.
 MAX_CAN_ID = 126
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
+# rad: 12.5 in the manual, 12.56 or 12.566 in firmware. Another one is a mistake that would scale every angle.
+POSITION_RANGE_BOUNDS = (12.4, 12.6)
+TORQUE_PER_AMPERE_BOUNDS = (0.02, 5.0)  # Nm/A at the output
+# s without a command after which a motor lets go. A shorter one fires in an ordinary stall of the computer, and drops
+# the arm without damping; a longer one leaves a motor pushing after its host has died.
+TIMEOUT_BOUNDS = (0.15, 0.5)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 BITRATE = 1_000_000  # bit/s, of AK motors as delivered
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
@@ -53,6 +59,7 @@ class JointMotor:
     zero: float = 0.0  #: motor angle in rad at which the joint angle is 0
     torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
     wire_format: WireFormat = MIT  #: of the motor's board
+    timeout: float = 0.0  #: s without a command after which the firmware lets go; 0: never
     command_id: int = field(init=False)  #: the arbitration ID of commands
     #: the frames that switch the motor on, before its next command; that switch it off; and that make its present angle
     #: zero, none if its board has no such frame
@@ -74,6 +81,12 @@ class JointMotor:
         if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
+        shortest, longest = TIMEOUT_BOUNDS
+        if self.timeout != 0.0 and not shortest <= self.timeout <= longest:
+            expected = (
+                f"0 (never) or from {shortest:g} to {longest:g} s: set it in the motor's firmware (docs/wiring.md)"
+            )
+            raise ParameterError("motor_timeout", self.timeout, expected)
         spec, board = self.spec, self.wire_format
         frames = {"enter": board.on, "exit": board.off, "set_zero": board.zero}
         derived: dict[str, object] = {
@@ -133,12 +146,20 @@ MOTOR_PARAMETERS = (
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
     Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
           choices=tuple(FORMATS), fixed=True),
+    Param("position_range", [0.0] * 4, "position range of the firmware's wire format; 0: the usual one of the motor",
+          (0.0, POSITION_RANGE_BOUNDS[1]), "rad", fixed=True),
     Param("velocity_range", [0.0] * 4, "velocity range of the firmware's wire format; 0: the usual one of the motor",
           (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
     Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
           (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
+    Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one of the "
+          "motor", (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
+    Param("motor_timeout", [0.0] * 4, "time without a command after which the firmware lets go, 0.15 to 0.5; 0: never",
+          unit="s", fixed=True),
 )
 # fmt: on
+# Of parameters whose bounds begin at 0, which stands for the usual value: those of any other value.
+_BOUNDS_BEYOND_0 = {"position_range": POSITION_RANGE_BOUNDS, "torque_per_ampere": TORQUE_PER_AMPERE_BOUNDS}
 _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param.default, list))
 
 
@@ -189,8 +210,16 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
-    spec = replace(usual, **{name: given[name] for name in ("velocity_range", "torque_range") if given[name]})
-    return JointMotor(spec, given["can_id"], given["direction"], given["zero"], given["torque_scale"], board)
+    if given["torque_per_ampere"] and board.replies:
+        expected = f"0 with wire_format = {board.name}, whose replies carry the torque itself"
+        raise ParameterError("torque_per_ampere", given["torque_per_ampere"], expected)
+    for name, (low, high) in _BOUNDS_BEYOND_0.items():
+        if given[name] and not low <= given[name] <= high:
+            raise ParameterError(name, given[name], f"0, the usual one of the motor, or from {low:g} to {high:g}")
+    names = "position_range", "velocity_range", "torque_range", "torque_per_ampere"
+    spec = replace(usual, **{name: given[name] for name in names if given[name]})
+    mounting = given["can_id"], given["direction"], given["zero"], given["torque_scale"]
+    return JointMotor(spec, *mounting, board, given["motor_timeout"])
 
 
 class FrameBits(NamedTuple):

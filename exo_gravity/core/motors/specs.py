@@ -4,9 +4,12 @@ Command, 8 bytes, a big-endian bit stream, arbitration ID = motor ID (CubeMars d
 
     position 16 | velocity 12 | kp 12 | kd 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
 
-Reply, 6 bytes, or 8 on newer firmware, arbitration ID = the motor's ID or the master's (0):
+Reply, 6, 7 or 8 bytes, arbitration ID = the motor's ID or the master's (0):
 
     motor ID 8 | position 16 | velocity 12 | torque 12 | temperature + 40 8 | error 8
+
+Older firmware ends after the torque. The open drive, from which the AK firmware descends, sends its supply voltage as
+the seventh byte, and nothing after it.
 
 All values refer to the output side of the gear. A field of b bits divides its range into 2^b - 1 steps, and values are
 rounded to the nearest step: the manual's 2^b overflows at the maximum, and truncation would turn 0 Nm into a push. No
@@ -24,9 +27,15 @@ from exo_gravity.core.numbers import one_float
 ENTER = b"\xff" * 7 + b"\xfc"
 EXIT = b"\xff" * 7 + b"\xfd"
 SET_ZERO = b"\xff" * 7 + b"\xfe"
-SPECIAL_FRAMES = (ENTER, EXIT, SET_ZERO)
+# Seven bytes FF and this one, or a higher one, are no command on some firmware: EE is a query, F0 clears faults, FB
+# starts the boot loader, and FC, FD and FE are the frames above.
+LOWEST_SPECIAL = 0xEE
+_TOP = b"\xff" * 7
 
 WIRE_RANGE_BOUNDS = (1.0, 100.0)  # rad/s or Nm
+REPLY_LENGTHS = (6, 7, 8)  # bytes
+# What the error byte means in the manuals' table. One vendor's MIT firmware sends a bit mask instead: the whole byte is
+# 2 above 81 degC and 6 above 120 degC, where it shuts off.
 MOTOR_ERRORS = {
     0: "none",
     1: "motor over-temperature",
@@ -37,6 +46,7 @@ MOTOR_ERRORS = {
     6: "MOSFET over-temperature",
     7: "stall",
 }
+ERROR_BITS = {1: "warm, above 81 degC", 2: "shut off, above 120 degC"}  # by the number of the bit
 
 
 @dataclass(frozen=True)
@@ -54,7 +64,9 @@ class MotorSpec:
     peak_torque: float  #: Nm, for seconds
     gear_ratio: int  #: turns of the rotor per turn of the output
     pole_pairs: int  #: of the rotor; only V3 boards report a speed of it
-    torque_per_ampere: float  #: Nm, rated torque by rated current; only V3 boards report a current
+    #: Nm/A at the output, by which a V3 board divides torque for its current, which it reports: that of its firmware
+    #: where known, else rated torque by rated current
+    torque_per_ampere: float
     rotor_inertia: float  #: kg m^2, that of the rotor times the gear ratio squared
     position_range: float = 12.5  #: rad: the wire range is +- this value
     kp_max: float = 500.0  #: Nm/rad: the wire range starts at 0
@@ -112,7 +124,7 @@ MOTORS = {
         peak_torque=9.0,
         gear_ratio=6,
         pole_pairs=14,
-        torque_per_ampere=3.0 / 7.4,
+        torque_per_ampere=0.2997,  # of firmware V3.2; rated torque by rated current would be 0.405
         rotor_inertia=8.8e-4,
     ),
     "AK80-9": MotorSpec(
@@ -148,25 +160,36 @@ class MotorReply(NamedTuple):
     position: float  #: rad
     velocity: float  #: rad/s
     torque: float  #: Nm
-    temperature: int | None  #: degC, None from firmware that replies with 6 bytes
-    error: int | None  #: a code of MOTOR_ERRORS, None from firmware that replies with 6 bytes
+    temperature: int | None  #: degC, None from firmware that replies with 6 or 7 bytes
+    error: int | None  #: the error byte (`error_text`), None from firmware that replies with 6 or 7 bytes
+
+
+def is_special(data: bytes | bytearray) -> bool:
+    """Return whether some firmware takes these 8 bytes for something else than a command."""
+    return len(data) == 8 and data[7] >= LOWEST_SPECIAL and data[:7] == _TOP
+
+
+def error_text(error: int) -> str:
+    """Return what the error byte of a V1 or V2 board means: by the manuals' table, and by one firmware's bit mask."""
+    bits = [ERROR_BITS.get(bit, "unknown") for bit in range(8) if error >> bit & 1]
+    return f"{MOTOR_ERRORS.get(error, 'unknown')}; as a bit mask: {', '.join(bits) or 'none'}"
 
 
 def pack_command(spec: MotorSpec, position: float, velocity: float, kp: float, kd: float, torque: float) -> bytes:
-    """Return the 8 bytes of a command, which are never those of a special frame.
+    """Return the 8 bytes of a command, which no firmware takes for a special frame.
 
-    position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. Raises ParameterError on NaN, infinity
-    or a value outside the spec's range.
+    position rad, velocity rad/s, kp 0..500 Nm/rad, kd 0..5 Nm s/rad, torque Nm. With all other fields at their maximum
+    and a torque within 17 codes of its maximum (0.42 % of the range's width, 0.13 Nm of +-15), the torque is lowered to
+    the code below these. Raises ParameterError on NaN, infinity or a value outside the spec's range.
     """
     word = pack_fields(spec, position=position, velocity=velocity, kp=kp, kd=kd, torque=torque)
     data = word.to_bytes(8, "big")
-    # With all other fields at their maximum, the top torque codes spell ENTER, EXIT or SET_ZERO. Send the code below.
-    return data if data[0] != 0xFF or data not in SPECIAL_FRAMES else data[:7] + b"\xfb"
+    return data if data[0] != 0xFF or not is_special(data) else data[:7] + bytes((LOWEST_SPECIAL - 1,))
 
 
 def unpack_command(spec: MotorSpec, data: bytes | bytearray) -> MotorCommand:
     """Return the content of a command frame. Raises FrameError unless it is 8 bytes and not a special frame."""
-    if len(data) != 8 or bytes(data) in SPECIAL_FRAMES:
+    if len(data) != 8 or is_special(data):
         raise FrameError(data, "8 bytes and not a special frame")
     return MotorCommand(*unpack_fields(spec, int.from_bytes(data, "big"), *MotorCommand._fields))
 
@@ -193,9 +216,9 @@ def pack_reply(
 
 
 def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
-    """Return the content of a reply. Raises FrameError unless it is 6 or 8 bytes."""
-    if len(data) not in (6, 8):
-        raise FrameError(data, "a reply of 6 or 8 bytes")
+    """Return the content of a reply. Raises FrameError unless it is 6, 7 or 8 bytes."""
+    if len(data) not in REPLY_LENGTHS:
+        raise FrameError(data, "a reply of 6, 7 or 8 bytes")
     position, velocity, torque = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
     temperature, error = (data[6] - 40, data[7]) if len(data) == 8 else (None, None)
     return MotorReply(data[0], position, velocity, torque, temperature, error)

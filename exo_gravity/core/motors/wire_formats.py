@@ -18,6 +18,10 @@ Speed and current are the motor's: pole pairs and gear ratio lead to the output'
 torque. No frame switches a motor on: its first command does. The current 0 A (control mode 1) switches it off. A
 command without gains and torque comes before it (`MotorBus`), but is not enough: no 12-bit code is exactly 0 Nm.
 
+A motor also obeys frames that are not addressed to it as ours are, and shorter ones, so that these count as commands of
+another sender. The open drive compares the lowest 7 bits of an ID alone. Some firmware obeys short and remote frames,
+and completes them with bytes of an earlier frame. V3.2 boards obey the ID 0xFF.
+
 A further format is one subclass of `WireFormat` that overrides what differs, and one entry in `FORMATS`.
 """
 
@@ -35,6 +39,7 @@ MASTER_ID = 0  # the arbitration ID of replies from some firmware versions of V1
 
 MODE_CURRENT, MODE_MIT, LAST_MODE = 1, 8, 15  # control modes of V3 boards
 STATUS = 0x29
+BROADCAST_ID = 0xFF  # of a command to all V3 boards of a bus
 NO_CURRENT = bytes(4)  # int32, mA
 V3_POSITION_RANGE = 12.56  # rad
 POSITION_STEP = math.radians(0.1)  # rad
@@ -43,7 +48,10 @@ CURRENT_STEP = 0.01  # A
 _STATUS = struct.Struct(">hhhbB")
 
 Frame = tuple[int, bytes]  # arbitration ID and data
-REPLY, COMMAND, OTHER = "reply", "command", "other"
+OPEN_DRIVE_BITS = 0x7F  # of an ID that the open drive compares
+# What a frame is. MALFORMED is a reply of a wrong length; SERVO the status frame of a motor that does not speak `mit`:
+# a V1 or V2 board in servo mode, or a V3 board.
+REPLY, COMMAND, MALFORMED, SERVO, OTHER = "reply", "command", "malformed reply", "servo mode", "other"
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,7 @@ class WireFormat:
     off: tuple[Frame, ...] = ((0, EXIT),)  #: frames that switch a motor off
     #: frames that make the present angle zero; none if the board has no such frame
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
+    reply_lengths: tuple[int, ...] = specs.REPLY_LENGTHS  #: bytes of a reply or status frame
 
     def ranged(self, spec: MotorSpec) -> MotorSpec:
         """Return the motor with the usual ranges of this format. Raises ParameterError if they are not known."""
@@ -83,17 +92,21 @@ class WireFormat:
         """Return the content of a reply or status frame of the motor `motor_id`. Raises FrameError."""
         return specs.unpack_reply(spec, data)
 
-    def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
-        """Return what a frame is, REPLY, COMMAND or OTHER, and the ID of the motor in `motor_ids`, 0 for none.
+    def classify(
+        self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int], is_remote: bool = False
+    ) -> tuple[str, int]:
+        """Return what a frame is, and the ID of its motor in `motor_ids`, BROADCAST_ID for all, 0 for none.
 
         The first byte of a command is never its motor's ID.
         """
-        length = len(data)
-        if length in (6, 8) and data[0] in motor_ids and frame_id in (MASTER_ID, data[0]):
-            return REPLY, data[0]
-        if length == 8 and frame_id in motor_ids and data[0] != frame_id:
-            return COMMAND, frame_id
-        return OTHER, 0
+        if is_status(frame_id, motor_ids):
+            return SERVO, frame_id & 0xFF
+        own, length = frame_id & OPEN_DRIVE_BITS, len(data)
+        if frame_id >= EXTENDED:
+            return OTHER, 0
+        if length and data[0] in motor_ids and frame_id in (MASTER_ID, data[0]) and not is_remote:
+            return (REPLY if length in self.reply_lengths else MALFORMED), data[0]
+        return (COMMAND, own) if own in motor_ids else (OTHER, 0)
 
 
 class V3Format(WireFormat):
@@ -138,20 +151,26 @@ class V3Format(WireFormat):
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
         """Return the content of a status frame. Raises FrameError."""
-        if len(data) != 8:
+        if len(data) != _STATUS.size:
             raise FrameError(data, "a status frame of 8 bytes")
         position, speed, current, temperature, error = _STATUS.unpack(data)
         steps = _steps(spec)
         return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
-    def classify(self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int]) -> tuple[str, int]:
+    def classify(
+        self, frame_id: int, data: bytes | bytearray, motor_ids: frozenset[int], is_remote: bool = False
+    ) -> tuple[str, int]:
         """Return what a frame is: one of any control mode is a command."""
-        motor_id, kind = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
-        if motor_id not in motor_ids or frame_id < EXTENDED:
-            return OTHER, 0
-        if kind == STATUS and len(data) == 8:
-            return REPLY, motor_id
-        return (COMMAND, motor_id) if kind <= LAST_MODE else (OTHER, 0)
+        if is_status(frame_id, motor_ids) and not is_remote:
+            return (REPLY if len(data) in self.reply_lengths else MALFORMED), frame_id & 0xFF
+        motor_id, mode = frame_id & 0xFF, (frame_id & ID_BITS) >> 8
+        is_ours = motor_id in motor_ids or motor_id == BROADCAST_ID
+        return (COMMAND, motor_id) if frame_id >= EXTENDED and mode <= LAST_MODE and is_ours else (OTHER, 0)
+
+
+def is_status(frame_id: int, motor_ids: frozenset[int]) -> bool:
+    """Return whether a frame has the ID of status frames of one of these motors."""
+    return frame_id & ~0xFF == EXTENDED | STATUS << 8 and frame_id & 0xFF in motor_ids
 
 
 def _steps(spec: MotorSpec) -> tuple[float, float, float]:
@@ -160,5 +179,7 @@ def _steps(spec: MotorSpec) -> tuple[float, float, float]:
 
 
 MIT = WireFormat()
-MIT_V3 = V3Format("mit_v3", False, EXTENDED | MODE_MIT << 8, (), ((EXTENDED | MODE_CURRENT << 8, NO_CURRENT),), ())
+MIT_V3 = V3Format(
+    "mit_v3", False, EXTENDED | MODE_MIT << 8, (), ((EXTENDED | MODE_CURRENT << 8, NO_CURRENT),), (), (_STATUS.size,)
+)
 FORMATS: dict[str, WireFormat] = {MIT.name: MIT, MIT_V3.name: MIT_V3}

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.safety.drive import Drive, Fault, FaultCode
+from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
 
 THERMAL_TIME = 60.0  # s; an assumption for motors of this size: the data sheets state none
@@ -46,7 +46,6 @@ class DeliveryMonitor:
     def __init__(self, limits: Limits, peak_effort: Sequence[float]) -> None:
         self._limits = limits
         self._peak = tuple(peak_effort)
-        self._received: list[tuple[float, float] | None] = [None] * len(self._peak)  # effort and damping replied to
         self._newest = [-math.inf] * len(self._peak)  # s, of the last reply
         self.reset()
 
@@ -62,16 +61,6 @@ class DeliveryMonitor:
     def missing(self) -> tuple[bool, ...]:
         """Whether each joint (4,) does not deliver its torque."""
         return tuple(evidence >= DELIVERY.evidence for evidence in self._evidence)
-
-    def applied(self, drive: Drive, silent: Sequence[bool]) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the effort (4,) Nm and damping (4,) Nm s/rad that the motors apply after `drive` was sent.
-
-        A motor that is `silent` (4,) still applies what it last replied to.
-        """
-        sent = zip(drive.effort, drive.damping, strict=True)
-        known = zip(sent, self._received, silent, strict=True)
-        effort, damping = zip(*(old if is_silent and old else new for new, old, is_silent in known), strict=True)
-        return effort, damping
 
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], damping: Sequence[float]
@@ -95,7 +84,6 @@ class DeliveryMonitor:
             while expected[0][1] < self._replied[i] - DELIVERY.span:
                 expected.popleft()
             self._newest[i], self._replied[i] = joint.time, self._time
-            self._received[i] = effort[i], damping[i]
             least, most = min(expected)[0], max(expected)[0]
             nearest = max(least, min(most, joint.effort))
             added = min(DELIVERY.evidence / 2, DELIVERY.excess(joint.effort, nearest) * dt)

@@ -18,8 +18,9 @@ alone holds: an arm of 3.7 Nm then sinks at 0.74 rad/s. V halves whenever the jo
 arm comes to rest, and recovers slowly. A joint is down when s is zero and k holds nothing: it hangs, or lies on
 something.
 
-A motor that cannot be reached keeps applying its torque, so s and k of a silent joint are held. When it replies again,
-and has received these, they go on; else s continues from the torque that it reports.
+A motor that does not reply is taken to obey: k rises, and s fades slowly and blindly. If it was cut off it applies its
+last torque instead, and drops that when it hears its commands again, under full damping. When it replies and has
+received these, s and k go on; else s continues from the torque that it reports.
 """
 
 import math
@@ -58,7 +59,8 @@ class Descent:
     free_damping: float = 0.2
     rest_time: float = 2.0  #: s at rest with nothing holding the arm, until it is down
     longest_rest: float = 7.5  #: s with nothing holding the arm, after which it is down even if the wearer moves it
-    longest_silence: float = 5.0  #: s for which a silent motor is waited for
+    longest_silence: float = 9.0  #: s for which a silent motor is waited for: until it has faded
+    blind_fade_time: float = 8.0  #: s from full torque to none of a silent joint, as slowly as a horizontal arm sinks
 
 
 DESCENT = Descent()
@@ -86,8 +88,14 @@ class JointDescent:
         self.effort, self.damping = effort, damping
         self._carried = max(self._carried, effort, key=abs)
         self._most = max(self._most, abs(effort))
-        self._fade_rate = min(MAX_EFFORT_RATE, max(DESCENT.min_fade_rate, abs(effort) / DESCENT.fade_time))
+        self._fade_rate = min(MAX_EFFORT_RATE, max(DESCENT.min_fade_rate, abs(self._carried) / DESCENT.fade_time))
         self._is_rising = True  # the damping has not yet reached DAMPING
+
+    def step_blind(self, dt: float) -> None:
+        """Advance by `dt` s without a reading: damping rises and stays, torque fades slowly."""
+        self._approach(0.0, max(DESCENT.min_fade_rate, abs(self._carried)) / DESCENT.blind_fade_time, dt)
+        self.damping = min(DAMPING, self.damping + DAMPING / DESCENT.damping_rise * dt)
+        self._is_rising = True
 
     def step(self, dt: float, velocity: float) -> None:
         """Advance by `dt` s with the joint's `velocity` in rad/s; NaN is taken as 0."""
@@ -150,21 +158,31 @@ class ArmDescent:
         """Torque (4,) in Nm and damping (4,) in Nm s/rad to apply now."""
         return tuple(joint.effort for joint in self._joints), tuple(joint.damping for joint in self._joints)
 
-    def step(self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
+    def step(
+        self, now: float, dt: float, samples: Sequence[JointSample], silent: Sequence[bool], unsent: Sequence[bool]
+    ) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings.
 
         silent: (4,) whether the joint's motor does not reply.
+        unsent: (4,) whether its last command did not leave: it holds what it had.
         """
-        for joint, sample, is_silent, was_silent in zip(self._joints, samples, silent, self._silent, strict=True):
+        columns = zip(self._joints, samples, silent, self._silent, unsent, strict=True)
+        for joint, sample, is_silent, was_silent, is_unsent in columns:
             expected = joint.effort - joint.damping * sample.velocity
             is_obeying = DELIVERY.excess(sample.effort, expected) <= 0.0
             if was_silent and not is_silent and not is_obeying:
                 joint.restart(sample.effort)
-            elif not is_silent:
+            elif is_silent:
+                joint.step_blind(0.0 if is_unsent else dt)
+            else:
                 joint.step(dt, sample.velocity)
         self._silent = tuple(silent)
         if not all(joint.is_down for joint, is_silent in zip(self._joints, silent, strict=True) if not is_silent):
             self._held = now
+
+    def rejoin(self, i: int) -> None:
+        """Continue joint `i` without torque and damping: its motor was found off, and is switched on again."""
+        self._joints[i].restart(0.0)
 
     def is_down(self, now: float, rest_since: float) -> bool:
         """Return whether the arm is down at `now` (s), as far as its motors reply; at rest since `rest_since` (s)."""

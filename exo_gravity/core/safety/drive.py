@@ -40,19 +40,28 @@ class Efforts(NamedTuple):
 NO_EFFORTS = Efforts(None, -math.inf, False, False)  # before the first ones
 
 
+class Send(Enum):
+    """What a motor is sent in one cycle. Its wire format has the frames."""
+
+    NOTHING = "nothing"
+    POLL = "poll"  #: a command without torque and gains, to be read while it is off; none to a V3 board
+    COMMAND = "command"  #: its effort and damping; switches no V1 or V2 board on, but a V3 board
+    ENTER = "enter"  #: is switched on
+    CLEAR = "clear"  #: is switched on and, at once, forgets the command that it remembers
+    EXIT = "exit"  #: is switched off
+
+
 class Drive(NamedTuple):
     """What the motors receive in one cycle."""
 
-    effort: tuple[float, ...]  #: (4,) Nm
-    damping: tuple[float, ...]  #: (4,) Nm s/rad
-    powered: bool  #: whether the motors are to be on
-    enter: tuple[bool, ...]  #: (4,) which motors must be switched on again, because they are found off
-    #: (4,) which motors may be on or off: they are sent nothing that could switch them on
-    unsure: tuple[bool, ...]
+    effort: tuple[float, ...]  #: (n,) Nm
+    damping: tuple[float, ...]  #: (n,) Nm s/rad
+    send: tuple[Send, ...]  #: (n,)
+    powered: bool  #: whether one of them may be on
 
 
-NO_MOTOR = (False,) * JOINT_COUNT
-OFF = Drive(NO_TORQUE, NO_TORQUE, False, NO_MOTOR, NO_MOTOR)
+COMMANDS = (Send.COMMAND,) * JOINT_COUNT
+OFF = Drive(NO_TORQUE, NO_TORQUE, (Send.POLL,) * JOINT_COUNT, False)
 
 
 # After a fault, zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
@@ -108,6 +117,7 @@ class FaultCode(str, Enum):
     # The bus and the computer
     FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm", RECHECK
     BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed", RESUME
+    REPLIES_LATE = "replies_late", "a motor answers commands older than 0.04 s: a queue between it and the bridge grows"
     WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
     INTERNAL_ERROR = "internal_error", "an unexpected exception in the control loop, or a node that stood still"
 

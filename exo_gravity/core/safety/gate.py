@@ -32,6 +32,7 @@ class SwitchOn:
     #: s, time constant: replies are one command old and behind a current loop, a batch, a stall
     lag: float = 0.02
     timeout: float = 0.48  #: s until every motor has shown that it is on: four pushes each way
+    attempts: int = 6  #: to switch motors on again that show no torque in the sign check; each may miss 3 % of frames
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,9 @@ def _at_least(angle: float) -> str:
 
 
 class SwitchOnCheck:
-    """Checks that all four motors are on: short pushes each way, under damping, must appear in their replies.
+    """Checks that all motors are on: short pushes each way, under damping, must appear in their replies.
+
+    It is for motors whose signs are trusted. Those of others show in the sign check that they are on.
 
     A motor is on if the regression of its replied on its commanded torque is at least `SWITCH_ON.share`. Each pair of
     pushes separates 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
@@ -134,7 +137,10 @@ class SwitchOnCheck:
                 self._is_on[i] = self._is_on[i] or share >= SWITCH_ON.share
                 self.enter[i] = not self._is_on[i]
                 if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
-                    reason = f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied"
+                    reason = (
+                        f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied; "
+                        "a V3 board ignores commands while its configuration cable is plugged in"
+                    )
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
             self._products, self._squares = list(NO_TORQUE), list(NO_TORQUE)
         self._pushes = pushes
@@ -149,20 +155,25 @@ class SwitchOnCheck:
 class SignCheck:
     """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
 
-    Joint after joint: wait until it is still, push it gently and slowly under damping until it moves by about a degree,
-    then push it back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
+    Joint after joint: wait until it is still, push it gently and slowly until it moves by about a degree, then push it
+    back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
     compensation would double its weight. A joint that does not move has no torque, or is held. A joint that moves
     before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
     `direction` that reverses torque and encoder alike: such a joint moves as expected.
 
+    No joint is damped before it has moved the right way: a reversed motor that damps would drive it, without end.
+
     torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped.
     effort: (4,) Nm to apply now.
-    done: whether every joint has passed.
+    damped: (4,) which joints have moved the right way: these may be damped.
+    done: whether every joint has passed. pushes: whether it pushes any joint at all.
     hint: what the wearer should do, '' for nothing.
     """
 
     def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
         self.effort = [0.0] * len(names)
+        self.damped = [False] * len(names)
+        self.pushes = any(torque)
         self.done = not any(torque)
         self.hint = ""
         self._names = names
@@ -223,6 +234,7 @@ class SignCheck:
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
                 yield self._fault(i, reason, FaultCode.WRONG_SIGN)
+            self.damped[i] = True
         return True
 
     def _approach(self, i: int, effort: float, rate: float) -> None:

@@ -1,11 +1,9 @@
-"""The limits of a worn arm: which motor readings are a fault, and how an effort is limited before it reaches a motor.
+"""The limits of a worn arm, and which motor readings are a fault.
 
-`find_fault` checks a motor's reading; monitors.py confirms what it finds. `shape` limits the requested efforts, in this
-order: soft wall before a joint limit, clamp to the permitted torque (derated when hot), rate limit. docs/safety.md
-compares the defaults with those of other systems.
+`find_fault` checks a motor's reading; monitors.py confirms what it finds. barrier.py keeps every drive within the
+limits. docs/safety.md compares the defaults with those of other systems.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -20,7 +18,7 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTOR_ERRORS, MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
@@ -55,17 +53,6 @@ class Derating:
 
 
 @dataclass(frozen=True)
-class Guide:
-    """The brake of joints while the load changes (core/compensation/guidance.py).
-
-    A wearer who holds or moves slowly feels nothing, one who moves on feels 0.5 kg in their hand.
-    """
-
-    speed: float = 0.25  #: rad/s beyond which it brakes; above the noise of a motor's velocity
-    brake: float = 1.5  #: Nm, at most
-
-
-@dataclass(frozen=True)
 class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
@@ -83,7 +70,7 @@ class LoopTiming:
     periods: int = 2  #: of control that must fit into each time-out, so that one late cycle is not a fault
 
 
-WALL, HEAT, GUIDE, READING, LOOP = SoftWall(), Derating(), Guide(), ReadingLimits(), LoopTiming()
+WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming()
 
 
 @dataclass(frozen=True)
@@ -103,6 +90,13 @@ class Limits:
         "torque limit, by default the motors' rated torque",
         (0.0, max(spec.peak_torque for spec in MOTORS.values())),
         "Nm",
+    )
+    driven_speed: float = owned(
+        1.5,
+        "speed from which a joint is braked that its own motor drives; 1 rad/s beyond, the motor drives it no more",
+        (0.5, 4.0),
+        "rad/s",
+        expert=True,
     )
     command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
     #: s without a reply that makes a motor silent; `limits_of` derives it from the rate
@@ -151,7 +145,7 @@ class Limits:
         name, fastest = self.joint_names[i], self.max_velocity[i]
         low, high = self.position_min[i], self.position_max[i]
         if joint.error:
-            text = MOTOR_ERRORS.get(joint.error, "unknown")
+            text = error_text(joint.error)
             return Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})")
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
@@ -166,48 +160,6 @@ class Limits:
             return Fault(FaultCode.OUTSIDE_LIMITS, reason)
         return None
 
-    def shape(
-        self, effort: Sequence[float], share: float, joints: Sequence[JointSample], before: Sequence[float], dt: float
-    ) -> tuple[tuple[float, ...], tuple[float, ...], set[str]]:
-        """Return the limited torque (4,) in Nm, the soft walls' damping (4,) in Nm s/rad, and which limits acted.
-
-        effort: (4,) Nm, requested. share: 0..1, the ramp's factor on effort and soft wall. before: (4,) Nm, applied
-        `dt` s ago. Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
-        """
-        step = MAX_EFFORT_RATE * dt
-        shaped, damping, acted = [], [], set()
-        for i, (name, joint) in enumerate(zip(self.joint_names, joints, strict=True)):
-            if not abs(effort[i]) <= MAX_COMMAND:
-                raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
-            above = joint.position - self.position_max[i] + WALL.width
-            below = self.position_min[i] + WALL.width - joint.position
-            depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
-            # Once the joint leaves the wall, no spring pushes it.
-            is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL.release
-            wall = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
-            colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
-            permitted = self.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
-            wanted = share * (effort[i] + wall)
-            clamped = max(-permitted, min(permitted, wanted))
-            limited = max(before[i] - step, min(before[i] + step, clamped))
-            shaped.append(limited)
-            damping.append(WALL.damping * min(1.0, abs(depth) / WALL.edge))
-            if depth != 0.0:
-                acted.add(f"soft wall ({name})")
-            if permitted < self.max_effort[i]:
-                acted.add(f"derating ({name})")
-            if clamped != wanted:
-                acted.add(f"max_effort ({name})")
-            if limited != clamped:
-                acted.add(f"max_effort_rate ({name})")
-        return tuple(shaped), tuple(damping), acted
-
-
-def guide_damping(velocity: float) -> float:
-    """Return the damping in Nm s/rad of a joint at `velocity` rad/s while its load changes."""
-    speed = max(GUIDE.speed, abs(velocity))
-    return min(DAMPING * (speed - GUIDE.speed), GUIDE.brake) / speed
-
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
@@ -215,6 +167,12 @@ CAN_BRIDGE = (
     Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
     Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
+    Param(
+        "can.serial",
+        "",
+        "serial number of the CAN adapter, with two buses one per motor; empty: any adapter",
+        fixed=True,
+    ),
     *LIMIT_PARAMETERS,
     *REAL_TIME_PARAMETERS,
 )

@@ -1,22 +1,15 @@
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
-    DISABLED --enable--> CHECKING --all well--> PROVING --motors on, signs right--> RAMPING_IN --RAMP_TIME--> ACTIVE
-        ^                 |    |                   |                                    |                       |
-        |         disable |    | fault             |     disable, fault                 |                       |
-        +-----------------+    v                   v                                    v                       |
-        +------clear------- FAULT <--------- LETTING_DOWN <-----------------------------+-----------------------+
-        +-------------------------------------------+ down: FAULT after a fault, else DISABLED
+`transitions.TRANSITIONS` has every transition, `power.NEXT` those of a single motor.
 
-- DISABLED, CHECKING, FAULT: the motors are off. Zero commands poll their positions.
 - CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang.
-- PROVING: each motor must show in its replies that it is on. If signs are not trusted, each joint is pushed gently, and
-  must move the right way (gate.py).
+- PROVING switches the motors on one by one (power.py). Each must show in its replies that it is on. If signs are not
+  trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault switches the motors off.
+- RAMPING_IN: the torque begins as a guided motion (guidance.py), which ends at the full torque.
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
-  the arm and nothing moves it. A motor that cannot be reached is still watched for: if it replies again, however
-  late, its joint is lowered from the torque that it then applies. If all were silent at once, their supply may have
-  been cut: a motor that returns without torque stays off (`SupplyMonitor`).
-- FAULT latches the code and reason of the first fault. Only `clear` leaves it, and only to DISABLED: clearing a fault
-  never enables the arm.
+  the arm and nothing moves it. A motor that does not reply is taken to obey, and is still watched for: if it replies
+  again, however late, its joint is lowered from the torque that it then applies.
+- FAULT latches the code and reason of the first fault.
 
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
@@ -27,21 +20,25 @@ nothing to repair.
 
 import math
 import operator
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, NO_MOTOR, OFF, Drive, Efforts, Fault, FaultCode, State
-from exo_gravity.core.safety.gate import START_GATE, SignCheck, SwitchOnCheck, missing_for_a_start
-from exo_gravity.core.safety.limits import DAMPING, Limits, guide_damping
-from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough, SupplyMonitor
+from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.gate import START_GATE, SWITCH_ON, SignCheck, SwitchOnCheck, missing_for_a_start
+from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
+from exo_gravity.core.safety.limits import DAMPING, Limits
+from exo_gravity.core.safety.monitors import REST, Readings, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
+from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
+from exo_gravity.core.safety.transitions import TRANSITIONS, Event
 
-RAMP_TIME = 1.0  # s from no torque to full torque: the arm becomes light without a jolt
+CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
 
 class SafetyMachine:
@@ -52,8 +49,7 @@ class SafetyMachine:
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
     the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
-    is_unreached: whether a motor that may be on cannot be reached. ride: through late efforts.
-    motion: judges the efforts by gravity alone.
+    power: of each motor. ride: through late efforts. motion: judges the efforts by gravity alone.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -62,25 +58,42 @@ class SafetyMachine:
         self.fault: Fault | None = None
         self.waiting_for = self.refusal = ""
         self.acted: dict[str, float] = {}
-        self.is_unreached = False
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
-        self._peak_damping = [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT
+        #: the last hand on every drive
+        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
+        self._replies = [motor.wire_format.replies for motor in motors] or [True] * JOINT_COUNT
+        self.power = tuple(map(MotorPower, self._replies))
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
+        self._begin = GuidedMotion(JOINT_COUNT)  # of the torque
         self._rest = RestTracker()
         self._readings = Readings(limits)
-        self._is_found_on = False  # by this cycle's replies
         self._is_trusted = False  # zeros and signs
         self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
-        self._supply = SupplyMonitor()
+        self._switching = SwitchingOn(self._replies)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, NO_TORQUE)
+        self._left: Sequence[float] = ()  # Nm, what another process left the motors with
+        self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
+        #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
+        self.unsent: Sequence[bool] = (False,) * len(self.power)
         #: What else CHECKING waits for, set from outside; '' for nothing.
         self.hindrance = ""
+
+    @property
+    def is_unreached(self) -> bool:
+        """Whether the arm counts as down, but a motor that may be on does not reply."""
+        motors = zip(self.power, self._readings.silent, strict=True)
+        return self._is_standing and any(power.may_be_on and is_silent for power, is_silent in motors)
+
+    @property
+    def is_off(self) -> bool:
+        """Whether the arm is down, and each motor has confirmed that it is off."""
+        return self._is_standing and not self._may_be_powered
 
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
@@ -88,22 +101,19 @@ class SafetyMachine:
             return False
         self.waiting_for, self.refusal = "the first replies of the motors", ""
         self._calm_since = now
-        self._enter(State.CHECKING, now)
+        self._on(Event.ENABLE, now)
         return True
 
     def disable(self, now: float) -> None:
-        """Let the arm down if it is carried, then go to DISABLED. A latched fault stays."""
-        if self.state in CARRYING:
-            self._let_down(now)
-        elif self.state is State.CHECKING:
-            self._enter(State.DISABLED, now)
+        """Let the arm down if it is carried, else switch it off; then go to DISABLED. A latched fault stays."""
+        self._on(Event.DISABLE, now)
 
     def clear(self, now: float) -> bool:
         """Clear a latched fault, on the operator's request only. Return False, and do nothing, unless in FAULT."""
         if self.state is not State.FAULT:
             return False
         self.fault = None
-        self._enter(State.DISABLED, now)
+        self._on(Event.CLEAR, now)
         return True
 
     @property
@@ -129,21 +139,19 @@ class SafetyMachine:
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or Fault(code, reason)
-        if self.state in (State.CHECKING, State.DISABLED):
-            self._enter(State.FAULT, now)
-        elif self.state is not State.LETTING_DOWN:
-            self._let_down(now)
+        self._on(Event.FAULT, now)
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
-        """Let down an arm whose controller has died while its motors applied `effort` (4,) Nm and `damping` (4,)."""
-        self._sent = Drive(tuple(effort), tuple(damping), True, NO_MOTOR, NO_MOTOR)
-        self._supply.suspect(effort)
-        self._let_down(now)
+        """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
+        self._sent, self._left = Drive(tuple(effort), tuple(damping), COMMANDS, True), effort
+        self._change_power(Change.TAKEN_OVER)
+        self.state = State.ACTIVE
+        self._on(Event.DISABLE, now)
 
     def probe(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
-        self._descent = ArmDescent(now, NO_TORQUE, (DAMPING,) * JOINT_COUNT, self.limits.max_effort)
-        self._supply.suspect(NO_TORQUE)
+        self._descent = ArmDescent(now, NO_TORQUE, (DAMPING,) * len(self.power), self.limits.max_effort)
+        self._change_power(Change.PROBED)
 
     def is_at_rest(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
@@ -155,57 +163,67 @@ class SafetyMachine:
         joints: the newest sample of each joint, shoulder to elbow.
         efforts: what the controller asks for.
         """
-        effort, answered, damped, held = efforts
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
-        age = now - answered
         self._now, self._dt = now, min(now - self._now, self._period)
-        readings, supply, sent = self._readings, self._supply, self._sent
-        readings.step(now, joints, sent.powered)
-        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
-            self._is_trusted = False
-        self._rest.step(now, readings.joints, readings.silent)
-        if all(readings.silent) and sent.powered:
-            supply.suspect(sent.effort)
-        self._is_found_on = supply.step(self._dt, readings.joints, readings.silent)
+        self._read(joints)
+        is_fresh = efforts.effort is not None and now - efforts.answered <= self.limits.command_timeout
         if self.state is State.CHECKING:
-            self._check(effort is not None and age <= self.limits.command_timeout)
-        if sent.powered:
-            fault = self._delivery.step(self._dt, readings.joints, sent.effort, sent.damping)
-            is_proven = self.state in (State.RAMPING_IN, State.ACTIVE) or self._switch_on.done
-            if fault and self.state in CARRYING and is_proven:
-                self._trip(fault)
-        if self.state in CARRYING:
-            fault = readings.fault
-            if fault is None and effort is None:
-                fault = Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
-            elif fault is None:
-                fault = self.ride.step(now, self._dt, age, held)
-            self._trip(fault)
-        if effort is not None and self.state in (State.RAMPING_IN, State.ACTIVE):
-            effort, fault = self.motion.step(self._dt, readings.joints, effort, age)
+            self._check(is_fresh)
+        elif self.state in CARRYING:
+            self._trip(self._carried_fault(efforts))
+        effort = efforts.effort
+        if effort is not None and self.state in CARRIED:
+            effort, fault = self.motion.step(self._dt, self._readings.joints, effort, now - efforts.answered)
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
-        self._sent = self._drive(effort or NO_TORQUE, damped)
+        self._sent = self._drive(effort or NO_TORQUE, efforts.damped)
         return self._sent
 
+    def _read(self, joints: Sequence[JointSample]) -> None:
+        """Take the newest samples: readings, rest, and what they show of the motors' power."""
+        readings = self._readings
+        readings.step(self._now, joints, self._sent.powered)
+        if readings.lost or (readings.fault and readings.fault.code is FaultCode.POSITION_JUMP):
+            self._is_trusted = False
+        self._rest.step(self._now, readings.joints, readings.silent)
+        for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
+            power.step(self._now, self._dt, joint, is_silent)
+        if self._left and any(power.state is Power.ON for power in self.power):
+            # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
+            for power, held in zip(self.power, self._left, strict=True):
+                if power.state is Power.UNSURE and power.is_heard and abs(held) <= 2.0 * POWER.torque:
+                    power.change(Change.SHOWN_ON)
+
+    def _carried_fault(self, efforts: Efforts) -> Fault | None:
+        """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
+        sent = self._sent
+        undelivered = self._delivery.step(self._dt, self._readings.joints, sent.effort, sent.damping)
+        if undelivered:
+            if self.state in CARRIED or self._attempts == SWITCH_ON.attempts:
+                return undelivered
+            self._attempts += 1
+        if self._readings.fault:
+            return self._readings.fault
+        if efforts.effort is None:
+            return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
+        return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
+
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
-        if self.state in (State.RAMPING_IN, State.ACTIVE):
+        if self.state in CARRIED:
             try:
                 return self._carry(effort, damped)
             except ParameterError as error:
                 self.trip(FaultCode.COMMAND_IMPOSSIBLE, str(error), self._now)
         if self.state is State.PROVING:
-            damping = DAMPING * min(1.0, (self._now - self._since) / DESCENT.damping_rise)
-            pushed = (self._signs if self._switch_on.done else self._switch_on).effort
-            return self._powered(pushed, (damping,) * len(pushed), tuple(self._switch_on.enter), NO_MOTOR)
+            return self._push()
         return self._descend() if self.state is State.LETTING_DOWN else self._stand()
 
-    def _powered(
-        self, effort: Iterable[float], damping: Iterable[float], enter: tuple[bool, ...], unsure: tuple[bool, ...]
-    ) -> Drive:
-        """Return a drive of motors that are on, with no more damping than each of them can apply."""
-        return Drive(tuple(effort), tuple(map(min, damping, self._peak_damping)), True, enter, unsure)
+    def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
+        """Return a drive of motors that may be on, within the barrier."""
+        readings, torque = self._readings, tuple(effort)
+        bounded = self.barrier.damping(self._dt, readings.joints, readings.silent, torque, tuple(damping))
+        return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, efforts_are_fresh: bool) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start."""
@@ -214,104 +232,163 @@ class SafetyMachine:
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = missing or self.hindrance or ("" if efforts_are_fresh else "effort commands")
+        missing = self.hindrance or missing or ("" if efforts_are_fresh else "effort commands")
+        missing = missing or ("the motors to confirm that they are off" if not self._all_off else "")
         self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
         if missing:
             self._calm_since = self._now
         if self._now - self._calm_since >= START_GATE.calm:
             self.waiting_for = ""
             largest = 0.0 if self._is_trusted else limits.sign_check_torque
+            self._switching, self._attempts = SwitchingOn(self._replies), 0
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
-            self._enter(State.PROVING)
+            self._on(Event.PASSED)
         elif self._now - self._since >= limits.enable_timeout:
             self._refuse(f"not enabled within {limits.enable_timeout:g} s: waited for {self.waiting_for}")
 
     def _prove(self) -> None:
-        if self._switch_on.done:
-            fault = self._signs.step(self._dt, self._readings.joints)
-        else:
-            fault = self._switch_on.step(self._dt, self._readings.joints, self._sent.damping)
+        """Advance the checks of motors that were just switched on."""
+        if not self._switching.done:
             self._delivery.reset()
+            return
+        joints = self._readings.joints
+        if self._signs.done:  # before, or there is nothing to check: they are trusted
+            fault = self._switch_on.step(self._dt, joints, self._sent.damping)
+            self._delivery.reset()
+        else:
+            fault = self._signs.step(self._dt, joints)
         self.waiting_for = self._signs.hint
         self._trip(fault)
-        if not fault and self._switch_on.done and self._signs.done:
+        if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
             self._is_trusted = True
             self.motion.reset()
-            self._enter(State.RAMPING_IN)
+            self._begin.begin()
+            self._on(Event.PROVEN)
+
+    def _push(self) -> Drive:
+        """Return a drive that switches the motors on one by one, then pushes them gently.
+
+        A joint is damped only if its signs are trusted, or have just been proven.
+        """
+        count = len(self.power)
+        if not self._switching.done:
+            return self._powered(NO_TORQUE, NO_TORQUE, self._switching.step())
+        if self._signs.pushes:
+            pushed, again, damped = self._signs.effort, list(self._delivery.missing), self._signs.damped
+        else:
+            pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * count
+        if any(again):
+            self._delivery.reset()
+        boards = zip(again, self._replies, strict=True)
+        send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
+        rise = DAMPING / DESCENT.damping_rise * self._dt
+        drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
+        return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
-        joints, ramp = self._readings.joints, 1.0
+        joints = self._readings.joints
         if self.state is State.RAMPING_IN:
-            ramp = min(1.0, (self._now - self._since) / RAMP_TIME)
-            if ramp == 1.0:
-                self._enter(State.ACTIVE)
-        shaped, walls, acted = self.limits.shape(effort, ramp, joints, self._sent.effort, self._dt)
-        self.acted.update(dict.fromkeys(acted, self._now))
-        # A wall's damping rises at once, since it already rises with the position. That of a ride or a changing load
-        # rises over `damping_rise`, and any damping falls so.
-        step = DAMPING / DESCENT.damping_rise * self._dt
-        guided = [guide_damping(joint.velocity) if damped else 0.0 for joint in joints]
+            self._begin.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
+            if self._begin.is_over:
+                self._on(Event.RAMPED)
+        is_guided = damped or self.state is State.RAMPING_IN
+        share = [1.0 - left for left in self._begin.shares]
+        guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        columns = zip(walls, wanted, self._sent.damping, strict=True)
-        damping = [max(wall, last - step, min(last + step, most)) for wall, most, last in columns]
-        return self._powered(shaped, damping, NO_MOTOR, NO_MOTOR)
+        shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
+        self.acted.update(dict.fromkeys(shaped.acted, self._now))
+        return self._powered(shaped.effort, shaped.damping, COMMANDS)
 
     def _descend(self) -> Drive:
-        descent, supply, silent = self._descent, self._supply, self._readings.silent
-        may_differ = tuple(map(operator.or_, silent, supply.returning))
-        descent.step(self._now, self._dt, self._readings.joints, may_differ)
-        if self.state is not State.LETTING_DOWN:  # a motor that could not be reached replies again
-            self._enter(State.LETTING_DOWN)
-        if (all(supply.unsure) and supply.are_off) or descent.is_down(self._now, self._rest.since):
-            self.is_unreached = any(silent)
-            supply.clear(may_differ)
-            self._enter(State.FAULT if self.fault else State.DISABLED)
+        """Return a drive that lowers the arm, or stands once it is down."""
+        readings = self._readings
+        descent, silent, joints = self._descent, readings.silent, readings.joints
+        descent.step(self._now, self._dt, joints, silent, self.unsent)
+        self._switch_quiet_off()
+        if self._is_switched_off or descent.is_down(self._now, self._rest.since):
+            for power, is_silent in zip(self.power, silent, strict=True):
+                if not is_silent:
+                    power.change(Change.SWITCH_OFF)
+            self._on(Event.DOWN_AFTER_FAULT if self.fault else Event.DOWN)
             return self._stand()
-        columns = zip(self._delivery.missing, self._unsure, strict=True)
-        enter = tuple(missing and not is_unsure for missing, is_unsure in columns)
-        if any(enter):
-            self._is_trusted = False
+        delivered = self._delivery.step(self._dt, joints, self._sent.effort, self._sent.damping) is None
+        send = self._lowering_sends()
+        for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
+            asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
+            is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
+            if is_off and power.state is Power.ON and power.may_return and not joint.error:
+                power.may_return, self._is_trusted = False, False
+                descent.rejoin(i)
+                send[i] = Send.ENTER if self._replies[i] else Send.COMMAND
+        if not delivered:
             self._delivery.reset()
-        return self._powered(*descent.applied, enter, self._unsure)
-
-    @property
-    def _unsure(self) -> tuple[bool, ...]:
-        """Which motors (4,) may be off: those that are unsure, and those that do not reply, whose power may return."""
-        return tuple(map(operator.or_, self._readings.silent, self._supply.unsure))
+        return self._powered(*descent.applied, send)
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
-        supply = self._supply
-        if supply.are_off:
-            supply.clear()
-            if self.is_unreached and self.state is State.CHECKING:
-                self._refuse("the motors have just returned, switched off: enable them again")
-            self.is_unreached = False
-        is_doubtful = any(supply.unsure)
-        if not (self.is_unreached or is_doubtful or self._is_found_on):
-            return OFF
-        if not self._is_found_on and (is_doubtful or any(self._readings.silent)):
-            return self._powered(*self._descent.applied, NO_MOTOR, self._unsure)
-        if self.state is State.CHECKING:
-            self._refuse("a motor was still on: it is let down")
-        self.is_unreached = False
-        return self._descend()
+        self._switch_quiet_off()
+        if any(power.state is Power.ON for power in self.power):
+            if self.state is State.CHECKING:
+                self.refusal = "a motor was still on: it is let down"
+            self._on(Event.FOUND_ON)
+            return self._descend()
+        if self._all_off:
+            return OFF._replace(send=tuple(self._lowering_sends()))
+        self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
+        return self._powered(*self._descent.applied, self._lowering_sends())
+
+    def _switch_quiet_off(self) -> None:
+        """Switch motors off that may be on, but reply without torque."""
+        for power in self.power:
+            if power.state in (Power.UNSURE, Power.UNKNOWN) and power.is_quiet:
+                power.change(Change.SWITCH_OFF)
+
+    @property
+    def _is_switched_off(self) -> bool:
+        return all(power.state in (Power.OFF, Power.LEAVING) for power in self.power)
+
+    def _lowering_sends(self) -> list[Send]:
+        return [power.send(self._now) for power in self.power]
+
+    @property
+    def _is_standing(self) -> bool:
+        return self.state in (State.DISABLED, State.CHECKING, State.FAULT)
+
+    @property
+    def _all_off(self) -> bool:
+        return all(power.state is Power.OFF for power in self.power)
+
+    @property
+    def _may_be_powered(self) -> bool:
+        return any(power.may_be_on for power in self.power)
 
     def _refuse(self, reason: str) -> None:
         self.refusal = reason
-        self._enter(State.DISABLED)
-
-    def _let_down(self, now: float) -> None:
-        applied = self._delivery.applied(self._sent, self._readings.silent)
-        self._descent = ArmDescent(now, *applied, self.limits.max_effort)
-        self._enter(State.LETTING_DOWN, now)
+        self._on(Event.REFUSED)
 
     def _trip(self, fault: Fault | None) -> None:
         if fault:
             self.trip(*fault, self._now)
 
-    def _enter(self, state: State, now: float = -math.inf) -> None:
-        self.state = state
+    def _change_power(self, change: Change) -> None:
+        for power in self.power:
+            power.change(change)
+
+    def _on(self, event: Event, now: float = -math.inf) -> None:
+        """Go to the state that `TRANSITIONS` has for this event; stay where it has none."""
+        before, after = self.state, TRANSITIONS.get((self.state, event))
+        if after is None:
+            return
+        self.state = after
         self._since = self._now = max(now, self._now)
+        if after is State.PROVING:
+            self._change_power(Change.SWITCH_ON)
+        elif before is State.PROVING and after is not State.RAMPING_IN:
+            self._change_power(Change.SWITCH_OFF)
+        elif after is State.RAMPING_IN:
+            self._change_power(Change.SHOWN_ON)
+        elif after is State.LETTING_DOWN and before in CARRIED:
+            sent = self._sent
+            self._descent = ArmDescent(self._since, sent.effort, sent.damping, self.limits.max_effort)

@@ -1,15 +1,13 @@
-"""What the safety machine watches: the motors' readings, the arm's rest, the motors' supply, the age of the efforts.
+"""What the safety machine watches: the motors' readings, the arm's rest, the age of the efforts.
 
 Chosen against ordinary equipment: 3 % of the frames lost each way, a computer that is late by 20 ms in one cycle of
 ten, adapters that deliver in batches of 1 ms, and a motor that reports one wrong reading now and then.
 """
 
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Fault, FaultCode
@@ -37,19 +35,6 @@ class Rest:
 
 
 @dataclass(frozen=True)
-class Supply:
-    """What in its replies shows a motor on or off.
-
-    A motor that is off may report 0.15 Nm of noise (standard deviation); smoothed at 100 Hz that is 0.05 Nm, so one
-    read in ten thousand takes such a motor for one that is on.
-    """
-
-    torque: float = 0.2  #: Nm, smoothed, from which on it is on; less cannot throw an arm when it is switched off
-    smoothing: float = 0.05  #: s, time constant
-    read_time: float = 0.2  #: s without torque that show motors off; an arm that sinks under damping shows it sooner
-
-
-@dataclass(frozen=True)
 class Ride:
     """For how long in s late efforts are still applied."""
 
@@ -58,7 +43,7 @@ class Ride:
     recovery: float = 0.1  #: of riding that each s with sound efforts makes good
 
 
-TURN_COUNT, REST, SUPPLY, RIDE = TurnCount(), Rest(), Supply(), Ride()
+TURN_COUNT, REST, RIDE = TurnCount(), Rest(), Ride()
 
 
 class Readings:
@@ -145,76 +130,6 @@ class RestTracker:
         if any(silent):  # a silent joint may have moved by the time it replies again
             known = zip(self._reference, silent, strict=True)
             self._reference = [UNKNOWN if is_silent else last for last, is_silent in known]
-
-
-class SupplyMonitor:
-    """Whether motors that may have lost their power, or may be on unasked, apply torque. Only their replies tell.
-
-    All motors silent at once means that their supply was cut, as by an emergency stop, or that the bus was. A motor
-    that restarted is off, and must stay off until the operator enables the arm; one that kept its power still applies
-    its last command, and must be let down. Until it is known, a motor is sent nothing that could switch it on
-    (`MotorBus`). The same holds for the motors of an owner that left no notes.
-
-    unsure: (4,) whether it is not known of a motor.
-    """
-
-    def __init__(self) -> None:
-        self._times = list(NO_TORQUE)  # s, of each motor's last reply
-        self.suspect(NO_TORQUE)
-        self.clear()
-
-    @property
-    def returning(self) -> tuple[bool, ...]:
-        """Which motors (4,) are unsure and were silent: they may apply another torque than the last one sent."""
-        return tuple(map(operator.and_, self.unsure, self._were_silent))
-
-    @property
-    def are_off(self) -> bool:
-        """Whether every unsure motor has replied for `SUPPLY.read_time` without torque."""
-        unsure = [heard for heard, is_unsure in zip(self._heard, self.unsure, strict=True) if is_unsure]
-        return bool(unsure) and min(unsure) >= SUPPLY.read_time
-
-    def suspect(self, held: Sequence[float]) -> None:
-        """Take every motor for unsure from now on.
-
-        held: (4,) Nm, what they apply if they are on.
-        """
-        self._held = held
-        self.unsure: tuple[bool, ...] = (True,) * len(held)
-        self._torque = list(NO_TORQUE)  # smoothed, since the motor replies again
-        self._heard = list(NO_TORQUE)  # s for which it has replied again
-        self._were_silent = [False] * len(held)
-
-    def clear(self, still: Sequence[bool] = (False,) * JOINT_COUNT) -> None:
-        """Take the motors for sure from now on.
-
-        still: (4,) which stay unsure, if they are: those that are silent or `returning`.
-        """
-        self.unsure = tuple(map(operator.and_, self.unsure, still))
-
-    def step(self, dt: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> bool:
-        """Take the newest readings, `dt` s after the last ones; return whether one shows that its motor is on.
-
-        silent: (4,) whether the joint's motor does not reply.
-        """
-        if not any(self.unsure):
-            return False
-        for i, joint in enumerate(joints):
-            self._heard[i] = 0.0 if silent[i] else self._heard[i] + dt
-            if silent[i]:
-                self._torque[i], self._were_silent[i] = 0.0, True
-            elif joint.time > self._times[i]:
-                self._torque[i] += min(1.0, dt / SUPPLY.smoothing) * (joint.effort - self._torque[i])
-                self._times[i] = joint.time
-        shown = [abs(torque) > SUPPLY.torque for torque in self._torque]
-        if not any(shown):
-            return False
-        # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
-        self.unsure = tuple(
-            is_unsure and not is_shown and (is_silent or abs(held) > 2.0 * SUPPLY.torque)
-            for is_unsure, is_shown, is_silent, held in zip(self.unsure, shown, silent, self._held, strict=True)
-        )
-        return True
 
 
 class RideThrough:

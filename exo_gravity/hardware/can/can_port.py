@@ -1,5 +1,7 @@
 """A python-can bus that survives its adapter: every error becomes a BusError, and a failed bus is opened again.
 
+A send that fails once is a lost frame, as on the wire: a full transmit queue (ENOBUFS) is often empty a cycle later.
+
 Backends raise more than `can.CanError`: slcan raises ValueError on a garbled line. A USB adapter that is plugged in
 again is a new device, which only a newly opened bus can reach. Opening may block, so another thread does it.
 
@@ -21,12 +23,14 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor, buses_of
+from exo_gravity.core.motors.joint_motor import JointMotor, buses_of, channels_of
 from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.hardware.can.adapter import check_serial
 from exo_gravity.hardware.clock import Clock
 
+LOST_SENDS = 0.005  # s of failures in a row that are lost frames
 REOPEN_AFTER = 0.02  # s of failures in a row after which the bus is opened again
 REOPEN_PERIOD = 0.1  # s between two attempts
 MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
@@ -61,18 +65,22 @@ class CanPort:
         self._clock = clock
         self._reopen = reopen
         self._failing_since: float | None = None
+        self._has_lost = False  # a frame, since the last `confirm`
         self._error = ""
         self._is_closing = False
 
-    def send(self, *frames: Frame) -> None:
-        """Send frames. Raises BusError."""
+    def send(self, *frames: Frame, may_be_lost: bool = False) -> None:
+        """Send frames. Raises BusError; with `may_be_lost`, not for the first failures."""
         for frame in frames:
             bus = self._bus or self._reopening()
             self._awaited.append(frame)
             try:
                 bus.send(message_of(frame))
             except Exception as error:
-                raise self._failed(bus, error) from error
+                self._has_lost = True
+                failure = self._failed(bus, error)
+                if not may_be_lost or self._clock.monotonic() - (self._failing_since or 0.0) > LOST_SENDS:
+                    raise failure from error
 
     def receive(self, timeout: float) -> can.Message | None:
         """Return the next frame, or None if there is none within `timeout` s. Raises BusError."""
@@ -109,8 +117,10 @@ class CanPort:
         return True
 
     def confirm(self) -> None:
-        """Note that the bus works: its last failure, if any, was not the first of a row."""
-        self._failing_since = None
+        """Note, after a cycle, that the bus works: its last failure, if any, was not the first of a row."""
+        if not self._has_lost:
+            self._failing_since = None
+        self._has_lost = False
 
     def close(self) -> None:
         """Close the bus. Never raises."""
@@ -166,6 +176,7 @@ class ArmOnBus:
     limits: Limits  #: That it must never exceed.
     period: float  #: s of a control cycle.
     joints: Sequence[int] = field(default=range(JOINT_COUNT), kw_only=True)  #: (0..3) That are to be reached.
+    serials: Sequence[str] = field(default=("",) * JOINT_COUNT, kw_only=True)  #: (4,) Of adapters; '' for any.
 
     @property
     def parts(self) -> "list[ArmOnBus]":
@@ -173,10 +184,18 @@ class ArmOnBus:
         interface, channel, options = self.address
         buses = buses_of(channel, options).items()
         parts = ((name, own, [joint for joint in on if joint in self.joints]) for name, (on, own) in buses)
-        return [replace(self, address=(interface, name, own), joints=joints) for name, own, joints in parts if joints]
+        return [
+            replace(
+                self, address=(interface, name, own), joints=joints, serials=(self.serials[joints[0]],) * JOINT_COUNT
+            )
+            for name, own, joints in parts
+            if joints
+        ]
 
     def open(self, address: Address) -> can.BusABC:
-        """Open one of its buses. Raises BusError."""
+        """Open one of its buses. Raises BusError, also if it has another adapter."""
+        interface, channel, _ = address
+        check_serial(interface, channel, dict(zip(channels_of(self.address[1]), self.serials, strict=True))[channel])
         return open_bus(*address)
 
     def ports(self, clock: Clock, failures: list[BusError] | None = None) -> list[CanPort | None]:

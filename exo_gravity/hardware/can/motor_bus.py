@@ -11,11 +11,8 @@ A motor obeys every sender. A command to one of our motors that we did not send 
 full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
 up, so for a while all our commands to that motor also hold the joint.
 
-A zero command precedes the frames that switch a V1 or V2 board on or off: the motor remembers its last command, and
-ENTER would carry it out. A command switches a V3 board on, so it gets none while the arm is off.
-
-A motor that is `unsure` in a drive may have restarted or kept its power. A V1 or V2 board gets its command, which holds
-it if it is on, and is ignored if it is off, but no ENTER. A V3 board gets nothing: its status frames come unasked.
+What a motor is sent is the safety machine's decision (core/safety/power.py): this only carries it out. A motor gets one
+frame a cycle, whose reply is awaited: its reply has the ID of the command, and would collide with a second one.
 """
 
 import contextlib
@@ -26,17 +23,26 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.wire_formats import (
+    BROADCAST_ID,
+    COMMAND,
+    EXTENDED,
+    MALFORMED,
+    OTHER,
+    REPLY,
+    SERVO,
+    Frame,
+    WireFormat,
+)
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.drive import OFF, Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
+from exo_gravity.hardware.can.request_age import Requests
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
-EXIT_PERIOD = 0.5  # s between two EXIT frames to motors that are off, in case one was lost,
-UNCONFIRMED_EXIT_PERIOD = 0.02  # s, and to motors that have not replied since the first EXIT
-OFF_EFFORT = 0.2  # Nm that a V3 board may report when it is off: it reports unasked, so a frame alone proves nothing
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame
 LATE_REPLIES = 0.02  # s of it in which replies to the previous owner may still arrive
@@ -54,8 +60,7 @@ class MotorBus:
 
     bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
         torque, and is sent nothing.
-    powered: whether the motors are already on.
-    note: called with each drive, and whether a motor may be on, before its frames are sent.
+    note: called with each drive before its frames are sent.
     reopen: opens `bus` again after a failure.
     clock: of all times.
     """
@@ -64,8 +69,7 @@ class MotorBus:
         self,
         bus: can.BusABC | Sequence[CanPort | None],
         motors: Sequence[JointMotor],
-        powered: bool = False,
-        note: Callable[[Drive, bool], None] = lambda drive, powered: None,
+        note: Callable[[Drive], None] = lambda drive: None,
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
@@ -74,6 +78,7 @@ class MotorBus:
         self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
         self.foreign_commands = 0  #: count of commands to these motors from another sender
         self.foreign_command = ""  #: the last of them, in words
+        self.boards = Boards(motors)  #: what keeps them from serving this arm
         self.clock = clock
         self._now = clock.monotonic
         self._ports = [CanPort(bus, clock, reopen)] * JOINT_COUNT if isinstance(bus, can.BusABC) else list(bus)
@@ -85,24 +90,27 @@ class MotorBus:
         for port, motor in zip(self._ports, motors, strict=True):
             ids.setdefault((port, motor.wire_format), []).append(motor.can_id)
         self._ids = [(port, board, frozenset(can_ids)) for (port, board), can_ids in ids.items()]
-        self._asked = frozenset(joint for joint in self._joints if motors[joint].wire_format.replies)
+        self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
+        self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
-        self._powered = powered
-        self._unsure: Sequence[bool] = (False,) * JOINT_COUNT  # of the last powered drive
-        self._unconfirmed = set(self._joints) if powered else set()  # not known to be off
+        #: Whether the last drive did not leave for each motor (n,), because its bus failed.
+        self.unsent: Sequence[bool] = (False,) * len(motors)
         self._drive = OFF  # last sent
+        self._has_sent = False  # anything: another owner's motors are left alone
         self._corrected = [-math.inf] * JOINT_COUNT  # s
         self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
         self._held = [math.nan] * JOINT_COUNT  # rad
         self._note = note
-        self._exit_sent = -math.inf
-        self._is_confirming = False  # replies now follow an EXIT
         self._answered: set[int] = set()
+        self._requests = [Requests() for _ in motors]
 
     @property
-    def may_be_powered(self) -> bool:
-        """Whether a motor may be on: it was switched on or found on, and has not replied since it was sent EXIT."""
-        return bool(self._unconfirmed)
+    def late_replies(self) -> str:
+        """Which motor answers commands that are too old, as a sentence; '' if none does."""
+        for motor, requests in zip(self._motors, self._requests, strict=True):
+            if requests.late:
+                return f"motor {motor.can_id} answers commands that are {1000.0 * requests.late:.0f} ms old or older"
+        return ""
 
     @property
     def is_contested(self) -> bool:
@@ -127,30 +135,29 @@ class MotorBus:
     def exchange(self, drive: Drive, deadline: float) -> bool:
         """Send every motor its part of `drive`, then collect replies until all arrived or `deadline` (s).
 
-        Switches the motors on or off when `drive.powered` changes. Returns whether all motors replied in time. Raises
-        BusError if a bus fails, once the others have had their part.
+        Returns whether all motors replied in time. Raises BusError if a bus fails, once the others have had their part.
         """
         self._failed.clear()
-        if drive.powered:
-            self._unsure = drive.unsure
-            self._unconfirmed.update(joint for joint in self._joints if not drive.unsure[joint])
-        self._note(drive, self.may_be_powered)
-        self._is_confirming = not self._powered and self._exit_sent > -math.inf
+        self._note(drive)
         for port in self._buses:  # replies that arrived after their cycle are not replies to this one
             try:
                 for message in port.waiting():
                     self._take(port, message)
             except BusError as error:
                 self._failed[port] = error
-        if drive.powered and not self._powered:
-            self._powered, self._exit_sent = True, -math.inf
-            if not any(drive.unsure):
-                self._send_commands(OFF)
-                for joint, motor in enumerate(self._motors):
-                    self._send(self._ports[joint], *motor.enter)
-        self._send_commands(drive)
-        if not drive.powered:
-            self._switch_off()
+        self._drive, self._has_sent = drive, True
+        now = self._now()
+        frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
+        for joint, own in enumerate(self._ports):
+            due = self._frames(joint, now)
+            if due and self.replies[joint]:
+                if not self._requests[joint].may_send(now):
+                    continue
+                self._requests[joint].sent(now, len(due))
+            frames[own] += due
+        for own, all_due in frames.items():
+            self._send(own, *all_due, may_be_lost=True)
+        self.unsent = tuple([port in self._failed for port in self._ports])
         self._answered.clear()
         count = len(self._joints)
         self.receive_until(deadline, lambda: len(self._answered) == count)
@@ -176,37 +183,21 @@ class MotorBus:
                 except BusError as error:
                     self._failed[port] = error
 
-    def set_zero(self) -> None:
-        """Make the present pose every motor's zero; only while they are off. They are silent for up to 1.5 s."""
-        if self._powered:
-            raise BusError("set_zero: refused while the motors are on")
-        frames = [motor.set_zero for motor in self._motors]
-        if not all(frames):
-            raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
-        self._send_commands(OFF)
-        for joint, own in enumerate(frames):
-            self._send(self._ports[joint], *own)
-        self._raise_failure()
-
     def stop(self) -> None:
-        """Send the last frames, a zero command and EXIT, twice; then close the bus. Never raises.
+        """Send EXIT, twice, to the motors that were to be off; then close the bus. Never raises.
 
-        Motors whose replies do not show that they are off stay noted as powered. Nothing is sent to motors that were
-        never switched on or off: another owner may have left them on.
+        Nothing is sent to others: another owner may have left them on.
         """
-        for _ in range(2 if self.may_be_powered or self._exit_sent > -math.inf else 0):
-            self._is_confirming = True
-            for joint, motor in enumerate(self._motors):
-                for frame in (*self._zero_command(joint), *motor.exit):
-                    self._failed.clear()  # each is tried
-                    self._send(self._ports[joint], frame)
+        left = [
+            joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in (Send.POLL, Send.EXIT)
+        ]
+        for _ in range(2 if left else 0):
             self._failed.clear()
-            self._powered, self._exit_sent = False, self._now()
-            end = self._exit_sent + LAST_REPLIES
+            self._answered.clear()
+            for joint in left:
+                self._send(self._ports[joint], *self._motors[joint].exit)
             with contextlib.suppress(BusError):
-                self.receive_until(end, lambda: not self._unconfirmed)
-        if not self._unconfirmed:
-            self._note(OFF, False)
+                self.receive_until(self._now() + LAST_REPLIES, lambda: self._answered >= self._asked.intersection(left))
         self.close()
 
     def close(self) -> None:
@@ -214,11 +205,11 @@ class MotorBus:
         for port in self._buses:
             port.close()
 
-    def _send(self, port: CanPort | None, *frames: Frame) -> None:
+    def _send(self, port: CanPort | None, *frames: Frame, may_be_lost: bool = False) -> None:
         """Send frames on a bus, unless it is not open or has failed in this cycle."""
         if port and port not in self._failed:
             try:
-                port.send(*frames)
+                port.send(*frames, may_be_lost=may_be_lost)
             except BusError as error:
                 self._failed[port] = error
 
@@ -226,64 +217,55 @@ class MotorBus:
         for error in self._failed.values():
             raise error
 
-    def _switch_off(self) -> None:
-        period = UNCONFIRMED_EXIT_PERIOD if self._unconfirmed else EXIT_PERIOD
-        if self._powered or self._now() - self._exit_sent > period:
-            for joint, motor in enumerate(self._motors):
-                zero = () if joint in self._asked else self._zero_command(joint)
-                self._send(self._ports[joint], *zero, *motor.exit)
-            if self._failed:
-                return  # no reply confirms an EXIT that was not sent
-            self._exit_sent = self._now()
-        self._powered = False
+    def _frames(self, joint: int, now: float) -> tuple[Frame, ...]:
+        """Return what a motor is sent in the present drive."""
+        send, motor = self._drive.send[joint], self._motors[joint]
+        idle = (motor.command_id, motor.command(0.0, 0.0))
+        if send is Send.COMMAND:
+            return (self._command(joint, now),)
+        if send is Send.POLL:
+            return (idle,) if self.replies[joint] else ()
+        if send is Send.EXIT:
+            return motor.exit
+        if send is Send.ENTER:
+            return motor.enter
+        return (*motor.enter, idle) if send is Send.CLEAR else ()
 
-    def _zero_command(self, joint: int) -> tuple[Frame, ...]:
-        """Return a command without torque and gains; none for a V3 board that may be off: it would switch it on."""
-        if joint not in self._asked and (joint not in self._unconfirmed or self._unsure[joint]):
-            return ()
-        return ((self._motors[joint].command_id, self._motors[joint].command(0.0, 0.0)),)
-
-    def _send_commands(self, drive: Drive) -> None:
-        self._drive = drive
-        now = self._now()
-        frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
-        for joint, motor in enumerate(self._motors):
-            if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
-                continue
-            command = self._command(joint, now)
-            frames[self._ports[joint]] += (command, *motor.enter, command) if drive.enter[joint] else (command,)
-        for port, own in frames.items():
-            self._send(port, *own)
-
-    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
-        """Return REPLY or FOREIGN_COMMAND with the motor's ID, or the kind of a frame that does not matter with 0."""
+    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, frozenset[int]]:
+        """Return the kind of a frame, and the IDs of the motors that it concerns: only FOREIGN_COMMAND has several."""
         if message.is_error_frame:
-            return "error frame", 0
-        if message.is_remote_frame or message.is_fd:
-            return "remote or FD frame", 0
+            return "error frame", frozenset()
+        if message.is_fd:
+            return "FD frame", frozenset()
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
         for own, board, can_ids in self._ids:
             if own is not port:
                 continue
-            kind, can_id = board.classify(frame_id, message.data, can_ids)
-            if kind == REPLY:
-                return kind, can_id
+            kind, can_id = board.classify(frame_id, message.data, can_ids, message.is_remote_frame)
+            if kind == COMMAND and port.is_echo(message):
+                return "echo", frozenset()
             if kind == COMMAND:
-                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
-        return "foreign frame", 0
+                return FOREIGN_COMMAND, can_ids if can_id == BROADCAST_ID else frozenset((can_id,))
+            if kind != OTHER:
+                return kind, frozenset((can_id,))
+        return "foreign frame", frozenset()
 
     def _take(self, port: CanPort, message: can.Message) -> None:
-        kind, can_id = self._sort(port, message)
+        kind, can_ids = self._sort(port, message)
+        joints = [self._joint_of[can_id] for can_id in can_ids]
         if kind != REPLY:
             self.ignored[kind] += 1
-            if kind == FOREIGN_COMMAND:
-                self._oppose(self._joint_of[can_id], bytes(message.data))
+            for joint in joints if kind == FOREIGN_COMMAND else ():
+                self._oppose(joint, bytes(message.data))
+            for joint in joints if kind in (MALFORMED, SERVO) else ():
+                self.boards.heard(joint, kind, bytes(message.data), self._now())
             return
-        joint = self._joint_of[can_id]
-        sample = self._motors[joint].sample(message.data, self._now())
+        (joint,) = joints
+        now = self._now()
+        asked = self._requests[joint].replied(now) if self.replies[joint] else now
+        sample = self._motors[joint].sample(message.data, asked)
+        self.boards.take(joint, sample)
         self._answered.add(joint)
-        if self._is_confirming and (joint in self._asked or abs(sample.effort) < OFF_EFFORT):
-            self._unconfirmed.discard(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
             self._follow(joint, sample)
         else:
@@ -321,12 +303,12 @@ class MotorBus:
         self.foreign_commands += 1
         self._contested[joint] = now
         self.foreign_command = f"another sender commands motor {motor.can_id} (frame [{foreign.hex(' ')}])"
-        if not (self._powered and self._drive.powered) or self._drive.unsure[joint]:
+        if self._drive.send[joint] not in (Send.COMMAND, Send.ENTER):
             return
         if foreign in [data for _, data in motor.set_zero]:
             self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
         command = self._command(joint, now)
         is_exit = foreign in [data for _, data in motor.exit]
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
-            self._send(self._ports[joint], *((command, *motor.enter) if is_exit else ()), command)
+            self._send(self._ports[joint], *(motor.enter if is_exit else ()), command)
             self._corrected[joint] = now

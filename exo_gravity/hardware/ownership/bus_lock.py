@@ -24,7 +24,7 @@ from pathlib import Path
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import NO_MOTOR, Drive
+from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive
 from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -39,7 +39,7 @@ FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a p
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
 NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
 # Of motors that may be on: the first frames hold.
-UNKNOWN_DRIVE = Drive(NO_TORQUE, (DAMPING,) * JOINT_COUNT, True, NO_MOTOR, NO_MOTOR)
+UNKNOWN_DRIVE = Drive(NO_TORQUE, (DAMPING,) * JOINT_COUNT, COMMANDS, True)
 
 
 class DriveNotes(ctypes.Structure):
@@ -59,14 +59,15 @@ class DriveNotes(ctypes.Structure):
     )
     clock: Clock = COMPUTER_CLOCK
 
-    def note(self, drive: Drive, powered: bool) -> None:
+    def note(self, drive: Drive) -> None:
         """Note what the motors are about to receive, and whether one may be on."""
-        NOTE.pack_into(self, 0, self.clock.monotonic(), powered, *drive.effort, *drive.damping)
+        NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
         """What the motors received last."""
-        return Drive(tuple(self._effort), tuple(self._damping), bool(self._powered), NO_MOTOR, NO_MOTOR)
+        powered = bool(self._powered)
+        return Drive(tuple(self._effort), tuple(self._damping), COMMANDS if powered else OFF.send, powered)
 
     @property
     def owner(self) -> str:
@@ -109,7 +110,7 @@ class BusLock:
         if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
             self.problem = f"{path}: damaged"
         if self.problem:
-            self.notes.note(UNKNOWN_DRIVE, True)
+            self.notes.note(UNKNOWN_DRIVE)
         self.notes.owner = owner
         self.notes.heartbeat = 0.0
 
@@ -138,17 +139,17 @@ class ArmNotes:
         """Return the notes of the buses of these joints alone."""
         return ArmNotes(self._pages, joints)
 
-    def note(self, drive: Drive, powered: bool) -> None:
-        """Note what the motors are about to receive, and whether one may be on."""
+    def note(self, drive: Drive) -> None:
+        """Note what the motors are about to receive."""
         for page in self.noted:
-            page.note(drive, powered)
+            page.note(drive)
 
     @property
     def drive(self) -> Drive:
         """What the motors received last; powered if they may be on on one bus."""
         drives = [page.drive for page in self._pages]
         effort, damping = zip(*((drive.effort[i], drive.damping[i]) for i, drive in enumerate(drives)), strict=True)
-        return Drive(effort, damping, any(drive.powered for drive in drives), NO_MOTOR, NO_MOTOR)
+        return Drive(effort, damping, COMMANDS, any(drive.powered for drive in drives))
 
     @property
     def time(self) -> float:

@@ -17,6 +17,7 @@ from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.delivery import DELIVERY
+from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -69,8 +70,9 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
     left = [joint for joint in arm.joints if not ports[joint]]
     own = notes.of([joint for joint in arm.joints if ports[joint]])
     drive, clock, is_complete = notes.drive, notes.clock, False
-    motors = MotorBus(ports, arm.motors, powered=True, note=own.note, clock=clock)
-    first = drive._replace(powered=True, unsure=(True,) * len(drive.effort))
+    motors = MotorBus(ports, arm.motors, note=own.note, clock=clock)
+    send = [Send.COMMAND if replies else Send.NOTHING for replies in motors.replies]
+    first = drive._replace(send=tuple(send), powered=True)
     end = clock.monotonic() + TAKE_OVER.first_replies
     while not is_complete and clock.monotonic() < end:
         try:
@@ -95,7 +97,7 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
             motors.close()
             return False
     loop.stop()
-    if motors.may_be_powered:
+    if not machine.is_off:
         return False
     return not left or let_down(replace(arm, joints=left), notes, log, is_wanted)
 

@@ -5,18 +5,21 @@ alone, whose bytes are the same for every motor type: the gains' ranges are, and
 is never sent, so torque never flows; a motor that was left on lowers its joint under damping. IDs above `MAX_CAN_ID`
 are not scanned: there, an echoed command could be taken for a reply.
 
-V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on.
+V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on. V1
+and V2 boards in servo mode send the same frames, and are told apart by their rate alone: as delivered 50 a second, where
+a V3 board must be set to 200 at least.
 """
 
 import contextlib
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE
 from exo_gravity.core.motors.specs import MOTORS, pack_command
 from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
 from exo_gravity.core.safety.limits import DAMPING
@@ -30,6 +33,7 @@ DAMPED = pack_command(SPEC, 0.0, 0.0, 0.0, DAMPING, 0.0)
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 COMMANDS = 2  # to each ID, in case a frame is lost
+SERVO_RATE = 100.0  # status frames a second below which a board is no V3 board that an arm can use
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
 IDS = frozenset(range(1, 256))
 
@@ -39,10 +43,10 @@ class MotorAnswer(NamedTuple):
 
     can_id: int
     reply_id: int  #: Arbitration ID: the motor's own or 0, or that of a V3 board's status frames.
-    reply_length: int  #: 6 or 8 bytes.
+    reply_length: int  #: 6, 7 or 8 bytes.
     position: float  #: Motor angle in rad.
-    temperature: int | None  #: degC; None from 6-byte firmware.
-    error: int | None  #: Code of MOTOR_ERRORS; None from 6-byte firmware.
+    temperature: int | None  #: degC; None from firmware that replies with 6 or 7 bytes.
+    error: int | None  #: The error byte; None likewise.
     wire_format: str = MIT.name  #: Name of the board's format.
 
 
@@ -100,6 +104,7 @@ class BusScan(contextlib.ExitStack):
         self._now = clock.monotonic
         self.name = address[1]
         self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
+        self._rates: Counter[int] = Counter()  # Hz of their status frames
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
         try:
@@ -110,7 +115,9 @@ class BusScan(contextlib.ExitStack):
                 )
             self._port = CanPort(open_bus(*address), clock)
             self.callback(self._port.close)
-            for message, kind, _ in self._frames(LISTEN_TIME):
+            for message, kind, answer in self._frames(LISTEN_TIME):
+                if answer and message.is_extended_id:
+                    self._rates[answer.can_id] += 1.0 / LISTEN_TIME
                 heard = message.arbitration_id
                 if (kind == COMMAND) if message.is_extended_id else (heard <= MAX_CAN_ID):
                     raise BusError(
@@ -146,6 +153,12 @@ class BusScan(contextlib.ExitStack):
                     break
         for can_id in sorted(can_id for can_id in self._v3 if can_id > MAX_CAN_ID):
             problems[f"ID {can_id}: a V3 board; its ID must be from 1 to {MAX_CAN_ID}"] = None
+        for can_id, rate in sorted(self._rates.items()):
+            if rate < SERVO_RATE:
+                problems[
+                    f"ID {can_id}: about {rate:.0f} status frames a second: if it is a V1 or V2 board in servo mode, set "
+                    f"it to MIT mode with the vendor's tool; if it is a V3 board, set it to {MAX_STATUS_RATE:g} a second"
+                ] = None
         return tuple(found[can_id] for can_id in sorted(found)), tuple(problems)
 
     def poll(self, can_ids: Iterable[int]) -> dict[int, MotorAnswer]:

@@ -16,9 +16,10 @@ from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
-from exo_gravity.core.motors.specs import MOTOR_ERRORS
+from exo_gravity.core.motors.specs import error_text
+from exo_gravity.core.motors.wire_formats import MIT
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.lab.calibration.bus_scan import ArmScan, BusScan, MotorAnswer
+from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.arms import ConfiguredArm
@@ -35,7 +36,7 @@ MOTIONS = (
     "bend the elbow",
 )
 UNCHECKED = "not checked after a power-up"
-CALL_SET_ZERO = "call can_bridge's service set_zero with the arm hanging, and begin again"
+STORE_ZERO = "store a zero with the vendor's tool while the arm hangs, switch the power off and on, and begin again"
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,15 @@ class MotorSearch:
         zeros = []
         rows = zip(self.found.items(), self._arm.motors, at_rest, pose, strict=True)
         for (can_id, (name, direction)), motor, angles, angle in rows:
-            zero = fmean(angles) - direction * math.radians(angle)
+            # The scan decodes every reply of a V1 or V2 board with the usual position range.
+            is_mit = self._last[can_id].wire_format == MIT.name
+            scale = motor.spec.position_range / SPEC.position_range if is_mit else 1.0
+            zero = scale * fmean(angles) - direction * math.radians(angle)
             zeros.append(round(zero, 4))
             try:
                 JointMotor(motor.spec, can_id, direction, zero)
             except ParameterError as error:  # the angle would wrap
-                refusals.append(f"{name}: {error}: {CALL_SET_ZERO}")
+                refusals.append(f"{name}: {error}: {STORE_ZERO}")
         node, directions = f"{self._arm.namespace}/can_bridge", [direction for _, direction in self.found.values()]
         formats = [self._last[can_id].wire_format for can_id in self.found]
         changes = (
@@ -138,7 +142,11 @@ class MotorSearch:
         if len(answers) < JOINT_COUNT:
             listed = ", ".join(map(str, self._last)) or "none"
             count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"
-            problems = (*problems, f"{count}: check power, plugs, terminators and the bit rate")
+            problems = (
+                *problems,
+                f"{count}: check power, plugs, terminators and the bit rate. A V1 or V2 board must be in MIT mode; a V3 "
+                "board must report unasked, not in query-reply mode",
+            )
         if problems:
             raise DataError("; ".join(problems))
 
@@ -182,7 +190,11 @@ class MotorSearch:
                 "silent" if can_id in silent else f"{math.degrees(answer.position):.1f}",
                 f"{math.degrees(angles[-1] - angles[0]):+.1f}",
                 "-" if answer.temperature is None else str(answer.temperature),
-                "-" if answer.error is None else MOTOR_ERRORS.get(answer.error, str(answer.error)),
+                "-"
+                if answer.error is None
+                else "none"
+                if not answer.error
+                else f"{answer.error} ({error_text(answer.error)})",
                 f"{answer.reply_length} bytes",
                 hex(answer.reply_id) if answer.reply_id > MAX_CAN_ID else str(answer.reply_id),
                 answer.wire_format,
@@ -244,7 +256,7 @@ class MotorSearch:
                 is_turn = turns and abs(away - turns * turn) < STILL.same
                 cause = f"{turns:+d} rotor turns" if is_turn else "no whole number of rotor turns"
                 refusals.append(
-                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {CALL_SET_ZERO}"
+                    f"{name}: {math.degrees(away):+.0f} degrees off after the power-up, {cause}: {STORE_ZERO}"
                 )
         unchecked = f"{UNCHECKED}: hang the arm each time the motors are switched on"
         return "the same after a power-up with the arm hanging" if is_checked else unchecked, refusals

@@ -16,6 +16,8 @@ from functools import wraps
 from typing import Any
 
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -27,6 +29,7 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import request_real_time
@@ -35,6 +38,7 @@ from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
+from exo_gravity.nodes.ros.inner import Until, age_of_request, prepare_transitions
 from exo_gravity.nodes.ros.parameters import bus_of, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import TiltSubscription
@@ -43,6 +47,12 @@ REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
 DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
 REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
+UNREACHED = "a motor does not reply and may still be powered; the node stays active"
+LEAVING = "the node is being deactivated"
+# Transitions by the label or the number of a request: those that arm the arm, and those that let it down first.
+ARMING = ("configure", Transition.TRANSITION_CONFIGURE, "activate", Transition.TRANSITION_ACTIVATE)
+DEACTIVATE = ("deactivate", Transition.TRANSITION_DEACTIVATE)
+SHUTDOWN = ("shutdown", "active_shutdown", Transition.TRANSITION_ACTIVE_SHUTDOWN)
 # Set by launcher and launch file: the time in s for the watchdog of the dead bridge to let the arm down.
 RECOVER = "EXO_GRAVITY_RECOVER"
 
@@ -101,15 +111,17 @@ class CanBridge(LifecycleNode):
         self._thread_priority = values["thread_priority"]
         self._owned: OwnedBus | None = None  # while configured
         self._bus: MotorBus | None = None  # while inactive
+        self._is_leaving = False  # the arm is let down for a transition
         self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop, answer)
         lease = operation.Operator(self, lambda: self.loop).lease
         self._report = operation.BridgeReport(self, self._arm, traffic, lease)
-        operation.BridgeServices(self, lambda: self.loop, motors)
+        operation.BridgeServices(self, lambda: self.loop, motors, lambda: LEAVING if self._is_leaving else "")
+        prepare_transitions(self, self._prepare)
         if any(limits.largest_moment):
             _follow_gravity(self, lambda: self.loop)
         self.create_timer(REPORT_PERIOD, self._on_report)
-        operation.log_risks(self, traffic, values["rate"])
+        operation.log_risks(self, self._arm.address[0], traffic, values["rate"])
         if values["autostart"]:
             for trigger in (self.trigger_configure, self.trigger_activate):
                 if trigger() is not TransitionCallbackReturn.SUCCESS:
@@ -160,10 +172,30 @@ class CanBridge(LifecycleNode):
             if loop.failure:
                 raise BusError(f"the control thread has ended: {loop.failure}")
             if time.monotonic() > end:
-                raise BusError("a motor does not reply and may still be powered; the node stays active")
+                raise BusError(UNREACHED)
             self._report_descent()
             time.sleep(REPORT_PERIOD)
         self._stop(loop)
+
+    async def _prepare(self, request: ChangeState.Request) -> str:
+        """Let the arm down before a transition that needs it off; return why a transition is refused, or ''.
+
+        Meanwhile the executor goes on: reports are sent, and requests are answered.
+        """
+        transition, loop = request.transition.label or request.transition.id, self.loop
+        if self._is_leaving:
+            return LEAVING
+        if transition in ARMING:
+            return operation.why_too_old(age_of_request(self))
+        if loop is None or loop.is_off or transition not in (*DEACTIVATE, *SHUTDOWN):
+            return ""
+        self._is_leaving = True
+        try:
+            loop.call(lambda: loop.safety.disable(time.monotonic()))
+            await Until(lambda: loop.is_off or loop.failure, DESCENT_TIMEOUT)
+        finally:
+            self._is_leaving = False
+        return "" if loop.is_off or loop.failure or transition in SHUTDOWN else UNREACHED
 
     def close(self) -> None:
         """Let the arm down, send the last frames, close the bus and release it, in any state.
@@ -200,7 +232,8 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else ""
+        boards = loop.bus.boards.hindrance(time.monotonic(), 1.0 / loop.period)
+        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else boards
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
@@ -212,7 +245,9 @@ class CanBridge(LifecycleNode):
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
     """Declare the parameters; return their values, and the arm that they describe. Raises ParameterError."""
     values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-    return values, ArmOnBus(bus_of(node, values), motors_of(values), limits_of(values), 1.0 / values["rate"])
+    serials = serials_of(values["can.serial"], values["can.channel"])
+    address, motors, limits = bus_of(node, values), motors_of(values), limits_of(values)
+    return values, ArmOnBus(address, motors, limits, 1.0 / values["rate"], serials=serials)
 
 
 def _owner(node: Node) -> str:

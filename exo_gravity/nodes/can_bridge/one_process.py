@@ -12,11 +12,11 @@ import sys
 
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.nodes.can_bridge import node
 from exo_gravity.nodes.compensator.node import CompensatorNode
+from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.subscriptions import STOP_CHECK_PERIOD, PeriodicThread
 
 
@@ -27,7 +27,7 @@ class CompensatedBridge(node.CanBridge):
         context = Context()
         rclpy.init(args=arguments, context=context, signal_handler_options=SignalHandlerOptions.NO)
         self._compensator = CompensatorNode(context)
-        self._its_executor = executor = SingleThreadedExecutor(context=context)
+        self._its_executor = executor = NodeExecutor(context)
         executor.add_node(self._compensator)
         self._spinning = PeriodicThread("compensator", lambda: executor.spin_once(STOP_CHECK_PERIOD), 0.0)
         self._spinning.start()

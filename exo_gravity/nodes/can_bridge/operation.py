@@ -1,8 +1,12 @@
 """How `can_bridge` is operated: its services enable, clear_fault, resume and set_zero; its limits; /diagnostics.
 
-Each service runs on the control thread between two cycles. Who holds control is a lease (core/safety/lease.py).
+Each service runs on the control thread between two cycles, and the executor does not wait for it: a request to let the
+arm down never waits behind others, and ends those that would arm it. A request that would arm the arm is refused once
+it is older than REQUEST_LIFE: whoever sent it no longer expects it to be carried out. One that lets the arm down is
+carried out at any age. Who holds control is a lease (core/safety/lease.py).
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
@@ -21,20 +25,21 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
+from exo_gravity.hardware.can.adapter import serial_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others
+from exo_gravity.nodes.ros.inner import Until, age_of_request, wake
 from exo_gravity.nodes.ros.messages import ERROR, HELD_BY, NOBODY, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
-ZERO_TOLERANCE = 0.02  # rad that a motor may report after set_zero
-ZERO_TIMEOUT = 3.0  # s; motors are silent for up to 1.5 s while they write their memory
 REQUESTS = 32  # of control, that wait for the next look
 WATCH_PERIOD = 0.1  # s between two looks at them
 CALL_TIMEOUT = 2.0  # s that a service waits for the control thread
+REQUEST_LIFE = 1.0  # s; a busy computer delays requests by tenths of that
 
 # What follows a request that was carried out, by the state that it led to.
 FOLLOWS = {
@@ -59,15 +64,37 @@ def refuse_simulated_time(node: Node, interface: str) -> None:
     node.set_descriptor("use_sim_time", fixed)
 
 
+def why_too_old(age: float) -> str:
+    """Return why a request that is `age` s old may not arm an arm; '' if it may."""
+    if age <= REQUEST_LIFE:
+        return ""
+    return (
+        f"refused: the request is {age:.1f} s old, must be at most {REQUEST_LIFE:g} s: send it again; if it comes from "
+        "another computer, compare the clocks"
+    )
+
+
 class BridgeServices:
-    """Creates the services on `node`. get_loop returns the present control loop, None while the node is inactive.
+    """Creates the services on `node`.
+
+    get_loop: returns the present control loop, None while the node is inactive.
+    hindrance: returns why the arm may not be armed now; '' if it may.
 
     Each method below, on the control thread, does what its service is for and returns why it is refused, or ''.
     """
 
-    def __init__(self, node: Node, get_loop: Callable[[], ControlLoop | None], motors: Sequence[JointMotor]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        get_loop: Callable[[], ControlLoop | None],
+        motors: Sequence[JointMotor],
+        hindrance: Callable[[], str],
+    ) -> None:
+        self._node = node
         self._get_loop = get_loop
-        self._zero = [motor.zero for motor in motors]
+        self._hindrance = hindrance
+        self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
+        self._motors = tuple(motors)
         services = {self.enable: SetBool, self.clear_fault: Trigger, self.resume: Trigger, self.set_zero: Trigger}
         for function, kind in services.items():
             node.create_service(kind, f"~/{function.__name__}", partial(self.answer, function))
@@ -92,32 +119,44 @@ class BridgeServices:
         return "" if loop.safety.resume(time.monotonic()) else f"refused: {why_not}"
 
     def set_zero(self, loop: ControlLoop, _request: Trigger.Request) -> str:
-        """Make the present pose the motors' zero, while they are off."""
-        safety, now = loop.safety, time.monotonic()
-        if any(self._zero):
-            return f"zero = {self._zero}: must be all 0 when the motors store the zero"
-        is_silent = any(safety.limits.is_silent(now, joint) for joint in loop.samples)
-        if safety.state is not State.DISABLED or is_silent or not safety.is_at_rest(now):
-            return f"refused: the arm is {safety.state.value}; must be disabled and at rest, and all motors reply"
-        loop.bus.set_zero()
-        return ""
+        """Return what to write instead: some firmware forgets a zero that is set over the bus with its power."""
+        if any(not math.isfinite(joint.position) for joint in loop.samples):
+            return "refused: motors may forget a zero that is set over the bus; write zero: in the file, once all reply"
+        columns = zip(self._motors, loop.samples, strict=True)
+        zeros = ", ".join(f"{motor.motor_position(joint.position):.4f}" for motor, joint in columns)
+        return (
+            "refused: motors may forget a zero that is set over the bus when their power goes. To make the present "
+            f"angles 0, write zero: [{zeros}] for can_bridge in the parameter file, and start again"
+        )
 
-    def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
-        """Run `function` on the control thread, and wait for the motors' zeros if it has set them.
+    async def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
+        """Run `function` on the control thread.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
         """
-        loop, since = self._get_loop(), time.monotonic()
+        loop = self._get_loop()
+        response.success, response.message = False, "the node is not active"
         if loop is None:
-            response.success, response.message = False, "the node is not active"
             return response
+        lets_down = function == self.enable and not request.data
+        if not lets_down and (why_not := why_too_old(age_of_request(self._node)) or self._hindrance()):
+            response.message = why_not
+            return response
+        if lets_down:
+            for waiting in tuple(self._arming):
+                waiting.cancel()
         future = loop.call(lambda: function(loop, request))
+        if not lets_down:
+            self._arming.add(future)
+        future.add_done_callback(lambda _: wake(self._node))
+        await Until(future.done, CALL_TIMEOUT)
+        self._arming.discard(future)
         try:
-            response.message = future.result(CALL_TIMEOUT)
-            if function == self.set_zero and not response.message:
-                response.message = _wait_for_zeros(loop, since)
+            response.message = future.result(0.0)
         except BusError as error:
             response.message = str(error)
+        except futures.CancelledError:
+            response.message = "refused: the arm was asked to be let down"
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
             future.cancel()
             response.message = "the control thread did not respond"
@@ -125,17 +164,6 @@ class BridgeServices:
         if response.success:
             response.message = FOLLOWS.get(loop.safety.state, "")
         return response
-
-
-def _wait_for_zeros(loop: ControlLoop, since: float) -> str:
-    """Wait for replies of all motors, later than `since` (monotonic s), at their zero; return who did not reply so."""
-    while not all(joint.time > since and abs(joint.position) <= ZERO_TOLERANCE for joint in loop.samples):
-        if time.monotonic() > since + ZERO_TIMEOUT:
-            columns = zip(loop.safety.limits.joint_names, loop.samples, strict=True)
-            positions = ", ".join(f"{name} at {joint.position:.3f} rad" for name, joint in columns)
-            return f"the motors did not set their zero: {positions}"
-        time.sleep(0.005)
-    return ""
 
 
 class Operator:
@@ -171,10 +199,12 @@ class Operator:
         self._news = self.lease.request(self._now(), message.key, message.value) or self._news
 
 
-def log_risks(node: Node, traffic: Mapping[str, Traffic], rate: float) -> None:
-    """Log the load of each bus at `rate` (Hz), and whether other hosts can command the arm."""
+def log_risks(node: Node, interface: str, traffic: Mapping[str, Traffic], rate: float) -> None:
+    """Log the load of each bus at `rate` (Hz), its adapter, and whether other hosts can command the arm."""
     log = node.get_logger()
     for name, bus in traffic.items():
+        if serial := serial_of(interface, name):
+            log.info(f"the adapter of {name} has the serial number {serial}: can.serial binds the bus to it")
         log.info(
             f"bus load of {name} at {rate:g} Hz: {bus.load(rate):.0%} of {bus.bitrate / 1000:g} kbit/s, "
             f"{bus.load(rate, worst=True):.0%} at worst; the bus is full at {int(bus.largest_rate)} Hz"
@@ -223,6 +253,7 @@ class BridgeReport:
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
+            "temperatures when switched on": "implausible" if loop.bus.boards.odd_temperature else "plausible",
             "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
@@ -239,6 +270,8 @@ class BridgeReport:
         hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
         if hot:
             warnings.append(f"above rated torque for too long: {', '.join(hot)}")
+        if odd := loop.bus.boards.odd_temperature:
+            warnings.append(odd)
         if 0.0 < rate < self._slow:
             warnings.append(f"slower than {self._slow:.0f} Hz")
         self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)

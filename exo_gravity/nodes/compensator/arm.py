@@ -172,6 +172,7 @@ class MultiArrayInterface(PeriodicThread):
         self._message = Float64MultiArray()
         self._is_late = False  # the last joint state, by its stamp
         self._applied: Sequence[float] = ()  # Nm, what the joints applied before the first effort
+        self._velocity: Sequence[float] | None = None  # rad/s, of the last joint state
         node.create_service(Trigger, "~/clear_fault", self._clear)
 
     @property
@@ -197,7 +198,8 @@ class MultiArrayInterface(PeriodicThread):
             raise ParameterError("age by its stamp", round(age, 3), f"from {-TILT.lead:g} to {self._timeout:g} s")
         if self._fade.state == "waiting":
             self._applied = by_name(message, "effort", self._names, exact=False)
-        return by_name(message, "position", self._names, exact=False), velocity_of(message, self._names, exact=False)
+        self._velocity = velocity_of(message, self._names, exact=False)
+        return by_name(message, "position", self._names, exact=False), self._velocity
 
     def send(self, now: float, message: JointState, answer: Compensation) -> None:
         """Send the answer to a joint state, or begin the fade."""
@@ -206,7 +208,7 @@ class MultiArrayInterface(PeriodicThread):
                 return  # one late message is not yet a reason to let the arm down
             if answer.effort is None:
                 self._fade.withdraw(now, answer.reason)
-            elif effort := self._fade.take(now, answer.effort, self._applied):
+            elif effort := self._fade.take(now, answer.effort, self._applied, self._velocity):
                 self._publish(effort)
 
     def stop(self) -> None:
@@ -230,5 +232,5 @@ class MultiArrayInterface(PeriodicThread):
     def _clear(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self._lock:
             response.success = self._fade.clear()
-        response.message = "cleared: the torque ramps in" if response.success else "nothing to clear, or still fading"
+        response.message = "cleared: the torque begins" if response.success else "nothing to clear, or still fading"
         return response

@@ -54,13 +54,7 @@ class CompensatorNode(Node):
     """
 
     def __init__(self, context: Context | None = None) -> None:
-        # A parameter that is not in the table is refused by `accept_changes`, which names it: rclpy does not.
-        super().__init__(
-            "compensator",
-            context=context,
-            automatically_declare_parameters_from_overrides=True,
-            allow_undeclared_parameters=True,
-        )
+        super().__init__("compensator", context=context, automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
         table, values, read = declared(self)
         self._names = values["joint_names"]
@@ -152,7 +146,7 @@ class CompensatorNode(Node):
         now = time.monotonic()
         try:
             theta, velocity = self._interface.read(message)
-            if self._interface.problem:  # no step: the torque must ramp in from zero
+            if self._interface.problem:  # no step: there is no torque to change
                 answer = Compensation.withdrawn(self._interface.problem)
             else:
                 with self._lock:

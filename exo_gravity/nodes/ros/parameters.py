@@ -14,6 +14,7 @@ from rclpy.task import Future
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import Param, values_of
+from exo_gravity.nodes.ros.inner import intercept_changes
 
 T = TypeVar("T")
 
@@ -34,24 +35,22 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
         if node.has_parameter(param.name):
             node.undeclare_parameter(param.name)
         node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
-    _accept_unchanged(node)
-    return values
-
-
-def _accept_unchanged(node: Node) -> None:
-    """Let a read-only parameter be set to the value that it has, so that `ros2 param load` reads a node's own dump."""
-    set_parameters = node.set_parameters_atomically
 
     def is_same(given: Parameter) -> bool:
         if not node.has_parameter(given.name) or not node.describe_parameter(given.name).read_only:
             return False
         return bool(plain(given.value) == plain(node.get_parameter(given.name).value))
 
-    def set_others(parameters: list[Parameter]) -> SetParametersResult:
-        others = [given for given in parameters if not is_same(given)]
-        return set_parameters(others) if others else SetParametersResult(successful=True)
+    def refusal(given: Parameter) -> str:
+        if not node.has_parameter(given.name):
+            try:
+                values_of(table, {given.name: plain(given.value)}, free_prefix)
+            except ParameterError as error:
+                return str(error)
+        return ""
 
-    node.set_parameters_atomically = set_others  # which rclpy's parameter services call
+    intercept_changes(node, refusal, is_same)
+    return values
 
 
 def accept_changes(

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -23,6 +22,7 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.nodes.ros.inner import NodeExecutor
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
@@ -59,7 +59,7 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     gc.collect()
     gc.freeze()  # imported modules stay: later collections can skip them
     sys.setswitchinterval(SWITCH_INTERVAL)
-    executor = SingleThreadedExecutor()
+    executor = NodeExecutor()
     executor.add_node(node)
     try:
         while not ending:

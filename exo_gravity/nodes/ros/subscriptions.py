@@ -3,7 +3,7 @@
 rclpy's executor rebuilds its wait set, services included, for every message. That is most of a message's cost
 (measured, there and back at 500 Hz: 35 + 21 % of a core, against 14 + 11 % here; at 2,000 messages a second it is most
 of a core). A flood is shed before Python sees it: the middleware keeps `qos.depth` messages, and a thread sleeps for
-`pause` between two polls. `WaitSet` and `take_message` are internal to rclpy; its `wait_for_message` uses them, too.
+`pause` between two polls. inner.py has the wait set, and what is done where rclpy has none.
 """
 
 import math
@@ -15,8 +15,6 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
@@ -24,6 +22,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.arm.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import NO_ROTATION, NOT_REPORTED, TiltInput
+from exo_gravity.nodes.ros.inner import Inbox, open_inbox
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -37,14 +36,6 @@ DISTRUST_TIME = 0.2  # s for which a topic is not trusted after a second publish
 DATA, PITCH_YAW = "/imu/data", "/imu/pitch_yaw"
 
 Callback = Callable[[Any, dict[str, Any]], None]
-
-
-class OutsideExecutor(ReentrantCallbackGroup):
-    """Keeps its subscriptions out of the executor's wait set."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False: the executor handles none of them."""
-        return False
 
 
 class PeriodicThread:
@@ -83,6 +74,7 @@ class PolledSubscription(PeriodicThread):
 
     pause: s for which the thread sleeps after each poll; of what arrives meanwhile it gets the last `qos.depth`.
     raw: whether the callback gets the messages as bytes.
+    open_inbox: what the messages wait in.
     """
 
     def __init__(
@@ -94,27 +86,21 @@ class PolledSubscription(PeriodicThread):
         qos: QoSProfile = NEWEST_ONLY,
         pause: float = POLL_PAUSE,
         raw: bool = False,
+        open_inbox: Callable[[Node, type, str, QoSProfile, bool], Inbox] = open_inbox,
     ) -> None:
         super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
         self._callback, self._depth = callback, qos.depth
-        self._subscription = node.create_subscription(
-            msgtype, topic, callback, qos, callback_group=OutsideExecutor(), raw=raw
-        )
-        self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+        self._inbox = open_inbox(node, msgtype, topic, qos, raw)
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
 
         At most as many messages as the queue holds are taken, however many arrive meanwhile.
         """
-        handle, msgtype, raw = self._subscription.handle, self._subscription.msg_type, self._subscription.raw
         if timeout > 0.0:
-            with handle:
-                self._wait_set.clear_entities()
-                self._wait_set.add_subscription(handle)
-                self._wait_set.wait(int(timeout * 1e9))
+            self._inbox.wait(timeout)
         for _ in range(self._depth):
-            item = handle.take_message(msgtype, raw)
+            item = self._inbox.take()
             if item is None:
                 return
             self._callback(*item)

@@ -76,8 +76,6 @@ def test_when_messages_stop_the_torque_is_zero_100_ms_after_the_next_one_was_due
     loop.run(0.1 + 2 * CYCLE)
     assert loop.torques[-1] == (0.0,) * 4
     assert loop.input.state == "waiting" and loop.input.reason == "assist_efforts stopped"
-    largest = np.abs(np.diff(loop.torques, axis=0)).max()
-    assert largest <= 1.001 * CYCLE / TUNING.fade  # 1 Nm in TUNING.fade
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -88,7 +86,7 @@ def test_one_lost_message_costs_at_most_half_of_the_torque_and_it_returns(rate):
     loop.sending = True
     loop.run(1.0)
     assert loop.torques[-1] == pytest.approx(FOLLOWED)
-    if rate > 40:  # below, the gap is longer than any fade
+    if rate > 40:  # below, the gap is longer than an effort is valid
         assert loop.torques == [pytest.approx(FOLLOWED)] * len(loop.torques)
 
 
@@ -119,7 +117,6 @@ def test_a_wrong_message_fades_the_torque_at_once_and_sound_ones_bring_it_back(n
     loop.run(TUNING.recovery - 0.1)
     assert loop.torques[-1] == (0.0,) * 4
     assert loop.run(2.0) == pytest.approx(FOLLOWED)
-    assert np.abs(np.diff(loop.torques, axis=0)).max() <= 1.001 * CYCLE / TUNING.fade
 
 
 @pytest.mark.parametrize(
@@ -173,8 +170,7 @@ def test_the_torque_of_an_outer_loop_that_died_never_returns(goes_on, pause):
     torque = np.array(loop.torques)[:, 0]
     if pause > 0.2:
         assert not np.any(torque)
-    assert np.all(np.diff(torque) <= 0.0) and torque[-1] == 0.0  # what is left of it fades and nothing else comes
-    assert np.abs(np.diff(torque)).max() <= 5.0 * 1.001 * CYCLE / TUNING.fade
+    assert np.all(np.diff(torque) <= 0.0) and torque[-1] == 0.0
 
 
 def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
@@ -184,7 +180,7 @@ def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
     loop.input.assist = Assist((1.0,) * 4)
     loop.sending = False
     loop.run(0.04)  # the newest message is still valid
-    assert loop.torques[-1] == pytest.approx((5.0 - 0.04 * TUNING.max_rate, -5.0 + 0.04 * TUNING.max_rate, 0.0, 0.0))
+    assert loop.torques[-1] == (1.0, -1.0, 0.0, 0.0)
     loop.sending = True
     assert loop.run(1.0) == (1.0, -1.0, 0.0, 0.0)
 
@@ -232,7 +228,7 @@ message = st.fixed_dictionaries(
 
 @settings(max_examples=80, deadline=None)
 @given(st.lists(st.tuples(message, st.sampled_from([0.002, 0.01, 0.05, 0.1, 0.3])), max_size=40))
-def test_no_sequence_of_messages_exceeds_the_bound_or_steps(sequence):
+def test_no_sequence_of_messages_exceeds_the_bound(sequence):
     loop = OuterLoop()
     loop.sending = False
     for changes, pause in sequence:
@@ -241,6 +237,3 @@ def test_no_sequence_of_messages_exceeds_the_bound_or_steps(sequence):
         loop.run(pause)
     torques = np.array(loop.torques).reshape(-1, 4)
     assert np.all(np.abs(torques) <= ASSIST.max_effort)
-    # Fading from the bound, or following at the permitted rate while it ramps in.
-    most = np.array(ASSIST.max_effort) * (CYCLE / TUNING.fade + CYCLE / TUNING.ramp) + TUNING.max_rate * CYCLE
-    assert np.all(np.abs(np.diff(torques, axis=0)) <= most)

@@ -23,7 +23,7 @@ DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
 SUPPLY = "core.safety.monitors:SupplyMonitor.suspect"
 RIDE, RIDING = (f"core.safety.monitors:RideThrough.{name}" for name in ("step", "is_riding"))
 MONITOR, MOTION = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:MOTION"
-SHAPE = "core.safety.limits:Limits.shape"
+WALL = "core.safety.barrier:Barrier._wall"
 LEASE = "core.safety.lease:Lease.lost"
 COMPENSATOR = "core.compensation.compensator:Compensator.step"
 GUIDANCE = "core.compensation.guidance:GuidedChange.step"
@@ -207,7 +207,7 @@ DEFECTS = (
     Defect(
         "a soft wall without damping",
         ("elbow pushed into the soft wall",),
-        {SHAPE: after(lambda shaped, *_: (shaped[0], (0.0,) * len(shaped[1]), shaped[2]))},
+        {WALL: after(lambda wall, *_: (wall[0], 0.0))},
     ),
     Defect("torque delivery is not checked", ("motor 2 restarts in 30 ms",), {DELIVERY: after(lambda *_: None)}),
     Defect(

@@ -131,7 +131,7 @@ def test_a_bus_that_a_bridge_holds_is_refused_with_its_holder_and_free_after_the
 
 def test_a_bus_whose_motors_a_dead_bridge_may_have_left_on_is_refused_and_released(wire: Wire) -> None:
     lock = BusLock(ADDRESS, "a bridge")
-    lock.notes.note(lock.notes.drive, True)
+    lock.notes.note(lock.notes.drive._replace(powered=True))
     lock.release()
     with pytest.raises(BusError, match="may have left the motors on: start can_bridge"):
         scan_of(wire)

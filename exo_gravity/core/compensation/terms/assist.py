@@ -3,10 +3,10 @@
     off        `max_effort` is 0
     waiting    no messages yet, or they stopped; no torque
     refused    the last ones were wrong; no torque until they have been sound for `recovery`
-    assisting  the efforts are followed: clamped to `max_effort`, limited to `max_rate`, ramped in within `ramp`
+    assisting  the efforts are followed: clamped to `max_effort`, ramped in within `ramp`
 
-An effort is valid for `periods` observed periods, so that a single late message costs nothing. The input remembers only
-the torque that it applies, which moves towards the newest message and never past it: docs/terms.md.
+An effort is valid for `periods` observed periods, so that a single late message costs nothing. How fast the torque
+changes is limited for all of the compensator's torque together: docs/terms.md.
 """
 
 import math
@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
-from exo_gravity.core.compensation.guidance import RAMP
 from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
@@ -30,8 +29,6 @@ class AssistTuning:
     periods: float = 1.5  #: observed periods for which it is valid
     smoothing: float = 0.2  #: share of a new interval in the observed period
     max_lead: float = 0.02  #: s that a stamp may be ahead
-    fade: float = 0.05  #: s from full assistance to none
-    max_rate: float = 10.0  #: Nm/s, the fastest change of the torque
     ramp: float = 0.5  #: s from none to full
     recovery: float = 0.5  #: s without a wrong message, after which efforts are accepted again
 
@@ -59,8 +56,7 @@ class AssistInput:
         self.reason = "no assist_efforts yet"
         self._names = list(names)
         self._target = NO_TORQUE  # the newest efforts
-        self._torque = NO_TORQUE  # as applied
-        self._ramp = 0.0  # share of the target that may be applied
+        self._begin = math.inf  # s, since when they are followed
         self._period = ASSIST.slowest
         self._stamp = self._arrival = -math.inf
         self._refused = -math.inf
@@ -78,7 +74,7 @@ class AssistInput:
     @property
     def idle(self) -> bool:
         """Whether `torque` returns nothing, and will until the next message."""
-        return self._ramp <= 0.0 and not self.assist.on
+        return not self.assist.on
 
     @property
     def report(self) -> str:
@@ -99,7 +95,9 @@ class AssistInput:
         """
         interval, self._arrival = now - self._arrival, now
         is_stream = interval < ASSIST.slowest * ASSIST.periods
-        if is_stream:
+        if not is_stream:
+            self._begin = math.inf
+        else:
             self._period += ASSIST.smoothing * (min(interval, ASSIST.slowest) - self._period)
         problem = self._problem(now, names, efforts, stamp, from_another and is_stream)
         if problem:
@@ -122,20 +120,10 @@ class AssistInput:
 
     def torque(self, now: float) -> Torque:
         """Return the torque (4,) in Nm at `now`; call it in every cycle."""
-        dt = now - self._last
-        if not 0.0 <= dt <= RAMP.pause:
-            self._ramp, self._torque, dt = 0.0, NO_TORQUE, 0.0
-        self._last, before = now, self._ramp
-        if self._is_sound(now):
-            self._ramp = ramp = min(1.0, before + dt / ASSIST.ramp)
-            step = ASSIST.max_rate * min(dt, ASSIST.fade)
-            columns = zip(self._target, self._torque, self.assist.max_effort, strict=True)
-            self._torque = tuple([last + clamp(ramp * clamp(tau, most) - last, step) for tau, last, most in columns])
-        else:
-            self._ramp = max(0.0, before - dt / ASSIST.fade)
-            left = self._ramp / before if before else 0.0
-            self._torque = tuple([left * last for last in self._torque])
-        return self._torque
+        self._last = now
+        self._begin = min(self._begin, now) if self._is_sound(now) else math.inf
+        ramp = max(0.0, min(1.0, (now - self._begin) / ASSIST.ramp))
+        return tuple([ramp * clamp(tau, most) for tau, most in zip(self._target, self.assist.max_effort, strict=True)])
 
     def _is_sound(self, now: float) -> bool:
         """Return whether the newest efforts are to be followed at `now`; note why not."""

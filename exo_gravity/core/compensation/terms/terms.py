@@ -1,4 +1,4 @@
-"""The terms at work: their parameters, and their bounded, rate-limited sum, plus the outer loop's input.
+"""The terms at work: their parameters, and their bounded sum, plus the outer loop's input.
 
 The compensator guides a change of parameters. Whatever is wrong with the sum, gravity compensation goes on beneath it.
 A new term is a field of `TermSettings` and an item in `Terms._built`.
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
-from exo_gravity.core.compensation.guidance import RAMP, limited
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -39,8 +38,7 @@ class SumLimits:
     """What bounds all terms together."""
 
     effort: Sequence[float] = (2.0, 4.0, 2.0, 2.0)  #: Nm: well below the motors' rated torque, which gravity needs
-    rate: float = 50.0  #: Nm/s
-    pause: float = 0.2  #: s between two cycles, beyond which the terms begin again from no torque
+    pause: float = 0.2  #: s between two cycles, beyond which the acceleration is measured anew
     edge_share: float = 0.8  #: of the stiffness that the arm can bear, for `limits` where that is less
 
 
@@ -121,12 +119,12 @@ class Terms:
         self.settings = settings
         self.assist = AssistInput(names, settings.assist)
         self._refusal = ""  # why the sum is not used
-        self._output = self._assisted = NO_TORQUE
+        self._assisted = NO_TORQUE
         self.tank = EnergyTank()
         self._acceleration = AccelerationFilter()
         self._time = -math.inf
         self._state = TermState(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
-        self._has_inertia = self._has_changed = False
+        self._has_inertia = False
         self.in_force = TermsInForce(self._built(settings, arm), -math.inf)
 
     @property
@@ -144,7 +142,7 @@ class Terms:
     def apply(self, settings: TermSettings, arm: ArmModel) -> None:
         """Use new settings and a new arm at once: it is for the caller to guide the change (`guidance`)."""
         since = self.in_force.since if settings.spring == self.settings.spring else self._time
-        self.settings, self.assist.assist, self._has_changed = settings, settings.assist, True
+        self.settings, self.assist.assist = settings, settings.assist
         self.in_force = TermsInForce(self._built(settings, arm), since)
 
     def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
@@ -154,19 +152,15 @@ class Terms:
         """
         dt, self._time = now - self._time, now
         if not 0.0 <= dt <= SUM.pause:
-            self._output, self._has_changed, dt = NO_TORQUE, False, 0.0
+            dt = 0.0
         acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
         self._state = TermState(dt, theta, velocity, acceleration, now - self.in_force.since)
         total = _sum(self.in_force.terms, self._state)
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
             total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
-        step = math.inf if self._has_changed else SUM.rate * min(dt, RAMP.longest_step)
-        self._has_changed = False
-        columns = zip(total, self._output, SUM.effort, strict=True)
-        self._output = tuple([limited(wanted, last, limit, step) for wanted, last, limit in columns])
         self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
-        return tuple(map(operator.add, self._assisted, self._output))
+        return self._whole(total)
 
     def torque_of(self, other: TermsInForce) -> Torque:
         """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
@@ -174,6 +168,10 @@ class Terms:
         total = _sum(other.terms, state)
         if not math.isfinite(sum(total)):
             total = NO_TORQUE
+        return self._whole(total)
+
+    def _whole(self, total: Torque) -> Torque:
+        """Return the `total` (4,) of the terms in Nm, clamped, with the outer loop's efforts."""
         return tuple(map(operator.add, self._assisted, map(clamp, total, SUM.effort)))
 
     def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Callable[[TermState], Torque]]:

@@ -1,0 +1,166 @@
+"""The last hand on every drive: no torque that is asked for, whatever asks for it, throws an arm.
+
+`shape` limits the torque of an arm that is carried, in this order: soft wall before a joint limit, clamp to the
+permitted torque (derated when hot), rate limit. A joint that moves against torque which it does not get is damped.
+
+`damping` then bounds each drive that leaves the safety machine, whether the arm is carried or let down. With tau the
+feed-forward of a joint, v > 0 its speed along tau, V = `driven_speed` and F = V + BARRIER.span, the motor gets at least
+
+    kd = |tau| / F * min(1, max(0, (v - V) / (F - V)))
+
+From F on kd v >= |tau|: the motor as a whole takes energy out of the joint, however wrong tau is. So no feed-forward
+drives a joint beyond F, but for what happens within a cycle. The motor itself applies kd v, without delay and to its
+true speed: one wrong speed in a reply moves nothing. A light arm passes F within a cycle, so v leads the newest speed
+by its change over BARRIER.lead. A wearer who lifts their arm feels nothing up to V; at F they lift it without support.
+
+Damping is bounded, too: kd times the newest speed stays within `max_effort`, so that neither a wearer's jerk nor a fall
+makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule with others.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_COMMAND, MAX_EFFORT_RATE, WALL, Limits
+
+
+@dataclass(frozen=True)
+class BarrierTuning:
+    """How the barrier acts beyond `driven_speed`."""
+
+    span: float = 1.0  #: rad/s over which the brake rises; less is felt as a step
+    #: s, the speed's change over which is added to it. An empty forearm under 3 Nm gains 2 rad/s in a cycle of 4 ms, a
+    #: wearer who reaches at 3 rad/s 0.06
+    lead: float = 0.012
+    #: s, time constant with which the brake falls. It rises at once; if it fell so, a light arm would be thrown and
+    #: caught by turns, one cycle each
+    hold: float = 0.05
+    #: Nm s/rad a second, of damping that begins or ends: full damping within 0.2 s, so that it does not step
+    rate: float = DAMPING / 0.2
+    full: float = 0.99  #: of the permitted torque, from which on a joint counts as clamped: by the compensator, too
+
+
+BARRIER = BarrierTuning()
+
+
+class Shaped(NamedTuple):
+    """What a carried arm gets of what is asked for."""
+
+    effort: tuple[float, ...]  #: (n,) Nm
+    damping: tuple[float, ...]  #: (n,) Nm s/rad
+    acted: frozenset[str]  #: which limits acted, for people
+
+
+class Barrier:
+    """The bounds of one arm's drives.
+
+    limits: of the arm.
+    peak_damping: the most that each motor can apply, (n,) Nm s/rad.
+    """
+
+    def __init__(self, limits: Limits, peak_damping: Sequence[float]) -> None:
+        self._limits, self._peak = limits, tuple(peak_damping)
+        self._asked = [0.0] * len(self._peak)  # Nm s/rad, that rises and falls at BARRIER.rate
+        self._slow = [0.0] * len(self._peak)  # rad/s, the speed low-passed by BARRIER.lead
+        self._brake = [0.0] * len(self._peak)  # Nm s/rad
+
+    def shape(
+        self,
+        dt: float,
+        joints: Sequence[JointSample],
+        effort: Sequence[float],
+        share: Sequence[float],
+        before: Sequence[float],
+        damping: Sequence[float],
+    ) -> Shaped:
+        """Return what a carried arm gets.
+
+        dt: s since the last call.
+        joints: the newest readings (n,).
+        effort, damping: what is asked for, (n,) Nm and (n,) Nm s/rad.
+        share: 0..1, the factor (n,) on effort and soft wall where torque begins.
+        before: the torque of the last drive, (n,) Nm.
+
+        Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
+        """
+        step, step_of_damping = MAX_EFFORT_RATE * dt, BARRIER.rate * dt
+        shaped, dampings, acted = [], [], set()
+        for i, (name, joint) in enumerate(zip(self._limits.joint_names, joints, strict=True)):
+            if not abs(effort[i]) <= MAX_COMMAND:
+                raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
+            spring, wall = self._wall(i, joint)
+            permitted = self._permitted(i, joint)
+            wanted = share[i] * (effort[i] + spring)
+            clamped = max(-permitted, min(permitted, wanted))
+            limited = max(before[i] - step, min(before[i] + step, clamped))
+            missing = limited if abs(limited) >= BARRIER.full * permitted else wanted - limited
+            asked = DAMPING if missing * joint.velocity < 0.0 else damping[i]
+            last = self._asked[i]
+            self._asked[i] = max(last - step_of_damping, min(last + step_of_damping, asked))
+            shaped.append(limited)
+            # A wall's damping rises at once, since it already rises with the position.
+            dampings.append(max(wall, self._asked[i]))
+            if wall:
+                acted.add(f"soft wall ({name})")
+            if permitted < self._limits.max_effort[i]:
+                acted.add(f"derating ({name})")
+            if clamped != wanted:
+                acted.add(f"max_effort ({name})")
+            if limited != clamped:
+                acted.add(f"max_effort_rate ({name})")
+        return Shaped(tuple(shaped), tuple(dampings), frozenset(acted))
+
+    def damping(
+        self,
+        dt: float,
+        joints: Sequence[JointSample],
+        silent: Sequence[bool],
+        effort: Sequence[float],
+        damping: Sequence[float],
+    ) -> tuple[float, ...]:
+        """Return the damping (n,) in Nm s/rad of a drive that is to apply `effort` (n,) Nm.
+
+        dt: s since the last call.
+        joints: the newest readings (n,).
+        silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.
+        damping: what is asked for, (n,) Nm s/rad.
+        """
+        brakes = self.brake(dt, joints, effort)
+        columns = zip(joints, silent, damping, brakes, self._peak, self._limits.max_effort, strict=True)
+        bounded = []
+        for joint, is_silent, asked, brake, peak, most in columns:
+            speed = 0.0 if is_silent else abs(joint.velocity)
+            wanted = min(peak, asked if is_silent else max(asked, brake))
+            bounded.append(most / speed if wanted * speed > most else wanted)
+        return tuple(bounded)
+
+    def brake(self, dt: float, joints: Sequence[JointSample], effort: Sequence[float]) -> Sequence[float]:
+        """Return the damping (n,) in Nm s/rad that joints need which `effort` (n,) Nm drives; see the module."""
+        first, span = self._limits.driven_speed, BARRIER.span
+        share, kept = min(1.0, dt / BARRIER.lead), max(0.0, 1.0 - dt / BARRIER.hold)
+        for i, (joint, tau) in enumerate(zip(joints, effort, strict=True)):
+            velocity = joint.velocity if math.isfinite(joint.velocity) else 0.0
+            self._slow[i] += share * (velocity - self._slow[i])
+            sign = math.copysign(1.0, tau)
+            driven = sign * velocity + max(0.0, sign * (velocity - self._slow[i]))
+            needed = abs(tau) / (first + span) * max(0.0, min(1.0, (driven - first) / span))
+            self._brake[i] = max(needed, kept * self._brake[i])
+        return tuple(self._brake)
+
+    def _wall(self, i: int, joint: JointSample) -> tuple[float, float]:
+        """Return spring in Nm and damping in Nm s/rad of the soft wall in which a joint is; zeros outside."""
+        above = joint.position - self._limits.position_max[i] + WALL.width
+        below = self._limits.position_min[i] + WALL.width - joint.position
+        depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
+        # Once the joint leaves the wall, no spring pushes it.
+        is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL.release
+        spring = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
+        return spring, WALL.damping * min(1.0, abs(depth) / WALL.edge)
+
+    def _permitted(self, i: int, joint: JointSample) -> float:
+        """Return the torque in Nm that a joint's motor may apply at its temperature."""
+        colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
+        return self._limits.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))

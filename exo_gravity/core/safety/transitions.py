@@ -1,0 +1,61 @@
+"""The states of an arm between off and carried: every transition, and what each state sends.
+
+Two states are safe. While nothing is proven (checking, proving), any fault switches the motors off at once: the arm
+hangs, and a motor that damps with the wrong sign would drive it. Once the arm is carried, it is lowered under damping.
+A fault is latched in `FAULT`, which only the operator leaves, and only to `DISABLED`: that never enables the arm.
+"""
+
+from enum import Enum
+
+from exo_gravity.core.safety.drive import State
+
+
+class Event(str, Enum):
+    """What may change the state."""
+
+    ENABLE = "enable"  #: by the operator
+    DISABLE = "disable"  #: by the operator, or an end of the node
+    CLEAR = "clear"  #: by the operator
+    PASSED = "all well"  #: the start gate has passed
+    REFUSED = "refused"  #: it has not, in time
+    PROVEN = "motors on, signs right"
+    RAMPED = "full torque"
+    FAULT = "fault"
+    FOUND_ON = "a motor is on"  #: that should be off, by its replies
+    DOWN = "down"  #: nothing holds the arm, and nothing moves it
+    DOWN_AFTER_FAULT = "down after a fault"
+
+
+TRANSITIONS: dict[tuple[State, Event], State] = {
+    (State.DISABLED, Event.ENABLE): State.CHECKING,
+    (State.DISABLED, Event.FAULT): State.FAULT,
+    (State.DISABLED, Event.FOUND_ON): State.LETTING_DOWN,
+    (State.CHECKING, Event.PASSED): State.PROVING,
+    (State.CHECKING, Event.REFUSED): State.DISABLED,
+    (State.CHECKING, Event.DISABLE): State.DISABLED,
+    (State.CHECKING, Event.FAULT): State.FAULT,
+    (State.CHECKING, Event.FOUND_ON): State.LETTING_DOWN,
+    (State.PROVING, Event.PROVEN): State.RAMPING_IN,
+    (State.PROVING, Event.DISABLE): State.DISABLED,
+    (State.PROVING, Event.FAULT): State.FAULT,
+    (State.RAMPING_IN, Event.RAMPED): State.ACTIVE,
+    (State.RAMPING_IN, Event.DISABLE): State.LETTING_DOWN,
+    (State.RAMPING_IN, Event.FAULT): State.LETTING_DOWN,
+    (State.ACTIVE, Event.DISABLE): State.LETTING_DOWN,
+    (State.ACTIVE, Event.FAULT): State.LETTING_DOWN,
+    (State.LETTING_DOWN, Event.DOWN): State.DISABLED,
+    (State.LETTING_DOWN, Event.DOWN_AFTER_FAULT): State.FAULT,
+    (State.FAULT, Event.CLEAR): State.DISABLED,
+    (State.FAULT, Event.FOUND_ON): State.LETTING_DOWN,
+}
+
+# What the motors receive in each state, in words for readers; `power.SENT` has the frames.
+SENDS: dict[State, str] = {
+    State.DISABLED: "nothing that switches a motor on; EXIT now and then",
+    State.CHECKING: "as disabled",
+    State.PROVING: "ENTER; small pushes without damping",
+    State.RAMPING_IN: "the efforts, which grow from none",
+    State.ACTIVE: "the efforts, within the limits, and damping where a joint is driven",
+    State.LETTING_DOWN: "damping, and a torque that fades; no ENTER",
+    State.FAULT: "as disabled",
+}

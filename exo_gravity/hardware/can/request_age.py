@@ -1,0 +1,93 @@
+"""How old the motors' replies are: each belongs to a command, and a queue on the way shows as commands under way.
+
+A reply does not say which command it answers, but a V1 or V2 board answers each command once, and in order. So the
+oldest command without a reply is the one that the next reply answers, if no frame was lost. Frames are lost, which
+looks just like a queue that grows: before a frame leaves this computer, in the adapter, or before a reply is read. A
+pause tells them apart: a motor that is sent nothing still replies to all that is queued, and to nothing that was lost.
+
+    oldest command without a reply older than `longest`    the motor is sent nothing until it is known why:
+        no reply for `quiet`                                    those commands were lost, and are forgotten
+        replies, which show a queue as long as `longest`        the replies are `late`: a fault
+
+While replies are late, a motor is sent a command only if no more are under way than `longest` holds: a queue that our
+own commands fill gets no longer.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ReplyAge:
+    """When replies are too old."""
+
+    longest: float = 0.04  #: s; an ordinary computer or adapter is late by 0.02 s, efforts are stale at 0.05 s
+    fewest: int = 3  #: commands under way: at a low rate one or two may be longer than `longest`
+    quiet: float = 0.02  #: s without a reply that show that none is under way; an adapter's longest timer is 0.016 s
+    looks: int = 3  #: cycles of it at least
+    most: int = 256  #: commands that are remembered
+
+
+AGE = ReplyAge()
+
+
+class Requests:
+    """The commands to one motor, and their replies. Times are in s.
+
+    last: when the motor was last sent a frame; -inf for never.
+    late: how old its replies are at least, in s, if that is too old; else 0.
+    """
+
+    def __init__(self) -> None:
+        self.last = -math.inf
+        self.late = 0.0
+        self._open: deque[float] = deque(maxlen=AGE.most)  # when each command without a reply was sent
+        self._sent: list[float] = []  # of a pause: `_open` when it began; empty without a pause
+        self._replies: list[float] = []  # when they arrived in the pause
+        self._looks = 0  # cycles without a command since the last reply
+        self._replied = self._paused = -math.inf  # when the last reply arrived, and when the pause began
+
+    def may_send(self, now: float) -> bool:
+        """Return whether the motor is to be sent a command in this cycle."""
+        if self._sent:
+            self._looks += 1
+            since = self._replies[-1] if self._replies else self._paused
+            if self._looks >= AGE.looks and now - since >= AGE.quiet:
+                self._forget()
+            return not self._sent
+        if len(self._open) < AGE.fewest or now - self._open[0] <= AGE.longest:
+            return True
+        if self.late:
+            self._looks += 1
+            if self._looks >= AGE.looks and now - self._replied >= AGE.quiet:
+                self._forget()
+            return not self._open
+        if now - self._replied >= AGE.quiet:
+            return True  # it does not reply at all
+        self._sent, self._replies, self._looks, self._paused = list(self._open), [], 0, now
+        return False
+
+    def sent(self, now: float, frames: int) -> None:
+        """Note frames that the motor answers."""
+        self.last = now
+        self._open.extend([now] * frames)
+
+    def replied(self, now: float) -> float:
+        """Note a reply; return when the motor was last asked, or `now` if it never was: the reading is no newer."""
+        self._replied, self._looks = now, 0
+        if self._open:
+            self._open.popleft()
+        if not self._open:
+            self.late = 0.0
+        if self._sent:
+            self._replies.append(now)
+            count = len(self._replies)  # so many commands at least were under way when the pause began
+            age = self._replies[0] - self._sent[-min(count, len(self._sent))]
+            if count >= AGE.fewest and age > AGE.longest:
+                self.late, self._sent = age, []
+        return now if self.last == -math.inf else self.last
+
+    def _forget(self) -> None:
+        self._open.clear()
+        self._sent, self.late = [], 0.0

@@ -1,0 +1,303 @@
+"""AK motors that answer real frames: MIT mode of V1 and V2 boards, and of V3 boards.
+
+What all firmware of V1 and V2 boards does (CubeMars driver manual V1.0.15; Ben Katz's drive, from which it descends):
+- It replies to commands, on or off, and never sends anything else.
+- Torque flows only between ENTER and EXIT. ENTER carries out the last command at once.
+- SET_ZERO makes the present angle zero.
+
+What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats.py):
+- A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
+  switches the motor off. Other control modes are ignored here.
+- It replies to nothing. It sends its state `status_rate` times a second, on or off.
+
+Where firmwares differ, `firmware.Firmware` says what is done. A further wire format needs nothing here: the frames that
+switch a motor on and off and set its zero, whether it replies, its commands and its replies all come from its
+`WireFormat`.
+"""
+
+import math
+import random
+from dataclasses import dataclass, replace
+
+from exo_gravity.core.errors import FrameError
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.specs import MotorCommand, MotorReply
+from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, Frame, V3Format
+from exo_gravity.core.params import check_owned, owned
+from exo_gravity.sim.motors.firmware import (
+    BOOT_LOADER,
+    BROADCAST_ID,
+    CLEAR_FAULTS,
+    ENCODER_ERROR,
+    SHUT_OFF,
+    SHUT_OFF_AT,
+    WARM,
+    WARM_ABOVE,
+    Firmware,
+    usual_firmware,
+)
+
+_NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+_FULL_LENGTH = 8  # bytes of a command
+_BUS_VOLTAGE = round(24.0 / 80.0 * 0xFF)  # the last byte of a reply of 7 bytes, 0 to 80 V
+
+
+@dataclass(frozen=True)
+class Heat:
+    """How a motor warms: it nears `ambient` plus `rise` times the square of its torque by the rated one."""
+
+    rise: float = owned(
+        0.0, "temperature rise of a motor that gives its rated torque for long; 0: none", (0.0, 200.0), "K"
+    )
+    time: float = owned(600.0, "time constant with which a motor warms and cools", (1.0, 10000.0), "s")
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+
+    def next(self, temperature: float, ambient: float, load: float, dt: float) -> float:
+        """Return the temperature in degC after `dt` s under `load`, the torque by the rated one."""
+        goal = ambient + self.rise * load * load
+        return temperature - (temperature - goal) * -math.expm1(-dt / self.time)
+
+
+class SimulatedMotor:
+    """One motor on one joint, with a board that speaks the joint's wire format. The faults may be set at any time.
+
+    joint: the true mounting and scale of the motor, from which the controller's parameters may differ.
+    firmware: of its board; by default the usual one of the wire format.
+    heat: how it warms; by default it does not. Raises ParameterError.
+    """
+
+    def __init__(self, joint: JointMotor, firmware: Firmware | None = None, heat: Heat | None = None) -> None:
+        self.firmware = firmware = firmware or usual_firmware(joint.wire_format)
+        firmware.check(joint.wire_format)
+        if firmware.position_range:
+            joint = replace(joint, spec=replace(joint.spec, position_range=firmware.position_range))
+        self.joint = joint
+        to_master = firmware.reply_to_master and joint.wire_format.replies
+        #: Arbitration IDs of replies or status frames, and of the frames that the motor obeys.
+        self.reply_id = MASTER_ID if to_master else joint.wire_format.reply_id(joint.can_id)
+        self._own_ids = own_ids(joint, firmware)
+        self.received_ids = tuple(self._own_ids)
+        self.cable = False  #: a V3 board whose configuration cable is plugged in: it reports, and ignores commands
+        self.strength = 1.0  #: share of its torque that the motor still gives; its replies show all of it
+        self.ambient = 30.0  #: degC
+        self.temperature = self.ambient  #: degC
+        self.error = 0  #: the error byte, to which a firmware may add bits of its own
+        self.entered = False  #: the motor is on, after ENTER and before EXIT
+        self.has_left = False  #: its boot loader runs, and it takes no part in the bus until its next power cycle
+        self.dips = 0  #: how often its time-out has taken a torque or gains away
+        self._heat = heat or Heat()
+        self._zero = joint.zero  # rad, after a power cycle
+        self._is_unplugged = False
+        self._is_shut_off = False  # by temperature, until CLEAR_FAULTS
+        self._command = _NO_COMMAND
+        self._data: bytes | None = None  # of the last command
+        self._frame = bytes(_FULL_LENGTH)  # the last one that was received
+        self._age = 0.0  # s since the last command
+        self._silent_until = -math.inf  # s, after SET_ZERO
+        self._random = random.Random(joint.can_id)
+        constant = firmware.torque_per_ampere.get(joint.spec.name, joint.spec.torque_per_ampere)
+        self._reported = replace(joint.spec, torque_per_ampere=constant)
+
+    @property
+    def unplugged(self) -> bool:
+        """A fault: no power, no torque, no replies. What the board does not store is lost at once."""
+        return self._is_unplugged
+
+    @unplugged.setter
+    def unplugged(self, is_unplugged: bool) -> None:
+        self._is_unplugged = is_unplugged
+        if is_unplugged:
+            self._forget()
+
+    def _forget(self) -> None:
+        """Lose what a board does not store."""
+        self.entered, self.has_left, self._is_shut_off = False, False, False
+        self._command, self._data, self._frame = _NO_COMMAND, None, bytes(_FULL_LENGTH)
+        self._silent_until = -math.inf
+        if self.joint.zero != self._zero:
+            self.joint = replace(self.joint, zero=self._zero)
+
+    @property
+    def damping(self) -> float:
+        """Damping in Nm s/rad that the motor applies to the joint."""
+        return self._command.kd * self.joint.torque_scale * self.strength if self.entered else 0.0
+
+    @property
+    def steady(self) -> bool:
+        """Whether the torque stays constant until the next frame, however the joint moves."""
+        if self.unplugged or not self.entered:
+            return not self.unplugged and not self._heat.rise
+        return not (self._command.kp or self._command.kd or self.firmware.timeout or self._heat.rise)
+
+    def receive(
+        self, data: bytes, position: float, velocity: float, now: float, frame_id: int | None = None
+    ) -> bytes | None:
+        """Execute the frame `data` and return the bytes of the reply, or None if the motor does not reply.
+
+        position, velocity: of the joint, rad and rad/s. now: simulated time in s, for the silence after SET_ZERO.
+        data: of a remote frame, none.
+        frame_id: arbitration ID, one of `received_ids`; by default that of a command.
+        """
+        if self.unplugged or self.has_left or self.cable or now < self._silent_until:
+            return None
+        joint = self.joint
+        own_id = joint.command_id if frame_id is None else self._own_ids[frame_id]
+        if own_id == joint.command_id and self.firmware.shortest_command <= len(data) < _FULL_LENGTH:
+            data += self._frame[len(data) :]
+        if len(data) == _FULL_LENGTH:
+            self._frame = data
+        frame = own_id, data
+        if frame in joint.set_zero:
+            if self._set_zero(position, now):
+                return None
+        elif frame in joint.enter:
+            self.entered = self.entered or not self._is_refused
+        elif frame in joint.exit:
+            self._exit()
+        elif self._is_special(data):
+            self._act_on(data[-1])
+        elif not (self._take_command(data) if own_id == joint.command_id else self._take_current(data)):
+            return None
+        return self._state(position, velocity) if joint.wire_format.replies and not self.has_left else None
+
+    @property
+    def _is_refused(self) -> bool:
+        """Whether the motor does not go on."""
+        is_lost = self.error == ENCODER_ERROR and self.firmware.refuses_encoder_error
+        return self._is_shut_off or is_lost
+
+    def _set_zero(self, position: float, now: float) -> bool:
+        """Make the present angle zero; return whether the motor is silent about it."""
+        joint, firmware = self.joint, self.firmware
+        if firmware.zero_while_on or not self.entered:
+            self.joint = replace(joint, zero=-joint.direction * position)
+            self._zero = self.joint.zero if firmware.zero_kept else self._zero
+        self._silent_until = now + firmware.zero_silence
+        return firmware.zero_silence > 0.0
+
+    def _exit(self) -> None:
+        self.entered = False
+        if self.firmware.exit_clears:
+            self._command, self._data = _NO_COMMAND, None
+
+    def _is_special(self, data: bytes) -> bool:
+        """Return whether the firmware takes the frame for a special one that the manual does not name."""
+        head = data[:-1] == b"\xff" * (_FULL_LENGTH - 1) and bool(self.joint.enter)
+        return head and self.firmware.first_special <= data[-1] < 0xFF
+
+    def _act_on(self, code: int) -> None:
+        """Do what a special frame that ends with `code` asks for; most do nothing that a bus shows."""
+        if code == BOOT_LOADER:
+            self.has_left, self.entered = True, False
+        elif code == CLEAR_FAULTS:
+            self._is_shut_off = False
+
+    def _take_command(self, data: bytes) -> bool:
+        """Take a command, which switches the motor on if no other frame does; return whether it is one."""
+        joint = self.joint
+        if not self.entered and joint.enter and not self.firmware.remembers_off:
+            return len(data) == _FULL_LENGTH
+        if data != self._data:  # an arm at rest gets the same command in every cycle
+            try:
+                self._command, self._data = joint.wire_format.unpack_command(joint.spec, data), data
+            except FrameError:
+                return False
+        self._age = 0.0
+        self.entered = self.entered or not (joint.enter or self._is_refused)
+        return True
+
+    def _take_current(self, data: bytes) -> bool:
+        """Take a current, which a V3 board applies like a command; return whether it is one."""
+        joint = self.joint
+        if not isinstance(joint.wire_format, V3Format) or len(data) != 4:
+            return False
+        current = int.from_bytes(data, "big", signed=True) / 1000.0
+        torque = current * joint.spec.torque_per_ampere
+        self._command, self._data, self._age = MotorCommand(0.0, 0.0, 0.0, 0.0, torque), None, 0.0
+        self.entered = not self._is_refused
+        return True
+
+    def status(self, position: float, velocity: float) -> Frame | None:
+        """Return the status frame of a V3 board at `position` rad and `velocity` rad/s; None without power.
+
+        None of other boards, and of those in query-reply mode: they send nothing by themselves.
+        """
+        if self.unplugged or self.joint.wire_format.replies or not self.firmware.reports:
+            return None
+        return self.reply_id, self._state(position, velocity)
+
+    def advance(self, position: float, velocity: float, dt: float) -> float:
+        """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
+        self._age += dt
+        if 0.0 < self.firmware.timeout < self._age and self.entered and self._command != _NO_COMMAND:
+            self._command, self._data = _NO_COMMAND, None
+            self.dips += 1
+        torque = self.torque(position, velocity)
+        if self._heat.rise:
+            load = torque / self.joint.spec.rated_torque
+            self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
+        if self.firmware.error_is_mask and self.temperature >= SHUT_OFF_AT:
+            self.entered, self._is_shut_off = False, True
+        return torque
+
+    def torque(self, position: float, velocity: float) -> float:
+        """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.
+
+        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale` and `strength`, clamped to the peak
+        torque.
+        """
+        if self.unplugged:
+            self._forget()  # also what another thread was just changing when the power went
+        if not self.entered:
+            return 0.0
+        joint, command = self.joint, self._command
+        torque = command.torque + command.kd * (command.velocity - joint.direction * velocity)
+        if command.kp:
+            torque += command.kp * (command.position - joint.motor_position(position))
+        peak = joint.spec.peak_torque
+        return joint.direction * clamp(torque * joint.torque_scale, peak) * self.strength
+
+    def _state(self, position: float, velocity: float) -> bytes:
+        """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
+        joint, spec = self.joint, self.joint.spec
+        torque = joint.direction * self.torque(position, velocity) / (joint.torque_scale * self.strength)
+        if self.firmware.current_noise:
+            torque *= self._random.gauss(1.0, self.firmware.current_noise)
+        readings = (
+            clamp(joint.motor_position(position), spec.position_range),
+            clamp(joint.direction * velocity, spec.velocity_range),
+            clamp(torque, spec.torque_range),
+        )
+        temperature = round(max(-40.0, min(215.0, self.temperature)))
+        length = self.firmware.reply_length if joint.wire_format.replies else _FULL_LENGTH
+        extra = (temperature, self._error_byte) if length == _FULL_LENGTH else (None, None)
+        reply = joint.wire_format.pack_reply(self._reported, MotorReply(joint.can_id, *readings, *extra))
+        return reply + bytes((_BUS_VOLTAGE,)) if length == _FULL_LENGTH - 1 else reply
+
+    @property
+    def _error_byte(self) -> int:
+        if not self.firmware.error_is_mask:
+            return self.error
+        return self.error | WARM * (self.temperature > WARM_ABOVE) | SHUT_OFF * self._is_shut_off
+
+
+def own_ids(joint: JointMotor, firmware: Firmware) -> dict[int, int]:
+    """Return the arbitration IDs that a motor obeys, each with the ID of its own that it stands for."""
+    own = dict.fromkeys(
+        frame_id for frame_id, _ in ((joint.command_id, b""), *joint.enter, *joint.exit, *joint.set_zero)
+    )
+    ids = {frame_id: frame_id for frame_id in own}
+    for frame_id in own:
+        if frame_id < EXTENDED:
+            others = range(frame_id & (1 << firmware.id_bits) - 1, 1 << 11, 1 << firmware.id_bits)
+            ids |= {other: frame_id for other in others if other not in own}
+        elif firmware.obeys_broadcast:
+            ids[frame_id & ~0xFF | BROADCAST_ID] = frame_id
+    return ids
+
+
+def clamp(value: float, limit: float) -> float:
+    """Return `value` within -`limit`..`limit`."""
+    return value if -limit <= value <= limit else math.copysign(limit, value)

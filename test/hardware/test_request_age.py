@@ -1,0 +1,133 @@
+"""Queues between the bridge and its motors, and lost frames, which look the same for a while; in virtual time."""
+
+from __future__ import annotations
+
+import pytest
+
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.hardware.can.request_age import AGE, Requests
+
+from .compensated_arm import CYCLE, CompensatedArm
+
+SPEED = 0.6  # rad/s
+
+
+class Line:
+    """A motor behind a line, asked in every cycle. delay: s for which a command is under way, with its reply.
+
+    lost: whether the command of a cycle is lost. asked: count of the commands that were sent.
+    """
+
+    def __init__(self, cycle: float = CYCLE) -> None:
+        self.requests, self.now, self.cycle = Requests(), 0.0, cycle
+        self.asked = 0
+        self._replies: list[float] = []
+
+    def run(self, duration: float, delay=lambda now: 0.0003, lost=lambda count: False) -> float:
+        """Let `duration` s pass, or less: until the replies are late; return how old the newest one is then."""
+        end = self.now + duration
+        while self.now < end and not self.requests.late:
+            if self.requests.may_send(self.now):
+                self.requests.sent(self.now, 1)
+                self.asked += 1
+                if not lost(self.asked):
+                    self._replies.append(self.now + delay(self.now))
+            self.now += self.cycle
+            for due in [due for due in self._replies if due <= self.now]:
+                self._replies.remove(due)
+                self.requests.replied(due)
+        return delay(self.now)
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
+def test_a_queue_that_grows_is_found_before_it_is_long(rate):
+    line = Line(1.0 / rate)
+    begin = line.now
+    age = line.run(30.0, delay=lambda now: 0.0003 + 0.02 * max(0.0, now - begin))
+    assert line.requests.late > AGE.longest and AGE.longest < age < 0.08
+
+
+def test_a_queue_that_is_there_at_once_is_found_and_forgotten_once_it_is_gone():
+    line = Line()
+    line.run(1.0)
+    line.run(1.0, delay=lambda now: 0.1)
+    assert line.requests.late > AGE.longest
+    for _ in range(20):  # what was under way arrives
+        line.now += CYCLE
+        line.requests.may_send(line.now)
+    assert not line.requests.late
+    line.run(1.0)
+    assert not line.requests.late
+
+
+@pytest.mark.parametrize("rate", [50.0, 250.0, 1000.0])
+@pytest.mark.parametrize("delay", [0.0003, 0.016], ids=["prompt", "an adapter's timer of 16 ms"])
+def test_lost_frames_are_no_queue_and_hold_up_few_commands(rate, delay):
+    line = Line(1.0 / rate)
+    line.run(60.0, delay=lambda now: delay, lost=lambda count: count % 16 == 0)  # 6 %: 3 % each way
+    assert not line.requests.late
+    assert line.asked > 0.9 * 60.0 * rate
+
+
+def test_a_motor_that_does_not_reply_is_still_asked_in_every_cycle_and_replies_that_come_back_are_no_queue():
+    line = Line()
+    line.run(1.0)
+    asked = line.asked
+    line.run(2.0, lost=lambda count: True)
+    assert line.asked - asked >= 2.0 / CYCLE - 6
+    line.run(5.0)
+    assert not line.requests.late
+
+
+def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_matters():
+    arm = CompensatedArm()
+    begin, carry = arm.now, arm.wire.carry
+
+    def queue(sender, message, *sent):
+        is_command = sender is not None and message.arbitration_id and message.data[0] in (0x7F, 0x80)
+        if is_command:
+            arm.clock.later(0.02 * (arm.now - begin), lambda: carry(sender, message, *sent))
+        else:
+            carry(sender, message, *sent)
+
+    arm.wire.carry = queue
+    assert arm.run_until(lambda: arm.safety.state is not State.ACTIVE, 20.0)
+    assert arm.safety.fault.code is FaultCode.REPLIES_LATE
+    assert 0.02 * (arm.now - begin) < 0.1
+    arm.run(8.0)
+    assert arm.top_speed < SPEED
+
+
+def test_an_arm_whose_frames_are_lost_now_and_then_is_carried_on():
+    arm = CompensatedArm()
+    arm.wire.loss, arm.wire.batch = 0.03, 0.001
+    arm.run(20.0)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    assert arm.top_speed < 0.05
+
+
+def test_a_reading_is_as_old_as_the_command_that_it_answers():
+    arm = CompensatedArm()
+    assert arm.run_until(lambda: all(arm.now - sample.time >= 0.0002 for sample in arm.bus.samples), 0.1)
+
+
+def test_a_send_that_fails_once_is_a_lost_frame_and_a_bus_that_fails_for_longer_a_fault():
+    arm = CompensatedArm()
+    end = arm.bus._ports[0]._bus
+    send, failing = end.send, []
+
+    def sometimes(message, timeout=None):
+        if failing:
+            raise OSError(105, "No buffer space available")
+        send(message, timeout)
+
+    end.send = sometimes
+    for _ in range(10):
+        failing.append(1)
+        arm.loop.cycle()
+        failing.clear()
+        arm.run(0.1)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    failing.append(1)
+    arm.run(0.02)
+    assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.BUS_ERROR)
