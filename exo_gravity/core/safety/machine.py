@@ -20,7 +20,7 @@ nothing to repair.
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
