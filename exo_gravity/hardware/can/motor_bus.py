@@ -155,7 +155,7 @@ class MotorBus:
         if drive.powered and not self._powered:
             self._powered, self._exit_sent = True, -math.inf
             if not any(drive.unsure):
-                self._send_commands(OFF)
+                self._send_commands(OFF, must=True)
                 for joint, motor in enumerate(self._motors):
                     self._send(self._ports[joint], *motor.enter)
         self._send_commands(drive)
@@ -193,7 +193,7 @@ class MotorBus:
         frames = [motor.set_zero for motor in self._motors]
         if not all(frames):
             raise BusError(f"set_zero: motor {self._motors[frames.index(())].can_id} has a board without such a frame")
-        self._send_commands(OFF)
+        self._send_commands(OFF, must=True)
         for joint, own in enumerate(frames):
             self._send(self._ports[joint], *own)
         self._raise_failure()
@@ -253,7 +253,8 @@ class MotorBus:
             return ()
         return ((self._motors[joint].command_id, self._motors[joint].command(0.0, 0.0)),)
 
-    def _send_commands(self, drive: Drive) -> None:
+    def _send_commands(self, drive: Drive, must: bool = False) -> None:
+        """Send each motor its command. Unless they `must` be sent, those whose replies are awaited get none."""
         self._drive = drive
         now = self._now()
         frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
@@ -261,7 +262,7 @@ class MotorBus:
             if joint not in self._asked and (drive.unsure[joint] or not drive.powered):
                 continue
             if joint in self._asked:
-                if not self._requests[joint].may_send(now):
+                if not self._requests[joint].may_send(now) and not (must or drive.enter[joint]):
                     continue
                 self._requests[joint].sent(now, 1)
             command = self._command(joint, now)
