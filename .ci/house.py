@@ -39,8 +39,8 @@ ROSDEP = {
     "serial": "python3-serial",
     "yaml": "python3-yaml",
 }
-# Needed although no module imports them: by a lifecycle node's services, python-can's udp_multicast, the launch files.
-INDIRECT = {"lifecycle_msgs", "python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
+# Needed although no module imports them: by python-can's udp_multicast, the launch files.
+INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
     "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "matplotlib", "mcap", "mcap_ros2", "mpl_toolkits",

@@ -23,6 +23,13 @@ def keep_to_this_machine() -> None:
         os.environ[PROFILES] = str(Path(__file__).with_name("fastdds_peers.xml"))
 
 
+def kept_to_this_machine() -> str:
+    """Return, for the log, that other computers see no node, and what admits them; '' if they may."""
+    if os.environ.get(ROS_RANGE) != "LOCALHOST" or os.environ.get("ROS_STATIC_PEERS"):
+        return ""
+    return f"other computers do not see these nodes, whatever {ROS_RANGE} says; {RANGE}=SUBNET admits them"
+
+
 def open_to_others() -> str:
     """Return the setting that lets other hosts publish to our topics; '' if none does, or if SROS2 is enforced."""
     get = os.environ.get

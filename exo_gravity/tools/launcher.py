@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from datetime import datetime
 
 from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
 from exo_gravity.tools.cli import require_ros
@@ -62,6 +63,9 @@ def main(args: Sequence[str] | None = None) -> None:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
+        keep_to_this_machine()
+        if sentence := kept_to_this_machine():
+            print_line("launcher", sentence)
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         with asking_on_terminal(launcher.asking):
             dead = launcher.run(stopping)

@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 import rclpy
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
@@ -25,8 +27,10 @@ from exo_gravity.nodes.can_bridge import node as can_bridge
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.node import CanBridge
 from exo_gravity.nodes.can_bridge.operation import BridgeReport
+from exo_gravity.nodes.ros.inner import NodeExecutor
 
 from ..hardware.simulated_rig import NoWatchdog, SimulatedRig
+from ..support.node_thread import NodeThread
 from ..support.waiting import wait_until
 
 pytestmark = pytest.mark.real_time
@@ -145,6 +149,33 @@ class Client(Node):
         sent = client.call_async(request)
         wait_until(lambda: [rclpy.spin_once(node, timeout_sec=0.01) for node in (server, self)] and sent.done())
         return sent.result()
+
+
+def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_bridge):
+    bridge = make_bridge()
+    carry(bridge, rig)
+    executor, asking = NodeExecutor(), NodeThread("asking")
+    executor.add_node(bridge)
+    change = asking.nodes[0].create_client(ChangeState, "/can_bridge/change_state")
+    enable = asking.nodes[0].create_client(SetBool, "/can_bridge/enable")
+    asking.start()
+
+    def spin() -> None:
+        executor.spin_once(0.01)
+
+    wait_until(lambda: change.service_is_ready() and enable.service_is_ready(), spin)
+    leave = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
+    left = change.call_async(leave)
+    wait_until(lambda: bridge.loop.safety.state is State.LETTING_DOWN, spin)
+    enabled, again = enable.call_async(SetBool.Request(data=True)), change.call_async(leave)
+    wait_until(lambda: enabled.done() and again.done(), spin)
+    assert not left.done()
+    assert enabled.result().message == can_bridge.LEAVING and not again.result().success
+    wait_until(left.done, spin)
+    assert left.result().success
+    assert_nothing_runs(bridge, rig)
+    asking.close()
+    executor.shutdown()
 
 
 def test_no_motor_is_switched_on_before_the_watchdog_watches_nor_stays_on_without_it(rig, make_bridge, monkeypatch):

@@ -244,6 +244,8 @@ class BridgeReport:
         self._rate = Rate()
         self._slow = SLOW / arm.period  # Hz
         self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
+        names = zip(self._names, arm.motors, strict=True)
+        self._without_timeout = ", ".join(name for name, motor in names if not motor.timeout) or "none"
 
     def send(self, loop: ControlLoop | None, newest: Efforts, refusal: str) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
@@ -273,6 +275,7 @@ class BridgeReport:
             "incomplete cycles": loop.incomplete,
             "temperatures when switched on": "implausible" if loop.bus.boards.odd_temperature else "plausible",
             "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
+            "motors without time-out": self._without_timeout,
             "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
             "last refused message": refusal,
         }

@@ -21,7 +21,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.nodes.ros.inner import NodeExecutor
 
 NEEDED_CHECK_PERIOD = 0.1  # s
@@ -54,7 +54,10 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     except (ExoGravityError, RuntimeError) as error:  # RuntimeError: rcl could not read its own arguments
         get_logger(executable).fatal(str(error))
         os._exit(2)  # without closing Fast DDS, which can hang when it is closed during discovery
-    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
+    is_supervised = bool(os.environ.get("EXO_GRAVITY_SUPERVISED"))
+    if not is_supervised and (sentence := kept_to_this_machine()):  # else the launcher says it, once for all
+        node.get_logger().info(sentence)
+    if is_supervised:
         threading.Thread(target=_end_with_launcher, args=(node, ending), daemon=True).start()
     gc.collect()
     gc.freeze()  # imported modules stay: later collections can skip them
