@@ -19,7 +19,7 @@ from exo_gravity.core.compensation.tracking import MOTION, Observation, Sweep, a
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.bag.content import Bag
-from exo_gravity.lab.bag.joints import TYPES
+from exo_gravity.lab.bag.layout import TYPES
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
 from exo_gravity.lab.inputs.arms import ConfiguredArm
