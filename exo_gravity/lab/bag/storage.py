@@ -15,7 +15,7 @@ import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from io import BytesIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -377,9 +377,10 @@ def _named_files(metadata: Path) -> list[str]:
 def _open_database(file: Path, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int, Topic]]:
     """Return a database, or a readable copy of it, and its topics; `stack` closes them. Raises sqlite3.Error.
 
-    A killed recorder may leave a journal or a write-ahead log, which sqlite replays if it may write next to the file:
-    on a read-only medium it does so in a copy. If the file is truncated, the size in its header is wrong. The copy's is
-    made invalid, so that sqlite uses the size of the file: it counts if the counter at byte 92 equals the one at 24
+    A write-ahead log beside the file belongs to it: where sqlite may not write, on a read-only medium, it reads both as
+    copies. A killed recorder may leave a journal, which sqlite replays if it may write next to the file; the copy has
+    none. If the file is truncated, the size in its header is wrong. The copy's is made invalid, so that sqlite uses the
+    size of the file: it counts if the counter at byte 92 equals the one at 24
     (https://www.sqlite.org/fileformat.html, 1.3.7).
     """
     try:
@@ -387,18 +388,17 @@ def _open_database(file: Path, stack: ExitStack) -> tuple[sqlite3.Connection, di
     except sqlite3.Error:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         copy = Path(shutil.copyfile(file, folder / "copy.db3"))
-        for suffix in ("-wal", "-journal"):
-            if (log := file.with_name(file.name + suffix)).exists():
-                shutil.copyfile(log, folder / f"copy.db3{suffix}")
-        try:
-            return _connected(f"{copy.as_uri()}?mode=rw", stack)
-        except sqlite3.Error:
-            with copy.open("r+b") as changed:
-                changed.seek(24)
-                counter = changed.read(4)
-                changed.seek(92)
-                changed.write(bytes(byte ^ 0xFF for byte in counter))
-            return _connected(f"{copy.as_uri()}?immutable=1", stack)
+    if (log := file.with_name(f"{file.name}-wal")).exists():
+        with_log = Path(shutil.copyfile(file, folder / "with_log.db3"))
+        shutil.copyfile(log, folder / "with_log.db3-wal")
+        with suppress(sqlite3.Error):
+            return _connected(f"{with_log.as_uri()}?mode=rw", stack)
+    with copy.open("r+b") as changed:
+        changed.seek(24)
+        counter = changed.read(4)
+        changed.seek(92)
+        changed.write(bytes(byte ^ 0xFF for byte in counter))
+    return _connected(f"{copy.as_uri()}?immutable=1", stack)
 
 
 def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int, Topic]]:

@@ -21,7 +21,8 @@ def vector(kind, *numbers):
 
 
 def header(draw):
-    stamp = TYPES["builtin_interfaces/msg/Time"](draw(st.integers(-(2**31), 2**31 - 1)), draw(st.integers(0, 2**32 - 1)))
+    seconds, nanoseconds = draw(st.integers(-(2**31), 2**31 - 1)), draw(st.integers(0, 2**32 - 1))
+    stamp = TYPES["builtin_interfaces/msg/Time"](seconds, nanoseconds)
     return TYPES["std_msgs/msg/Header"](stamp, draw(st.text("abcü/", max_size=9)))
 
 
