@@ -69,7 +69,7 @@ def timeline(ordinal: np.ndarray, arrival: np.ndarray) -> Timeline:
     arrival = without_outliers(arrival)
     change = np.diff(arrival)
     cuts = np.flatnonzero((change < -CLOCK.back) | (change > CLOCK.ahead)) + 1
-    if _is_in_another_order(arrival, cuts):
+    if _is_in_another_order(arrival):
         cuts = cuts[:0]
     parts = [slice(*ends) for ends in pairwise((0, *cuts.tolist(), len(arrival)))]
     begin = np.array([arrival[part].min() for part in parts])
@@ -94,10 +94,12 @@ def without_outliers(arrival: np.ndarray) -> np.ndarray:
     return result
 
 
-def _is_in_another_order(arrival: np.ndarray, cuts: np.ndarray) -> bool:
-    """Return whether the parts, sorted by time, follow each other: the file's order is then not that of arrival."""
-    if not np.any(arrival[cuts] < arrival[cuts - 1]):
+def _is_in_another_order(arrival: np.ndarray) -> bool:
+    """Return whether the runs of times, sorted, follow each other: the file's order is then not that of arrival."""
+    change = np.diff(arrival)
+    if np.all(change >= -CLOCK.back):
         return False
+    cuts = np.flatnonzero((change < -CLOCK.back) | (change > CLOCK.join)) + 1
     edges = [0, *cuts.tolist(), len(arrival)]
-    spans = sorted((int(arrival[a:b].min()), int(arrival[a:b].max())) for a, b in pairwise(edges))
-    return all(-CLOCK.back <= later[0] - earlier[1] <= CLOCK.join for earlier, later in pairwise(spans))
+    runs = sorted((int(arrival[a:b].min()), int(arrival[a:b].max())) for a, b in pairwise(edges))
+    return all(-CLOCK.back <= later[0] - earlier[1] <= CLOCK.join for earlier, later in pairwise(runs))

@@ -413,7 +413,7 @@ class _Contents:
 
 def _arrival(series: JointSeries) -> np.ndarray:
     """Return times of arrival in ns, the stamp where that of arrival is unknown."""
-    return np.where(series.arrival > 0, series.arrival, np.maximum(series.stamp, 0))
+    return without_outliers(np.where(series.arrival > 0, series.arrival, np.maximum(series.stamp, 0)))
 
 
 def _clocks(series: JointSeries, line: Timeline) -> tuple[np.ndarray, np.ndarray, float]:
@@ -421,7 +421,7 @@ def _clocks(series: JointSeries, line: Timeline) -> tuple[np.ndarray, np.ndarray
 
     A stamp that is far from the recorder's clock is replaced by the time of arrival.
     """
-    arrival = line.times(series.ordinal, without_outliers(series.arrival))
+    arrival = line.times(series.ordinal, series.arrival)
     stamp = series.stamp + line.offset[line.part(series.ordinal)]
     near = np.abs(arrival - stamp) < PAIRING.clock_offset
     return arrival, np.where(near, stamp, arrival), float(near.mean())

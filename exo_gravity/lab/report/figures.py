@@ -91,9 +91,10 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
     errors = per_minute([hold.drift_rate_uncertainty for hold in analysis.holds])
     colours = joint_colours(len(recording.joint_names))
     for joint, name in enumerate(joint_labels(recording)):
+        beside = numbers + 0.48 * ((joint + 0.5) / len(colours) - 0.5)
         axis.errorbar(
-            numbers + 0.48 * ((joint + 0.5) / len(colours) - 0.5), rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2,
-            color=colours[joint], label=name,
+            beside, rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2, color=colours[joint],
+            label=name,
         )  # fmt: skip
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
     if math.isfinite(criteria.max_rate):

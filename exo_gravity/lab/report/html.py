@@ -40,7 +40,9 @@ thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5
 tbody th { font-weight: inherit; text-align: left; }
 .joints th::before { content: "●"; margin-right: .4rem; }
 pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
-""" + "\n".join(f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS + MORE_COLOURS, 1))
+""" + "\n".join(
+    f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS + MORE_COLOURS, 1)
+)
 
 
 def joint_colours(count: int) -> tuple[str, ...]:
