@@ -185,17 +185,24 @@ class Storage:
             self.topics.update(topics.values())
             chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
+            found: list[tuple[Any, Any, Any]] = []
             try:
-                cursor = database.execute(query, list(chosen))
-                while found := cursor.fetchmany(ROWS):
-                    # A damaged row has values of other types.
-                    whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
-                    self.damaged += len(found) - len(whole)
-                    if whole:
-                        numbers, stamps, data = zip(*whole, strict=True)
-                        yield Rows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
-            except sqlite3.Error as error:  # the rows before the damage have been yielded
+                for row in database.execute(query, list(chosen)):
+                    found.append(row)
+                    if len(found) == ROWS:
+                        yield from self._whole(found, chosen)
+                        found = []
+            except sqlite3.Error as error:  # the rows before the damage are kept
                 self.cut_short = f"{file.name} {error}"
+            yield from self._whole(found, chosen)
+
+    def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[Rows]:
+        """Yield rows of a database without those that are damaged, which have values of other types."""
+        whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
+        self.damaged += len(found) - len(whole)
+        if whole:
+            numbers, stamps, data = zip(*whole, strict=True)
+            yield Rows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
 
 
 class _McapFile:

@@ -37,8 +37,8 @@ BLOCK = 2**22  # bytes that are hashed at once
 SPAWNED = get_context("spawn")  # the progress bar has a thread, which a forked process would lack
 COLUMNS = (
     "recording", "date", "subject", "protocol", "arm", "mode", "support", "held", "verdict", "problem", "holds",
-    "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg", "range_of_motion_deg",
-    "rms_torque_nm",
+    "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
+    "range_of_motion_deg", "rms_torque_nm",
 )  # fmt: skip
 
 Row = dict[str, Any]  # by COLUMNS; None where unknown
