@@ -1,16 +1,17 @@
-"""The rows of the tools: training the ANFIS, an offline trial against real time, the report against rosbags."""
+"""The rows of the tools: training the ANFIS, an offline trial against real time, recordings against rosbags."""
 
 from __future__ import annotations
 
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import yaml
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.lab.anfis_training import from_gravload, train_law
@@ -42,6 +43,7 @@ def measure_work(quick: bool) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         bag = _recording(Path(folder, "bag"), 30 if quick else 300)
         size = sum(file.stat().st_size for file in bag.iterdir()) / 1e6
+        yield from _reading(Path(folder), 30 if quick else 120, repeats)
         ours = [size / taken for taken in _timed(lambda: _report(bag, Path(folder, "report")), repeats)]
         peer = [size / taken for taken in _timed(lambda: _read_all(bag), 1)]
     yield Row(
@@ -52,6 +54,27 @@ def measure_work(quick: bool) -> Iterator[Row]:
         _range(ours),
         more_is_better=True,
     )
+
+
+FORMS = {
+    "MCAP": (StoragePlugin.MCAP, None),
+    "MCAP, zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    "sqlite3": (StoragePlugin.SQLITE3, None),
+}
+
+
+def _reading(folder: Path, seconds: int, repeats: int) -> Iterator[Row]:
+    """Yield a row for each storage: MB of messages in a second, here and by rosbags, in turn."""
+    for number, (name, (plugin, compression)) in enumerate(FORMS.items()):
+        bag = _recording(folder / f"form_{number}", seconds, plugin, compression)
+        with Reader(bag) as reader:
+            size = sum(len(data) for _, _, data in reader.messages()) / 1e6
+        ours, peer = [], []
+        for _ in range(repeats):
+            ours += [size / taken for taken in _timed(partial(read_bag, bag), 1)]
+            peer += [size / taken for taken in _timed(partial(_read_all, bag), 1)]
+        row = f"reading, {name}: rosbags"
+        yield Row(row, float(np.median(ours)), float(np.median(peer)), "MB/s", _range(ours), more_is_better=True)
 
 
 def _timed(call: Callable[[], object], repeats: int) -> list[float]:
@@ -77,13 +100,18 @@ def _offline(hold: float) -> tuple[float, float]:
     return float(trial.run().time[-1]), time.perf_counter() - begin
 
 
-def _recording(path: Path, seconds: int) -> Path:
-    """Write a rosbag2 in MCAP with joint states and efforts of an arm that moves from pose to pose."""
+def _recording(
+    path: Path, seconds: int, plugin: StoragePlugin = StoragePlugin.MCAP, compression: CompressionMode | None = None
+) -> Path:
+    """Write a rosbag2 with joint states and efforts of an arm that moves from pose to pose."""
     store = get_typestore(Stores.ROS2_JAZZY)
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     names = yaml.safe_load(packaged_config("sim.yaml").read_text())["/right/compensator"]["ros__parameters"]
     rng = np.random.default_rng(1)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if compression:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         states, commands = (
             writer.add_connection(f"/right/{topic}", JOINT_STATE, typestore=store)
             for topic in ("joint_states", "effort_commands")

@@ -78,8 +78,8 @@ def from_bag(path: str | Path, configured: ConfiguredArm, functions: int) -> Sam
     """
     bag = read_bag(path)
     recording = recording_of(bag, configured)
-    tilts = tilts_of(Path(path), configured.side, required=False)
-    tilted = np.array([stamp - bag.start / 1e9 for stamp, tilt in tilts if not tilt.axis_angle <= UPRIGHT])
+    tilts = zip(bag.tilt[:, 0].tolist(), tilts_of(bag, configured.side), strict=True)
+    tilted = np.array([now for now, tilt in tilts if not tilt.axis_angle <= UPRIGHT])
     holds = [h for h in analyse(recording).holds if not np.any((tilted >= h.start) & (tilted <= h.end))]
     spans = [(recording.time >= hold.start) & (recording.time <= hold.end) for hold in holds]
     angle = np.reshape([hold.pose for hold in holds], (-1, JOINT_COUNT))

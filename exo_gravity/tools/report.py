@@ -1,14 +1,17 @@
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
+Several recordings, or a folder of them, become one table, a row for each trial, and cohort.csv, a row for each joint.
+
 With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
 
-Exit code 0: the arm held, or the recording is complete. 1: it drifted more than allowed, or was never held. 2: wrong
-use, or part of the recording could not be read; the rest is reported first.
+Exit code 0: the arms held, or the recording is complete. 1: one drifted more than allowed, or was never held. 2: wrong
+use, or part of a recording could not be read; the rest is reported first.
 """
 
 import argparse
 import math
 from collections.abc import Sequence
+from glob import glob
 from pathlib import Path
 
 from exo_gravity.lab.report import video
@@ -19,11 +22,12 @@ from exo_gravity.tools.cli import exit_code, non_negative
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="report", description="Report a recorded trial: holds, drift, pushes.")
     option = parser.add_argument
-    option("bag", help="rosbag2 folder, or an .mcap or .db3 file, complete or cut short")
+    bag = "rosbag2 folder, or an .mcap or .db3 file, complete or cut short; or several; or a folder of recordings"
+    option("bag", nargs="+", help=bag)
     option(
         "--repair", action="store_true", help="write a complete copy, BAG_repaired, of a recording cut short; no report"
     )
-    option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the recording)")
+    option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the first recording)")
     option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
     formats = "also write each figure in this format; twice for both"
     option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
@@ -35,7 +39,11 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     ):
         option(name, type=non_negative, default=default, metavar=unit, help=description)
     video.add_arguments(parser)
-    return parser.parse_args(args)
+    options = parser.parse_args(args)
+    options.bag = [Path(found) for text in options.bag for found in sorted(glob(text)) or [text]]
+    if options.repair and len(options.bag) > 1:
+        parser.error("--repair takes one recording")
+    return options
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -47,7 +55,7 @@ def main(args: Sequence[str] | None = None) -> int:
 def _repair(options: argparse.Namespace) -> int:
     from exo_gravity.lab.bag.writer import is_complete, repair
 
-    path = Path(options.bag)
+    (path,) = options.bag
     if is_complete(path):
         print(f"{path} is complete: nothing to repair")
         return 0
@@ -60,22 +68,55 @@ def _run(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from exo_gravity.lab.bag.reader import read_bag
-    from exo_gravity.lab.report import trial_report
+    from exo_gravity.lab.report import cohort, trial_report
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),
         max_stray_after_push=math.radians(options.max_drift_after_push),
         max_rate=math.radians(options.max_rate) / 60.0,
     )
-    path, screen = Path(options.bag), Console(stderr=True)
+    (path, *more), screen = options.bag, Console(stderr=True)
+    beside = path.resolve().with_name(f"{path.resolve().stem}_report")
+    if more or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
+        return _run_cohort(options, criteria, Path(options.output or beside))
     clip = video.requested(options.video, options.video_speed)
     with screen.status(f"reading {path.name}"):
         bag = read_bag(path)
     report = trial_report.analyse(bag, criteria, options.min_hold)
-    beside = path.resolve().with_name(f"{path.resolve().stem}_report")
     written = trial_report.write(report, options.output or beside, options.figures, options.csv)
     if clip:
         video.write(bag, clip, screen)
     trial_report.print_report(report)
     print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}")
     return report.exit_code
+
+
+def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Path) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from exo_gravity.lab.report import cohort
+
+    recordings = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
+    output.mkdir(parents=True, exist_ok=True)
+    cache = cohort.Cache(output / "cohort_cache.json", criteria, options.min_hold)
+    screen, columns = (
+        Console(stderr=True),
+        (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("left")),
+    )
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
+        task = progress.add_task("", total=len(recordings))
+        rows, known = cohort.summaries(
+            recordings, criteria, options.min_hold, cache, lambda path: progress.advance(task)
+        )
+    cohort.write_csv(output / "cohort.csv", rows)
+    console = Console(highlight=False, width=None if Console().is_terminal else 200)
+    trials = cohort.trials_of(rows)
+    cohort.print_trials(trials, console)
+    failed = {row["recording"]: row["problem"] for row in trials if row["problem"]}
+    for problem in failed.values():
+        console.print(f"Not reported: {problem}", markup=False)
+    held = sum(bool(row["held"]) for row in trials)
+    console.print(f"{held} of {len(trials)} trials held; {len(failed)} recordings failed; {known} had not changed")
+    console.print(f"Written: cohort.csv in {output}", markup=False, soft_wrap=True)
+    return 2 if failed else int(held < len(trials))

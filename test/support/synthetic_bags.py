@@ -14,9 +14,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.lab.bag.content import Bag
+from exo_gravity.lab.bag.content import TILT_TOPIC, TILT_TYPE, Bag
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.calibration.recorded import TILT_TOPIC, TILT_TYPE
 from exo_gravity.lab.trial.recording import Recording, ScriptedStep, Span
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

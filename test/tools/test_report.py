@@ -338,7 +338,7 @@ def test_where_nothing_moved_the_resolution_is_stated():
         codes[within] = codes[within][-1] if step.action == "hold" else codes[within]
     report = report_of(replace(WHOLE, position=codes * made.POSITION_CODE))
     code = math.degrees(made.POSITION_CODE)
-    assert f"one position code ({code:.3f} degrees)" in report.verdict[0]
+    assert report.verdict == (f"It held. Right: no measurable movement (below {code:.3f} degrees).", True)
     bound = f"<{60.0 * code / report.arms[0][1].holds[0].duration:.2f}"
     assert " ".join([bound] * 4) in printed(report)
 

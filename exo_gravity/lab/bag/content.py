@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import Param, params_of
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
@@ -21,6 +20,7 @@ STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_ste
 WEARER = ("wearer_efforts", "wearer_efforts_std", "support_request")
 # Of all
 DIAGNOSTICS, PARAMETER_EVENTS, MARKERS, IMU = "/diagnostics", "/parameter_events", "/event_marker", "/imu/data"
+TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 # Of the recorder, in the recording alone
 PARAMETERS, LOSSES, SESSION = "/recorder/parameters", "/recorder/losses", "/recorder/session"
 READ = {  # type of each topic, or last part of its name, that the reader decodes
@@ -30,6 +30,7 @@ READ = {  # type of each topic, or last part of its name, that the reader decode
     DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
     PARAMETER_EVENTS: "rcl_interfaces/msg/ParameterEvent",
     IMU: "sensor_msgs/msg/Imu",
+    TILT_TOPIC: TILT_TYPE,
     PARAMETERS: STRING,
     LOSSES: STRING,
     SESSION: STRING,
@@ -77,6 +78,8 @@ class Bag:
     #: the trunk's motion, (n, 7): s since the start, angular velocity (3,) in rad/s, what it feels as gravity (3,) as
     #: a share of 1 g, in its axes
     trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
+    #: its tilt as published on `/imu/pitch_yaw`, (n, 3): s since the start, pitch and roll in rad
+    tilt: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
@@ -100,7 +103,7 @@ class Bag:
 
 
 def _columns(recording: Recording) -> dict[str, np.ndarray]:
-    time = recording.time
+    time, joints = recording.time, len(recording.joint_names)
     step, action = np.zeros(len(time), int), np.full(len(time), "", object)
     for number, one in enumerate(recording.steps, 1):
         within = slice(*np.searchsorted(time, (one.start, one.end)))
@@ -112,9 +115,9 @@ def _columns(recording: Recording) -> dict[str, np.ndarray]:
     values = (recording.position, recording.velocity, recording.effort, recording.command)
     names = ("position_rad", "velocity_rad_per_s", "torque_nm", "command_nm")
     return {
-        "arm": np.full(len(time) * JOINT_COUNT, recording.name, object),
+        "arm": np.full(len(time) * joints, recording.name, object),
         "joint": np.tile(np.array(recording.joint_names, object), len(time)),
-        **{name: np.repeat(column, JOINT_COUNT) for name, column in shared.items()},
+        **{name: np.repeat(column, joints) for name, column in shared.items()},
         **{name: np.ravel(column) for name, column in zip(names, values, strict=True)},
     }
 

@@ -1,101 +1,86 @@
-"""Serialised sensor_msgs/JointState -> arrays, thousands of messages at once.
+"""The joint states or efforts of one topic -> arrays of the joints of one arm.
 
-CDR (OMG DDS-XTYPES 7.4.3, plain CDR version 1): a header of four bytes, the second of which is 1 for little-endian;
-then stamp, frame_id, name[], position[], velocity[], effort[]. A number is aligned to its size, a string is its length
-and its bytes with a final 0, a sequence its length and its items. All messages of one publisher have the same length
-and names. So the first one gives the offsets of the numbers, and NumPy extracts them from all messages whose other
-bytes are equal.
+Others publish there too: a gripper, or a driver of more joints. Messages are kept by the joints that they name, and
+`arrays` takes those that have the joints of the arm.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.content import JOINT_STATE
+from exo_gravity.lab.bag.layout import Batch, Decoder
 
 FIELDS = ("position", "velocity", "effort")
-TYPES = get_typestore(Stores.ROS2_JAZZY)
+Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+class JointSeries(NamedTuple):
+    """Messages of one arm in the order of the file."""
+
+    ordinal: np.ndarray  #: (n,) their numbers among all messages of the recording
+    arrival: np.ndarray  #: (n,) ns since 1970
+    stamp: np.ndarray  #: (n,) ns since 1970
+    values: np.ndarray  #: (n, fields, joints), NaN where unknown
 
 
 class JointArrays:
-    """Collects the joint states of one topic. The first message gives the order of the joints, `names`."""
+    """Collects the joint states of one topic. fields: those of a message that are kept."""
 
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.names: tuple[str, ...] = ()
-        self.first_arrival = 0  #: ns
-        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    def __init__(self, topic: str, fields: Sequence[str] = FIELDS) -> None:
+        self.topic, self.fields, self.count = topic, tuple(fields), 0
+        self.decoder = Decoder(JOINT_STATE)
+        self._parts: dict[tuple[str, ...], list[Part]] = {}  # by the joints, in order of appearance
 
-    def add(self, arrivals: Sequence[int], messages: Sequence[bytes]) -> None:
-        """Decode messages that arrived at `arrivals` ns. Raises DataError if joints change or a message is damaged."""
-        self.first_arrival = self.first_arrival or arrivals[0]
-        arrived = np.array(arrivals, np.int64)
-        lengths = np.fromiter(map(len, messages), np.int64, len(messages))
-        for length in dict.fromkeys(lengths.tolist()):  # in order of appearance
-            chosen = np.flatnonzero(lengths == length)
-            rows = np.frombuffer(b"".join([messages[i] for i in chosen.tolist()]), np.uint8).reshape(-1, length)
-            while len(chosen):
-                names, fixed, numbers = _layout(rows[0].tobytes())
-                self.names = self.names or names
-                if sorted(names) != sorted(self.names):
-                    differing, expected = ", ".join(names), ", ".join(self.names)
-                    raise DataError(f"{self.topic}: joint names differ: {differing}; must be {expected}")
-                same = np.all(rows[:, fixed] == rows[0, fixed], axis=1)
-                self._parts.append((arrived[chosen[same]], *self._decoded(rows[same].view(numbers)[:, 0], names)))
-                chosen, rows = chosen[~same], rows[~same]
+    def add(self, ordinals: np.ndarray, batch: Batch) -> None:
+        """Decode the messages of a batch, which are the `ordinals`-th of the recording."""
+        for index, layout, numbers in self.decoder.decode(batch):
+            names = layout.texts["name"]
+            given = {field: numbers.dtype[field].shape[0] for field in FIELDS if field in (numbers.dtype.names or ())}
+            if not names or len(set(names)) < len(names) or set(given.values()) - {len(names)}:
+                self.decoder.damaged += len(index)
+                self.decoder.problem = f"a joint state has {given} values for the joints {', '.join(names)}"
+                continue
+            stamp = numbers["header.stamp.sec"].astype(np.int64) * 1_000_000_000 + numbers["header.stamp.nanosec"]
+            # float32 is 1000 times finer than a position code.
+            values = np.full((len(index), len(self.fields), len(names)), np.nan, np.float32)
+            with np.errstate(over="ignore", invalid="ignore"):
+                for number, field in enumerate(self.fields):
+                    if field in given:
+                        values[:, number] = numbers[field]
+            self._parts.setdefault(names, []).append((ordinals[index], batch.arrival[index], stamp, values))
+            self.count += len(index)
 
-    def _decoded(self, numbers: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps (n,) in ns and values (n, 3, joints); float32 is 1000 times finer than a position code."""
-        values = np.full((len(numbers), len(FIELDS), len(self.names)), np.nan, np.float32)
-        order = [names.index(name) for name in self.names]
-        for field, name in enumerate(FIELDS):
-            if name in (numbers.dtype.names or ()):
-                values[:, field] = numbers[name][:, order]
-        return numbers["sec"].astype(np.int64) * 1_000_000_000 + numbers["nanosec"], values
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The joints that most messages name; () without a message."""
+        counts = {names: sum(len(part[0]) for part in parts) for names, parts in self._parts.items()}
+        return max(counts, key=lambda names: counts[names], default=())
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return times of arrival (n,) in order and stamps (n,) in ns, and the values (n, 3, joints) of `FIELDS`.
+    def has(self, joints: Collection[str]) -> bool:
+        """Return whether some messages have all of these joints."""
+        return any(set(joints) <= set(names) for names in self._parts)
 
-        They are forgotten then.
+    def arrays(self, joints: Sequence[str]) -> tuple[JointSeries, int]:
+        """Return the messages that have all `joints`, in their order, and the number of those that have not.
+
+        They are forgotten then. Raises DataError if none has.
         """
-        arrival, stamp, values = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
-        self._parts.clear()
-        order = np.argsort(arrival, kind="stable")
-        return arrival[order], stamp[order], values[order]
-
-
-def _layout(message: bytes) -> tuple[tuple[str, ...], np.ndarray, np.dtype[np.void]]:
-    """Return the joints of a message, the offsets (n,) of the bytes that identify its layout, and its numbers' type.
-
-    The bytes are the header, lengths and texts, not the padding. The numbers are sec, nanosec, and those of `FIELDS`
-    that are not empty, (joints,) each. Raises DataError if the message is not a JointState.
-    """
-    try:
-        decoded: Any = TYPES.deserialize_cdr(message, JOINT_STATE)
-    except Exception:  # rosbags raises whatever its generated code raises
-        raise DataError("a message is damaged, or is not a sensor_msgs/msg/JointState in CDR") from None
-    order, count = "<" if message[1] == 1 else ">", len(decoded.name)
-    fixed, at = [*range(4)], 12
-    texts = [len(text.encode()) + 1 for text in (decoded.header.frame_id, *decoded.name)]
-    for size in (4 + texts[0], 4, *(4 + length for length in texts[1:])):
-        at += -at % 4
-        fixed += range(at, at + size)
-        at += size
-    numbers: dict[str, tuple[Any, int]] = {"sec": (f"{order}i4", 4), "nanosec": (f"{order}u4", 8)}
-    for field in FIELDS:
-        given = len(getattr(decoded, field))
-        if given not in (0, count):
-            raise DataError(f"a joint state has {given} values of {field} for {count} names")
-        at += -at % 4
-        fixed += range(at, at + 4)
-        at += 4
-        if given:
-            at += -(at - 4) % 8  # alignment counts from the end of the header
-            numbers[field] = (f"{order}f8", (count,)), at
-            at += 8 * count
-    formats, offsets = zip(*numbers.values(), strict=True)
-    form: Any = {"names": [*numbers], "formats": formats, "offsets": offsets, "itemsize": len(message)}
-    return tuple(decoded.name), np.array(fixed), np.dtype(form)
+        chosen: list[Part] = []
+        others = 0
+        for names in [*self._parts]:
+            parts = self._parts.pop(names)
+            if set(joints) <= set(names):
+                order = [names.index(joint) for joint in joints]
+                chosen += parts if names == tuple(joints) else [(*part[:3], part[3][:, :, order]) for part in parts]
+            else:
+                others += sum(len(part[0]) for part in parts)
+        if not chosen:
+            raise DataError(f"{self.topic}: no message has the joints {', '.join(joints)}")
+        series = JointSeries(*(np.concatenate(columns) for columns in zip(*chosen, strict=True)))
+        if np.any(np.diff(series.ordinal) < 0):
+            order_of_file = np.argsort(series.ordinal, kind="stable")
+            series = JointSeries(*(column[order_of_file] for column in series))
+        return series, others

@@ -8,15 +8,14 @@ was carried comes from the key `state` of its can_bridge on /diagnostics, never 
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import groupby, islice
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from rosbags.serde import SerdeError
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
@@ -24,13 +23,13 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.lab.bag import content
+from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
 from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
-from exo_gravity.lab.bag.joints import FIELDS, TYPES, JointArrays
-from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
+from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
+from exo_gravity.lab.bag.storage import Rows, Storage
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
-
-BATCH_SIZE = 5_000  # messages that are decoded at once
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,18 @@ class Pairing:
 PAIRING = Pairing()
 
 
-TOPIC = itemgetter(0)
+@dataclass(frozen=True)
+class Plausible:
+    """Which positions are those of an arm in radians."""
+
+    angle: float = 2.0 * math.pi  #: rad; no joint of an arm turns farther
+    share: float = 0.01  #: of the samples that may be beyond it, and are left out: more are of another unit
+
+
+PLAUSIBLE = Plausible()
+LISTED_STEPS = 3  # of the clock, a note each
+
+Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
 
 
 def read_bag(path: str | Path) -> Bag:
@@ -54,15 +64,10 @@ def read_bag(path: str | Path) -> Bag:
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
     storage, contents = Storage(path), _Contents()
-    messages = storage.messages(content.is_wanted)
-    while batch := list(islice(messages, BATCH_SIZE)):
-        for topic, rows in groupby(sorted(batch, key=TOPIC), TOPIC):
-            _, types, stamps, data = zip(*rows, strict=True)
-            contents.add(topic, types[0], stamps, data)
-    if storage.cut_short:
-        contents.is_partial = contents.is_cut = True
-        contents.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
-    states = sorted(name for name in contents.joints if leaf(name) == STATES)
+    for rows in storage.rows(content.is_wanted):
+        contents.add(rows)
+    contents.conclude(storage)
+    states = sorted(name for name, joints in contents.joints.items() if leaf(name) == STATES and joints.count)
     if not states and not contents.problems:
         problem = (
             f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(storage.topics))}"
@@ -70,21 +75,90 @@ def read_bag(path: str | Path) -> Bag:
         if not storage.topics or any(leaf(t) == STATES and kind == JOINT_STATE for t, kind in storage.topics.items()):
             problem = "the recording is empty: it has no messages"
         raise DataError(f"{path}: {'; '.join((problem, *contents.notes))}")
-    start = min((contents.joints[name].first_arrival for name in states), default=0)
-    recordings = tuple(r for name in states if (r := contents.recording(name, start)))
+    series = {name: found for name in contents.arms(states) if (found := contents.series(name))}
+    if not series:
+        raise DataError(f"{path}: {'; '.join(contents.problems)}")
+    reference = max(series, key=lambda name: len(series[name].ordinal))
+    line = timeline(series[reference].ordinal, series[reference].arrival)
+    start = min(int(line.times(one.ordinal, one.arrival).min()) for one in series.values())
+    contents.note_steps(line, start)
+    seconds = _Seconds(line, start)
+    recordings = tuple(r for name, one in series.items() if (r := contents.recording(name, one, seconds)))
     if not recordings:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
     if contents.losses:
         contents.notes.append(f"the recorder lost messages: {contents.losses}")
     events, markers = (
-        tuple(Event((stamp - start) / 1e9, *what) for stamp, *what in sorted(found, key=itemgetter(0, 1)))
+        tuple(Event(now, *what) for now, (_, *what) in seconds.sorted(found))
         for found in (contents.events, contents.markers)
     )
-    notes, problems = tuple(contents.notes), tuple(contents.problems)
-    trunk = np.array(sorted(contents.trunk), dtype=float).reshape(-1, 7)
-    trunk[:, 0] = (trunk[:, 0] - start) / 1e9
-    more = contents.is_partial, contents.session, markers, trunk
-    return Bag(Path(path), start, recordings, events, contents.parameters, notes, problems, *more)
+    return Bag(
+        Path(path), start, recordings, events, contents.parameters, tuple(contents.notes), tuple(contents.problems),
+        contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
+    )  # fmt: skip
+
+
+class _Seconds(NamedTuple):
+    """Times in s since the start of the recording."""
+
+    line: Timeline
+    start: int  #: ns
+
+    def of(self, ordinal: Any, arrival: Any) -> np.ndarray:
+        """Return the times (n,) of messages by their numbers (n,) and times of arrival (n,) in ns."""
+        ordinal, arrival = np.array(ordinal, np.int64), np.array(arrival, np.int64)
+        return (self.line.times(ordinal, arrival) - self.start) / 1e9
+
+    def sorted(self, found: Sequence[tuple[Row, Any]] | Sequence[tuple[Any, ...]]) -> list[tuple[float, Any]]:
+        """Return entries that begin with a Row in the order of their times, each with its time."""
+        if not found:
+            return []
+        times = self.of(*zip(*(entry[0] for entry in found), strict=True)).tolist()
+        return sorted(zip(times, found, strict=True), key=itemgetter(0))
+
+
+class _Samples:
+    """Numbers of a topic, by `columns` from its decoded messages: (n, numbers), NaN in a row that is left out."""
+
+    def __init__(self, msgtype: str, columns: Callable[[np.ndarray], np.ndarray], width: int) -> None:
+        self.decoder, self._columns, self._width = Decoder(msgtype), columns, width
+        self._parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+
+    def add(self, ordinals: np.ndarray, batch: Batch) -> None:
+        for index, _, values in self.decoder.decode(batch):
+            rows = self._columns(values)
+            kept = np.isfinite(rows).all(axis=1)
+            self._parts.append((ordinals[index][kept], batch.arrival[index][kept], rows[kept]))
+
+    def rows(self, seconds: _Seconds) -> np.ndarray:
+        """Return the rows in order, each with its time in s first."""
+        if not self._parts:
+            return np.empty((0, 1 + self._width))
+        ordinal, arrival, rows = (np.concatenate(columns) for columns in zip(*self._parts, strict=True))
+        self._parts.clear()
+        result = np.column_stack((seconds.of(ordinal, arrival), rows))
+        return result[np.argsort(result[:, 0], kind="stable")]
+
+
+def _turning_and_felt(imu: np.ndarray) -> np.ndarray:
+    """Return angular velocity and what is felt as gravity in units of 1 g, (n, 6), of sensor_msgs/Imu (n,)."""
+
+    def vector(name: str, axes: str = "xyz") -> np.ndarray:
+        return np.array([imu[f"{name}.{axis}"] for axis in axes], float)
+
+    with np.errstate(all="ignore"):  # a damaged message may have any number
+        felt = vector("linear_acceleration") / -STANDARD_GRAVITY
+        unreported = imu["linear_acceleration_covariance"][:, 0] == NOT_REPORTED
+        if unreported.any():
+            up = np.array([up_in_body(q) for q in vector("orientation", "xyzw").T[unreported].tolist()])
+            felt[:, unreported] = -up.T
+        felt[:, ~np.any(felt, axis=0)] = np.nan
+    return np.vstack((vector("angular_velocity"), felt)).T
+
+
+def _pitch_and_roll(tilt: np.ndarray) -> np.ndarray:
+    """Return pitch and roll in rad, (n, 2), of geometry_msgs/Vector3Stamped (n,)."""
+    return np.column_stack((tilt["vector.y"], tilt["vector.x"]))
 
 
 class _Contents:
@@ -95,61 +169,131 @@ class _Contents:
         self.parameters: dict[str, str] = {}
         self.losses = ""
         self.session = Session()
-        self.events: list[tuple[Any, ...]] = []  # stamp, text and setting of faults and changed parameters
-        self.markers: list[tuple[int, str]] = []  # stamp and text
-        self.trunk: list[tuple[float, ...]] = []  # rows of Bag.trunk, with stamps in ns
+        self.events: list[tuple[Any, ...]] = []  # row, text and setting of faults and changed parameters
+        self.markers: list[tuple[Row, str]] = []  # row and text
+        self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
+        self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
         self.notes: list[str] = []
         self.problems: list[str] = []
         self.is_cut = False  # the file was cut short
         self.is_partial = False  # it was, or an arm was not down at the end
+        self._names: dict[str, tuple[str, ...]] = {}  # of an arm's joints, by the topic of its joint states
+        self._count = 0  # of the messages so far
+        self._damaged: dict[str, int] = {}  # messages by topic
         self._unreadable: set[str] = set()
-        self._steps: dict[str, list[tuple[int, str, float]]] = {}  # arm -> (stamp, action, duration)
-        self._states: dict[str, list[tuple[int, str]]] = {}  # arm -> (stamp, state)
+        self._steps: dict[str, list[tuple[Row, str, float]]] = {}  # by arm: row, action, duration
+        self._states: dict[str, list[tuple[Row, str]]] = {}  # by arm: row, state
         self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
 
-    def add(self, topic: str, msgtype: str, stamps: Sequence[int], messages: Sequence[bytes]) -> None:
-        """Add messages that arrived at `stamps` ns. An unreadable topic becomes a problem, and its rest is ignored."""
-        if topic in self._unreadable:
-            return
-        try:
+    def add(self, rows: Rows) -> None:
+        """Add messages. A topic with an invalid message becomes a problem, and its rest is ignored."""
+        for (topic, msgtype), chosen, batch in rows.by_topic():
+            ordinals = self._count + chosen
             if msgtype == JOINT_STATE:
-                self.joints.setdefault(topic, JointArrays(topic)).add(stamps, messages)
-                return
-            for stamp, data in zip(stamps, messages, strict=True):
-                self._add(topic, stamp, TYPES.deserialize_cdr(data, msgtype))
-        except (DataError, SerdeError, ValueError, LookupError) as error:
-            self._unreadable.add(topic)
-            self.joints.pop(topic, None)
-            text = str(error)
-            self.problems.append(text if topic in text else f"{topic}: {text}")
+                if topic not in self.joints:
+                    self.joints[topic] = JointArrays(topic, FIELDS if leaf(topic) == STATES else ("effort",))
+                self.joints[topic].add(ordinals, batch)
+            elif topic in (content.IMU, content.TILT_TOPIC):
+                (self.trunk if topic == content.IMU else self.tilt).add(ordinals, batch)
+            elif topic not in self._unreadable:
+                self._add_messages(topic, msgtype, ordinals, batch)
+        self._count += len(rows.topic)
 
-    def _add(self, topic: str, stamp: int, message: Any) -> None:
-        """Add one decoded message that arrived at `stamp` ns. Raises DataError for an invalid step."""
+    def _add_messages(self, topic: str, msgtype: str, ordinals: np.ndarray, batch: Batch) -> None:
+        for *row, data in zip(ordinals.tolist(), batch.arrival.tolist(), batch.messages(), strict=True):
+            try:
+                message = TYPES.deserialize_cdr(data, msgtype)
+            except Exception:  # rosbags raises whatever its generated code raises
+                self._damaged[topic] = self._damaged.get(topic, 0) + 1
+                continue
+            try:
+                self._add(topic, (row[0], row[1]), message)
+            except DataError as error:
+                self._unreadable.add(topic)
+                self.problems.append(str(error))
+                return
+
+    def conclude(self, storage: Storage) -> None:
+        """Note what the files lack, and which messages are damaged."""
+        self.notes += storage.notes
+        if storage.cut_short:
+            self.is_partial = self.is_cut = True
+            self.notes.append(f"the recording was cut short ({storage.cut_short}): what was written before is reported")
+        if storage.damaged:
+            self.is_partial = True
+            self.notes.append(f"the recording is damaged: parts left out: {storage.damaged}")
+        decoders = {topic: joints.decoder for topic, joints in self.joints.items()}
+        for topic, decoder in (
+            *decoders.items(),
+            (content.IMU, self.trunk.decoder),
+            (content.TILT_TOPIC, self.tilt.decoder),
+        ):
+            self._damaged[topic] = self._damaged.get(topic, 0) + decoder.damaged
+        for topic, count in self._damaged.items():
+            if count and topic in self.joints and not self.joints[topic].count:
+                self.problems.append(f"{topic}: {self.joints[topic].decoder.problem}")
+            elif count:
+                self.is_partial = True
+                self.notes.append(f"{topic}: damaged messages left out: {count}")
+
+    def arms(self, states: Sequence[str]) -> Sequence[str]:
+        """Return the topics in `states` that belong to arms: those with efforts or a bridge, if there are any."""
+        arms = [name for name in states if self._commands_of(name).count or arm_of(name) in self._states]
+        for name in states if arms else ():
+            if name not in arms:
+                self.notes.append(
+                    f"{name}: not reported: nothing commands its joints {', '.join(self.joints[name].names)}"
+                )
+        return arms or states
+
+    def _commands_of(self, states: str) -> JointArrays:
+        topic = states.removesuffix(STATES) + COMMANDS
+        return self.joints.get(topic) or JointArrays(topic)
+
+    def series(self, topic: str) -> JointSeries | None:
+        """Return the joint states of an arm: of the joints that its efforts name, else of those that most have."""
+        joints, commanded = self.joints[topic], self._commands_of(topic).names
+        names = commanded if commanded and joints.has(commanded) else joints.names
+        if commanded and sorted(names) == sorted(joints.names):
+            names = joints.names  # in the order of the joint states
+        series, others = joints.arrays(names)
+        if others:
+            self.notes.append(f"{topic}: messages of other joints left out: {others}; a topic of their own is better")
+        self._names[topic] = names
+        return series._replace(arrival=_arrival(series))
+
+    def note_steps(self, line: Timeline, start: int) -> None:
+        """Note the steps of the clock."""
+        ends = (line.end[:-1] - start) / 1e9
+        if len(line.steps) > LISTED_STEPS:
+            self.notes.append(f"the clock was set {len(line.steps)} times: the recording is divided there")
+            return
+        for step, end in zip(line.steps, ends.tolist(), strict=True):
+            how = f"set back by {-step / 1e9:.1f} s" if step < 0 else f"set ahead by {step / 1e9:.1f} s, or it paused,"
+            self.notes.append(f"the recording's clock was {how} at {end:.1f} s: it is divided there")
+
+    def _add(self, topic: str, row: Row, message: Any) -> None:
+        """Add one decoded message. Raises DataError for an invalid one."""
         if leaf(topic) == STEPS:
             try:
                 step = json.loads(message.data)
-                entry = stamp, str(step["action"]), float(step["duration"])
+                entry = row, str(step["action"]), float(step["duration"])
             except (ValueError, KeyError, TypeError):
                 raise DataError(f"{topic}: invalid {STEPS} message") from None
+            if not 0.0 <= entry[2] < math.inf:
+                raise DataError(f"{topic}: duration = {entry[2]}: must be a number of seconds, 0 or more")
             self._steps.setdefault(arm_of(topic), []).append(entry)
         elif topic == content.DIAGNOSTICS:
             for status in message.status:
-                self._add_status(stamp, status)
+                self._add_status(row, status)
         elif topic == content.PARAMETER_EVENTS:
             for parameter in message.changed_parameters:
                 name, value = parameter.name, _value(parameter.value)
-                self.events.append((stamp, f"{message.node}: {name} = {value}", (message.node, name, value)))
-        elif topic == content.IMU:
-            q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
-            felt = [component / -STANDARD_GRAVITY for component in (a.x, a.y, a.z)]
-            if message.linear_acceleration_covariance[0] == NOT_REPORTED:
-                felt = [-component for component in up_in_body((q.x, q.y, q.z, q.w))]
-            if all(map(math.isfinite, (*felt, w.x, w.y, w.z))) and any(felt):
-                self.trunk.append((stamp, w.x, w.y, w.z, *felt))
+                self.events.append((row, f"{message.node}: {name} = {value}", (message.node, name, value)))
         elif topic == content.LOSSES:
             self.losses = message.data
         elif topic == content.MARKERS:
-            self.markers.append((stamp, message.data))
+            self.markers.append((row, message.data))
         elif topic == content.SESSION:
             try:
                 self.session = Session(**json.loads(message.data))
@@ -159,66 +303,90 @@ class _Contents:
             node, _, text = message.data.partition(":")
             self.parameters[node.strip()] = f"{node}:{text}"
 
-    def _add_status(self, stamp: int, status: Any) -> None:
+    def _add_status(self, row: Row, status: Any) -> None:
         level = int(status.level)
         last = self._last.get(status.name, (0, ""))
         if level > 0 and (level, status.message) != last:
-            self.events.append((stamp, f"{status.name}: {status.message}"))
+            self.events.append((row, f"{status.name}: {status.message}"))
         elif level == 0 and last[0] > 0:
-            self.events.append((stamp, f"{status.name}: OK, {status.message}"))
+            self.events.append((row, f"{status.name}: OK, {status.message}"))
         self._last[status.name] = (level, status.message)
         for entry in status.values:
             if entry.key == "state" and entry.value:
-                self._states.setdefault(arm_of(status.name), []).append((stamp, entry.value))
+                self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
 
-    def recording(self, topic: str, start: int) -> Recording | None:
+    def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""
-        name, names = arm_of(topic), self.joints[topic].names
-        arrival, stamp, values = self.joints[topic].arrays()
-        finite = np.isfinite(values[:, FIELDS.index("position")]).all(axis=1)
-        if finite.any() and not finite.all():
-            self.notes.append(f"{name}: joint states left out, a position is NaN or infinite: {np.sum(~finite)}")
-            arrival, stamp, values = arrival[finite], stamp[finite], values[finite]
-        stamped = bool(np.all(np.diff(stamp) >= 0) and abs(np.median(arrival - stamp)) < PAIRING.clock_offset)
-        clock = stamp if stamped else arrival  # either is in order
-        command, steps = self._commands(topic, names, clock, stamped), self._script(name, start)
-        time = (clock - start) / 1e9
-        carried = self._carried(name, start, float(time[-1]))
+        name, names = arm_of(topic), self._names[topic]
+        arrival, stamp, near = _clocks(series, seconds.line)
+        order = np.argsort(arrival, kind="stable")
+        arrival, stamp, values = arrival[order], stamp[order], series.values[order]
+        kept = self._plausible(name, names, values[:, FIELDS.index("position")])
+        if kept is None:
+            return None
+        arrival, stamp, values = arrival[kept], stamp[kept], values[kept]
+        stamped = near > 0.5 and bool(np.all(np.diff(stamp) >= -CLOCK.back))
+        clock = np.maximum.accumulate(stamp) if stamped else arrival
+        command, steps = self._commands(topic, names, clock, stamped, seconds.line), self._script(name, seconds)
+        time = (clock - seconds.start) / 1e9
+        position, velocity, effort = np.moveaxis(values, 1, 0)
         try:
-            position, velocity, effort = np.moveaxis(values, 1, 0)
-            return Recording(name, names, time, position, velocity, effort, command, steps, carried)
+            recording = Recording(name, names, time, position, velocity, effort, command, steps)
         except DataError as error:
             self.problems.append(str(error))
             return None
+        return replace(recording, carried=self._carried(name, seconds, float(time[-1])))
 
-    def _commands(self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool) -> np.ndarray:
-        """Return the effort (n, 4) that was in force at each time of `clock`, NaN where there was none."""
+    def _plausible(self, name: str, joints: Sequence[str], position: np.ndarray) -> np.ndarray | None:
+        """Return which positions (n, joints) are those of an arm (n,); None if their unit is wrong, a problem."""
+        finite = np.isfinite(position).all(axis=1)
+        if not finite.any():
+            self.problems.append(f"{name}: no position is a number: must be in rad")
+            return None
+        beyond = np.abs(position) > PLAUSIBLE.angle
+        far = finite & beyond.any(axis=1)
+        if far.sum() > PLAUSIBLE.share * finite.sum():
+            joint = int(np.argmax(beyond[finite].sum(axis=0)))
+            largest = float(np.abs(position[finite, joint]).max())
+            self.problems.append(
+                f"{name}: {joints[joint]} = {largest:.4g} rad: must be within ±2 pi; is it in degrees?"
+            )
+            return None
+        for what, wrong in (("is NaN or infinite", ~finite), ("is beyond ±2 pi", far)):
+            if wrong.any():
+                self.notes.append(f"{name}: joint states left out, a position {what}: {np.sum(wrong)}")
+        return finite & ~far
+
+    def _commands(
+        self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool, line: Timeline
+    ) -> np.ndarray:
+        """Return the effort (n, joints) that was in force at each time of `clock`, NaN where there was none."""
         result = np.full((len(clock), len(names)), np.nan, np.float32)
-        topic = states.removesuffix(STATES) + COMMANDS
-        if topic not in self.joints:
-            self.notes.append(f"{topic} was not recorded: the torque error is unknown")
+        commands = self._commands_of(states)
+        if not commands.count:
+            self.notes.append(f"{commands.topic} was not recorded: the torque error is unknown")
             return result
-        given = self.joints[topic].names
-        if sorted(given) != sorted(names):
-            problem = f"joint names differ: {', '.join(given)}; {states} has {', '.join(names)}"
-            self.problems.append(f"{topic}: {problem}: the torque error is unknown")
+        if not commands.has(names):
+            problem = f"joint names differ: {', '.join(commands.names)}; {states} has {', '.join(names)}"
+            self.problems.append(f"{commands.topic}: {problem}: the torque error is unknown")
             return result
-        arrival, stamp, values = self.joints[topic].arrays()
-        sent, effort = stamp if stamped else arrival, values[:, FIELDS.index("effort")]
+        series, _ = commands.arrays(names)
+        arrival, stamp, _ = _clocks(series._replace(arrival=_arrival(series)), line)
+        sent = stamp if stamped else arrival
         order = np.argsort(sent, kind="stable")
-        sent, effort = sent[order], effort[order][:, [given.index(name) for name in names]]
+        sent, effort = sent[order], series.values[order, 0]
         last = np.searchsorted(sent, clock, "left") - 1
         known = (last >= 0) & (clock - sent[last] < PAIRING.command_age)
         result[known] = effort[last[known]]
         return result
 
-    def _script(self, arm: str, start: int) -> tuple[ScriptedStep, ...]:
+    def _script(self, arm: str, seconds: _Seconds) -> tuple[ScriptedStep, ...]:
         """Return the script steps of an arm; each ends when the next one begins, at the latest."""
-        steps = [((stamp - start) / 1e9, action, duration) for stamp, action, duration in self._steps.get(arm, [])]
+        steps = [(at, action, duration) for at, (_, action, duration) in seconds.sorted(self._steps.get(arm, []))]
         ends = [*(begin for begin, _, _ in steps[1:]), float("inf")]
         return tuple(ScriptedStep(name, at, min(at + s, end)) for (at, name, s), end in zip(steps, ends, strict=False))
 
-    def _carried(self, arm: str, start: int, end: float) -> tuple[Span, ...] | None:
+    def _carried(self, arm: str, seconds: _Seconds, end: float) -> tuple[Span, ...] | None:
         """Return when the arm was carried, by its reported states; None if no state of it was recorded.
 
         end: s, of the arm's recording. An arm that is carried in the last state before it is carried until then. What
@@ -226,7 +394,7 @@ class _Contents:
         """
         if arm not in self._states:
             return None
-        states = sorted(((stamp - start) / 1e9, state) for stamp, state in self._states[arm])
+        states = [(at, state) for at, (_, state) in seconds.sorted(self._states[arm])]
         groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
         spans = [(group[0][0], group[-1][0]) for group in groups]
         time, last = states[-1]
@@ -241,6 +409,22 @@ class _Contents:
                 self.notes.append(f"{arm}: the recording ends {missing}")
                 self.is_partial = True
         return tuple(spans)
+
+
+def _arrival(series: JointSeries) -> np.ndarray:
+    """Return times of arrival in ns, the stamp where that of arrival is unknown."""
+    return without_outliers(np.where(series.arrival > 0, series.arrival, np.maximum(series.stamp, 0)))
+
+
+def _clocks(series: JointSeries, line: Timeline) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return times of arrival (n,) and stamps (n,) in ns on the timeline, and the share of stamps that are near.
+
+    A stamp that is far from the recorder's clock is replaced by the time of arrival.
+    """
+    arrival = line.times(series.ordinal, series.arrival)
+    stamp = series.stamp + line.offset[line.part(series.ordinal)]
+    near = np.abs(arrival - stamp) < PAIRING.clock_offset
+    return arrival, np.where(near, stamp, arrival), float(near.mean())
 
 
 def _value(value: Any) -> object:

@@ -12,7 +12,7 @@ import numpy as np
 from exo_gravity.core.safety.drive import State
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event
-from exo_gravity.lab.bag.joints import TYPES
+from exo_gravity.lab.bag.layout import TYPES
 from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session

@@ -1,8 +1,8 @@
-"""Serialised messages of a rosbag2 recording: MCAP or sqlite3, complete or cut short.
+"""Serialised messages of a rosbag2 recording: MCAP or sqlite3, compressed or not, complete or cut short.
 
 A killed recorder leaves neither metadata.yaml nor an index, so neither is needed: MCAP files are read record by record,
-databases row by row, up to the cut. Recordings that rosbag2 compressed by file or by message go through rosbags'
-own reader, which requires complete files.
+databases row by row, up to the cut. Where there is a metadata.yaml, the files that it names are read: others beside
+them are copies.
 
 An MCAP file is a sequence of records (https://mcap.dev/spec): one byte of opcode, eight of length, the content. A
 chunk's content, once decompressed, is such records again. This module extracts messages itself: the libraries drop a
@@ -14,35 +14,60 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from io import BytesIO
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
+from typing import Any, NamedTuple
+from zlib import crc32
 
+import lz4.frame
+import numpy as np
+import yaml
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema
-from mcap.stream_reader import get_chunk_data_stream
-from rosbags.rosbag2 import Reader, ReaderError
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.clock import LATEST, SECOND
+from exo_gravity.lab.bag.layout import Batch
 
 MAGIC = b"\x89MCAP0\r\n"
+ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
-MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; the message follows
+MESSAGE = struct.Struct("<H4xQ8x")  # channel, log time; the serialised message follows
+LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
+ROWS = 20_000  # messages in a batch, at most
+BLOCK = 2**20  # bytes that are decompressed at once
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 Topic = tuple[str, str]  # name, type
 Message = tuple[str, str, int, bytes]  # topic, type, time of arrival in ns since 1970, serialised message
 
 
+class Rows(NamedTuple):
+    """Messages of several topics in the order of their file."""
+
+    topics: Mapping[int, Topic]  #: by their numbers
+    topic: np.ndarray  #: (n,) number of each message's topic
+    batch: Batch
+
+    def by_topic(self) -> Iterator[tuple[Topic, np.ndarray, Batch]]:
+        """Yield each topic, which rows are its messages (m,), and these messages."""
+        for number in dict.fromkeys(self.topic.tolist()):
+            chosen = np.flatnonzero(self.topic == number)
+            yield self.topics[number], chosen, self.batch.of(chosen)
+
+
 class Storage:
     """A recording: a rosbag2 folder, or one of its files.
 
-    `messages` fills: `topics`, the type of each topic, wanted or not; `announced`, by topic of an MCAP file, the
-    definition of its type and the publishers' quality of service; `cut_short`, where the last file ends too early, None
-    for complete files.
+    `rows` and `messages` fill: `topics`, the type of each topic, wanted or not; `announced`, by topic of an MCAP file,
+    the definition of its type and the publishers' quality of service; `cut_short`, where the last file ends too early,
+    None for complete files; `damaged`, the number of parts that were left out; `notes`, sentences on files.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -51,132 +76,349 @@ class Storage:
         self.topics: dict[str, str] = {}
         self.announced: dict[str, tuple[str, str]] = {}
         self.cut_short: str | None = None
+        self.damaged = 0
+        self.notes: list[str] = []
         if not self.path.exists():
             raise DataError(f"{path}: no such file or folder")
-        files = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
+        here = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
+        files = [f for f in here if f == self.path or (f.is_file() and not f.name.startswith("."))]
         self.files = [file for file in files if file.suffix in (".mcap", ".db3", ".zstd")]
         if not self.files:
             raise DataError(f"{path}: must be a rosbag2 folder with an .mcap or .db3 file, or such a file")
+        named = _named_files(self.path / "metadata.yaml") if self.path.is_dir() else []
+        self.is_listed = bool(named)  # by metadata.yaml, or is the file that was asked for
+        if named:
+            self._keep(named)
+
+    def _keep(self, named: Sequence[str]) -> None:
+        """Keep the files that metadata.yaml names; NAME.zstd stands for NAME."""
+        found = {file.name: file for file in self.files}
+        chosen = [found.get(name) or found.get(f"{name}.zstd") for name in named]
+        if missing := [name for name, file in zip(named, chosen, strict=True) if file is None]:
+            self.notes.append(f"metadata.yaml names {', '.join(missing)}, which is not there")
+        if kept := [file for file in chosen if file]:
+            if others := [file.name for file in self.files if file not in kept]:
+                self.notes.append(f"not read, because metadata.yaml does not name it: {', '.join(others)}")
+            self.files = kept
+        else:
+            self.is_listed = False
 
     def messages(self, wanted: Wanted) -> Iterator[Message]:
-        """Yield the messages of the `wanted` topics, file by file. Raises DataError for a file of unknown format."""
-        metadata = self.path / "metadata.yaml"
-        text = metadata.read_text(encoding="utf-8") if metadata.is_file() else ""
-        by_message = re.search(r"^\s*compression_mode:\s*['\"]?message", text, re.MULTILINE | re.IGNORECASE)
-        if by_message or any(file.suffix == ".zstd" for file in self.files):
-            yield from self._by_rosbags(wanted)
-            return
-        for file in self.files:
-            yield from (self._mcap if file.suffix == ".mcap" else self._sqlite)(file, wanted)
+        """Yield the messages of the `wanted` topics one by one; see `rows`."""
+        for rows in self.rows(wanted):
+            arrivals = rows.batch.arrival.tolist()
+            for number, stamp, data in zip(rows.topic.tolist(), arrivals, rows.batch.messages(), strict=True):
+                yield *rows.topics[number], stamp, data
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Message]:
+    def rows(self, wanted: Wanted) -> Iterator[Rows]:
+        """Yield the messages of the `wanted` topics, file by file.
+
+        Raises DataError for a file of unknown format, for one that is compressed and cut or damaged, and where two
+        files hold the same time and no metadata.yaml says which belong to the recording.
+        """
+        spans: list[tuple[Path, int, int]] = []
+        for file in self.files:
+            low, high = LATEST, 0
+            for rows in self._of_file(file, wanted):
+                low, high = min(low, int(rows.batch.arrival[0])), max(high, int(rows.batch.arrival[-1]))
+                is_twice = (f for f, begin, end in spans if low < end - SECOND and begin < high - SECOND)
+                if not self.is_listed and (other := next(is_twice, None)):
+                    raise DataError(
+                        f"{self.path}: {other.name} and {file.name} hold the same time, and no metadata.yaml says "
+                        f"which belongs to the recording: name one of them"
+                    )
+                yield rows
+            spans.append((file, low, high))
+
+    def _of_file(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
+        with ExitStack() as stack:
+            kind = file.suffix
+            content = file
+            if kind == ".zstd":
+                kind = file.with_suffix("").suffix
+                content = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
+                _decompress_file(file, content)
+            read = self._mcap if kind == ".mcap" else self._sqlite
+            for rows in read(content, wanted):
+                if decompressed := self._decompressed(rows):
+                    yield decompressed
+
+    def _decompressed(self, rows: Rows) -> Rows | None:
+        """Return rows whose messages are not compressed; None without any."""
+        topics, topic, batch = rows
+        whole = (batch.length > len(ZSTD)) & (batch.start + batch.length <= len(batch.data))
+        self.damaged += int(np.sum(~whole))
+        if not whole.all():
+            topic, batch = topic[whole], batch.of(whole)
+        if not len(topic):
+            return None
+        if not np.any(batch.data[batch.start] == ZSTD[0]):
+            return Rows(topics, topic, batch)
+        messages, kept = [], []
+        for index, message in enumerate(batch.messages()):
+            try:
+                messages.append(_unpacked("zstd", message, None) if message.startswith(ZSTD) else message)
+                kept.append(index)
+            except (zstandard.ZstdError, ValueError):
+                self.damaged += 1
+        if not kept:
+            return None
+        return Rows(topics, topic[kept], _batch(messages, batch.arrival[kept]))
+
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
             data = mmap(stream.fileno(), 0, access=ACCESS_READ)
-        try:
-            if not (yield from self._records(data, len(MAGIC), wanted, {}, {})):
-                self.cut_short = f"{file.name} ends without an index"
-        except Exception:  # each decompressor raises its own type
-            self.cut_short = f"{file.name} ends within a record, or is damaged"
+        reading = _McapFile(self, wanted)
+        yield from reading.rows(data, len(MAGIC))
+        if not reading.is_complete:
+            where = "without an index" if reading.at == len(data) else "within a record, or is damaged"
+            self.cut_short = f"{file.name} ends {where}"
 
-    def _records(
-        self, data: bytes | mmap, at: int, wanted: Wanted, schemas: dict[int, Schema], chosen: dict[int, Topic]
-    ) -> Generator[Message, None, bool]:
-        """Yield the messages among the records from `at` on, also those in chunks; return whether all data were read.
+    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
+        with ExitStack() as stack:
+            try:
+                database, topics = _open_database(file, stack)
+            except (sqlite3.Error, OSError) as error:
+                raise DataError(f"{file}: not a rosbag2 database ({error})") from None
+            self.topics.update(topics.values())
+            chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
+            query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
+            found: list[tuple[Any, Any, Any]] = []
+            try:
+                for row in database.execute(query, list(chosen)):
+                    found.append(row)
+                    if len(found) == ROWS:
+                        yield from self._whole(found, chosen)
+                        found = []
+            except sqlite3.Error as error:  # the rows before the damage are kept
+                self.cut_short = f"{file.name} {error}"
+            yield from self._whole(found, chosen)
 
-        schemas: read so far.
-        chosen: the wanted topics by channel.
+    def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[Rows]:
+        """Yield rows of a database without those that are damaged, which have values of other types."""
+        whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
+        self.damaged += len(found) - len(whole)
+        if whole:
+            numbers, stamps, data = zip(*whole, strict=True)
+            yield Rows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
 
-        Raises an error at a cut or damage.
-        """
-        end = len(data)
-        while at + RECORD.size <= end:
-            if data[at] == MESSAGE_OPCODE and at + MESSAGE.size <= end:
-                _, length, number, _, stamp, _ = MESSAGE.unpack_from(data, at)
-                start, at = at + MESSAGE.size, at + RECORD.size + length
-                if number in chosen and at <= end:
-                    yield *chosen[number], stamp, data[start:at]
-                continue
-            opcode, length = RECORD.unpack_from(data, at)
-            at += RECORD.size + length
-            body = ReadDataStream(BytesIO(data[at - length : at]))
-            if opcode == Opcode.CHUNK:
-                chunk, size = get_chunk_data_stream(Chunk.read(body))
-                yield from self._records(chunk.read(size), 0, wanted, schemas, chosen)
-            elif at > end:
+
+class _McapFile:
+    """Reads the records of an MCAP file: `at` is where it is, and `is_complete` whether it met the end of the data."""
+
+    def __init__(self, storage: Storage, wanted: Wanted) -> None:
+        self.storage, self.wanted = storage, wanted
+        self.schemas: dict[int, Schema] = {}
+        self.chosen: dict[int, Topic] = {}  # the wanted topics by channel
+        self.at, self.is_complete = 0, False
+
+    def rows(self, data: bytes | mmap, at: int) -> Iterator[Rows]:
+        """Yield the messages among the records from `at` on, also those in chunks, up to a cut or damage."""
+        end, size, unpack, unpack_message = len(data), RECORD.size, RECORD.unpack_from, MESSAGE.unpack_from
+        chosen, buffer = self.chosen, np.frombuffer(data, np.uint8)
+        numbers: list[int] = []
+        stamps: list[int] = []
+        starts: list[int] = []
+        ends: list[int] = []
+
+        def taken() -> Iterator[Rows]:
+            if numbers:
+                start = np.array(starts) + MESSAGE.size
+                batch = Batch(buffer, start, np.array(ends) - start, plausible(np.array(stamps, np.uint64)))
+                yield Rows(chosen, np.array(numbers), batch)
+                for column in (numbers, stamps, starts, ends):
+                    column.clear()
+
+        while at + size <= end:
+            opcode, length = unpack(data, at)
+            begin, after = at + size, at + size + length
+            if after > end:
+                if opcode == Opcode.CHUNK and (content := _of_cut_chunk(bytes(data[begin:]))):
+                    yield from taken()
+                    yield from self.rows(content, 0)
                 break
-            elif opcode == Opcode.SCHEMA:
-                described = Schema.read(body)
-                schemas[described.id] = described
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(body)
-                schema = schemas.get(channel.schema_id)
-                msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
-                self.topics[channel.topic] = msgtype
-                self.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
-                if wanted(channel.topic, msgtype):
-                    chosen[channel.id] = channel.topic, msgtype
+            at = after
+            if opcode == MESSAGE_OPCODE:
+                if length < MESSAGE.size:
+                    self.storage.damaged += 1
+                    continue
+                number, stamp = unpack_message(data, begin)
+                if number in chosen:
+                    numbers.append(number)
+                    stamps.append(stamp)
+                    starts.append(begin)
+                    ends.append(after)
+                    if len(numbers) >= ROWS:
+                        yield from taken()
+                continue
+            if opcode == Opcode.CHUNK:
+                yield from taken()
+                if content := self._chunk(bytes(data[begin:after])):
+                    yield from self.rows(content, 0)
+                    if self.at < len(content):
+                        self.storage.damaged += 1
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._describe(opcode, bytes(data[begin:after]))
             elif opcode == Opcode.DATA_END:
-                return True
-        if at != end:
-            raise EOFError
-        return False
+                self.is_complete = True
+                break
+        yield from taken()
+        self.at = at
 
-    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[Message]:
+    def _chunk(self, record: bytes) -> bytes | None:
+        """Return the records in a chunk; None if it is damaged, and counted."""
         try:
-            database, topics = _open_database(file)
-        except sqlite3.Error as error:
-            raise DataError(f"{file}: not a rosbag2 database ({error})") from None
-        self.topics.update(topics.values())
-        chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
-        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
+            chunk = Chunk.read(ReadDataStream(BytesIO(record)))
+            content = _unpacked(chunk.compression, chunk.data, chunk.uncompressed_size)
+            if chunk.uncompressed_crc in (0, crc32(content)):
+                return content
+        except Exception:  # each decompressor raises its own type
+            pass
+        self.storage.damaged += 1
+        return None
+
+    def _describe(self, opcode: int, record: bytes) -> None:
+        """Take in a schema or a channel; a damaged one is counted."""
+        body = ReadDataStream(BytesIO(record))
         try:
-            for key, stamp, data in database.execute(query, list(chosen)):
-                yield *chosen[key], stamp, data
-        except sqlite3.Error as error:  # the rows before the damage have been yielded
-            self.cut_short = f"{file.name} {error}"
-        database.close()
+            if opcode == Opcode.SCHEMA:
+                described = Schema.read(body)
+                self.schemas[described.id] = described
+                return
+            channel = Channel.read(body)
+        except Exception:  # mcap raises whatever its reading meets
+            self.storage.damaged += 1
+            return
+        schema = self.schemas.get(channel.schema_id)
+        msgtype, definition = (schema.name, schema.data.decode(errors="replace")) if schema else ("", "")
+        self.storage.topics[channel.topic] = msgtype
+        self.storage.announced[channel.topic] = definition, channel.metadata.get("offered_qos_profiles", "")
+        if self.wanted(channel.topic, msgtype):
+            self.chosen[channel.id] = channel.topic, msgtype
 
-    def _by_rosbags(self, wanted: Wanted) -> Iterator[Message]:
-        try:
-            with Reader(self.path) as reader:
-                self.topics.update((c.topic, c.msgtype) for c in reader.connections)
-                chosen = [c for c in reader.connections if wanted(c.topic, c.msgtype)]
-                for connection, stamp, data in reader.messages(chosen) if chosen else ():
-                    yield connection.topic, connection.msgtype, stamp, bytes(data)
-        except (ReaderError, FileNotFoundError) as error:
-            raise DataError(f"{self.path}: a compressed recording must be complete ({error})") from None
+
+def _of_cut_chunk(record: bytes) -> bytes | None:
+    """Return the records in the first part of a chunk, unless it is compressed."""
+    try:
+        chunk = Chunk.read(ReadDataStream(BytesIO(record)))
+    except Exception:  # mcap raises whatever its reading meets
+        return None
+    return None if chunk.compression else chunk.data
 
 
-def _open_database(file: Path) -> tuple[sqlite3.Connection, dict[int, Topic]]:
-    """Return a database, or a readable copy of a damaged one, and its topics. Raises sqlite3.Error.
+def plausible(stamps: np.ndarray) -> np.ndarray:
+    """Return times of arrival (n,) in ns as int64, 0 for those that no clock shows."""
+    return np.where((stamps >= 0) & (stamps <= LATEST), stamps, 0).astype(np.int64)
 
-    A killed recorder may leave a journal, which sqlite replays if it may write next to the file; the copy has none. If
-    the file is truncated, the size in its header is wrong. The copy's is made invalid, so that sqlite uses the size of
-    the file: it counts if the counter at byte 92 equals the one at 24 (https://www.sqlite.org/fileformat.html, 1.3.7).
+
+def _batch(messages: Iterable[bytes], arrival: np.ndarray) -> Batch:
+    messages = list(messages)
+    length = np.fromiter(map(len, messages), np.int64, len(messages))
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    return Batch(data, np.cumsum(length) - length, length, plausible(arrival))
+
+
+def _unpacked(compression: str, data: bytes, size: int | None) -> bytes:
+    """Return decompressed bytes, of which there are `size` unless None.
+
+    Raises ValueError, or what the decompressor raises.
+    """
+    most = LARGEST if size is None else size
+    if most > LARGEST:
+        raise ValueError
+    if not compression:
+        content = data
+    elif compression == "zstd":
+        # A reader takes no more memory than it gives, whatever a damaged header claims.
+        reader = zstandard.ZstdDecompressor(max_window_size=LARGEST // 2).stream_reader(data)
+        content = reader.read(most + 1) if size is not None else b"".join(_blocks(reader, LARGEST))
+    elif compression == "lz4":
+        content = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1)
+    else:
+        raise ValueError
+    if size is not None and len(content) != size:
+        raise ValueError
+    return content
+
+
+def _blocks(reader: Any, most: int) -> Iterator[bytes]:
+    """Yield what a reader gives, up to `most` bytes. Raises ValueError beyond."""
+    taken = 0
+    while block := reader.read(BLOCK):
+        taken += len(block)
+        if taken > most:
+            raise ValueError
+        yield block
+
+
+def _decompress_file(file: Path, content: Path) -> None:
+    """Decompress a file that rosbag2 compressed. Raises DataError if it is cut or damaged."""
+    decompressor = zstandard.ZstdDecompressor().decompressobj()
+    try:
+        with file.open("rb") as source, content.open("wb") as target:
+            while block := source.read(BLOCK):
+                target.write(decompressor.decompress(block))
+                if decompressor.eof:
+                    break
+        if decompressor.eof:
+            return
+        reason = "it ends too early"
+    except zstandard.ZstdError as error:
+        reason = str(error)
+    raise DataError(f"{file}: the compressed file is cut or damaged ({reason}): copy it again")
+
+
+def _named_files(metadata: Path) -> list[str]:
+    """Return the names of the files of a recording, of any version of metadata.yaml; [] if it is not readable."""
+    try:
+        paths = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"][
+            "relative_file_paths"
+        ]
+        return [Path(path).name for path in paths]
+    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError):
+        return []
+
+
+def _open_database(file: Path, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int, Topic]]:
+    """Return a database, or a readable copy of it, and its topics; `stack` closes them. Raises sqlite3.Error.
+
+    A write-ahead log beside the file belongs to it: where sqlite may not write, on a read-only medium, it reads both as
+    copies. A killed recorder may leave a journal, which sqlite replays if it may write next to the file; the copy has
+    none. If the file is truncated, the size in its header is wrong. The copy's is made invalid, so that sqlite uses the
+    size of the file: it counts if the counter at byte 92 equals the one at 24
+    (https://www.sqlite.org/fileformat.html, 1.3.7).
     """
     try:
-        return _connected(f"{file.resolve().as_uri()}?mode=ro")
+        return _connected(f"{file.resolve().as_uri()}?mode=ro", stack)
     except sqlite3.Error:
-        with tempfile.NamedTemporaryFile() as copy:
-            shutil.copyfile(file, copy.name)
-            copy.seek(24)
-            counter = copy.read(4)
-            copy.seek(92)
-            copy.write(bytes(byte ^ 0xFF for byte in counter))
-            copy.flush()
-            return _connected(f"file:{copy.name}?immutable=1")
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        copy = Path(shutil.copyfile(file, folder / "copy.db3"))
+    if (log := file.with_name(f"{file.name}-wal")).exists():
+        with_log = Path(shutil.copyfile(file, folder / "with_log.db3"))
+        shutil.copyfile(log, folder / "with_log.db3-wal")
+        with suppress(sqlite3.Error):
+            return _connected(f"{with_log.as_uri()}?mode=rw", stack)
+    with copy.open("r+b") as changed:
+        changed.seek(24)
+        counter = changed.read(4)
+        changed.seek(92)
+        changed.write(bytes(byte ^ 0xFF for byte in counter))
+    return _connected(f"{copy.as_uri()}?immutable=1", stack)
 
 
-def _connected(uri: str) -> tuple[sqlite3.Connection, dict[int, Topic]]:
+def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int, Topic]]:
     database = sqlite3.connect(uri, uri=True)
     try:
+        database.text_factory = lambda data: data.decode(errors="replace")
         rows = database.execute("SELECT id, name, type FROM topics").fetchall()
+        database.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").fetchall()
     except sqlite3.Error:
         database.close()
         raise
-    return database, {key: (topic, kind) for key, topic, kind in rows}
+    stack.callback(database.close)
+    return database, {key: (str(topic), str(kind)) for key, topic, kind in rows}
 
 
 def _natural(path: Path) -> list[int | str]:

@@ -26,7 +26,7 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.calibration.live import Say
-from exo_gravity.lab.calibration.recorded import messages_of
+from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
@@ -108,11 +108,13 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
     """Return the samples of `topic` in a recording, in order of their stamps. Raises DataError."""
-    rows = []
-    for _, message in messages_of(bag, topic, IMU_TYPE):
-        stamp, rate, force = message.header.stamp, message.angular_velocity, message.linear_acceleration
-        rows.append((stamp.sec + stamp.nanosec * 1e-9, rate.x, rate.y, rate.z, force.x, force.y, force.z))
-    values = np.array(sorted(rows))
+    parts = []
+    for found in samples_of(bag, topic, IMU_TYPE):
+        vectors = (found[f"{name}.{axis}"] for name in ("angular_velocity", "linear_acceleration") for axis in "xyz")
+        seconds = found["header.stamp.sec"] + found["header.stamp.nanosec"] * 1e-9
+        parts.append(np.column_stack((seconds, *vectors)))
+    values = np.concatenate(parts)
+    values = values[np.lexsort(values.T[::-1])]
     return ImuRecord(values[:, 0] - values[0, 0], values[:, 1:4], values[:, 4:7])
 
 

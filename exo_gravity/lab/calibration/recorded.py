@@ -9,23 +9,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from rosbags.serde import SerdeError
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.lab.bag.content import Bag
-from exo_gravity.lab.bag.joints import TYPES
+from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
+from exo_gravity.lab.bag.layout import Decoder
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
-
-TILT_TOPIC, TILT_TYPE = "/imu/pitch_yaw", "geometry_msgs/msg/Vector3Stamped"
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     recording = recording_of(bag, arm)
     effort = np.where(np.isfinite(recording.command), recording.command, recording.effort)  # as commanded, where known
     recording = replace(recording, position=recording.position.astype(float), effort=effort)
-    down = _down(path, arm, recording.time + bag.start / 1e9)
+    down = _down(bag, arm, recording.time)
     observations = list(_sweeps(recording, down))
     if with_held:
         observations += list(_held(recording, down, observations))
@@ -74,36 +70,34 @@ def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
     return recording.in_order(arm.joint_names)
 
 
-def _down(path: Path, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
+def _down(bag: Bag, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
     """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
     if not arm.compensator["use_imu"]:
         return np.tile(Tilt.of(arm.side).direction, (len(times), 1))
-    stamps, tilts = zip(*tilts_of(path, arm.side), strict=True)
-    components = np.array([tilt.direction for tilt in tilts]).T
-    return np.stack([np.interp(times, stamps, component) for component in components], axis=1)
+    if not len(bag.tilt):
+        raise DataError(f"{bag.path}: no samples of {TILT_TOPIC}, which gravity's direction comes from")
+    components = np.array([tilt.direction for tilt in tilts_of(bag, arm.side)]).T
+    return np.stack([np.interp(times, bag.tilt[:, 0], component) for component in components], axis=1)
 
 
-def tilts_of(path: Path, side: str, required: bool = True) -> Iterator[tuple[float, Tilt]]:
-    """Yield the trunk's tilts in a recording, for the `side` arm, each with its stamp in s. Raises DataError."""
-    for stamp, message in messages_of(path, TILT_TOPIC, TILT_TYPE, required):
-        yield stamp / 1e9, Tilt.of(side, message.vector.y, message.vector.x)
+def tilts_of(bag: Bag, side: str) -> list[Tilt]:
+    """Return the trunk's tilts of `bag.tilt`, for the `side` arm."""
+    return [Tilt.of(side, pitch, roll) for _, pitch, roll in bag.tilt.tolist()]
 
 
-def messages_of(path: Path, topic: str, msgtype: str, required: bool = True) -> Iterator[tuple[int, Any]]:
-    """Yield stamp in ns and message of each message of `topic` in a recording.
+def samples_of(path: Path, topic: str, msgtype: str) -> Iterator[np.ndarray]:
+    """Yield the messages of `topic` in a recording, with their numbers as `layout.Decoder` names them.
 
-    Raises DataError if a message is unreadable, or if a `required` one is missing.
+    Raises DataError without any.
     """
-    storage, found = Storage(path), False
-    for *_, stamp, data in storage.messages(lambda name, kind: (name, kind) == (topic, msgtype)):
-        try:
-            yield stamp, TYPES.deserialize_cdr(data, msgtype)
-        except (SerdeError, ValueError) as error:
-            raise DataError(f"{path}: {topic}: {error}") from None
-        found = True
-    if required and not found:
-        topics = ", ".join(sorted(storage.topics)) or "none"
-        raise DataError(f"{path}: no samples of {topic} ({msgtype}); its topics: {topics}")
+    storage, decoder, found = Storage(path), Decoder(msgtype), False
+    for rows in storage.rows(lambda name, kind: (name, kind) == (topic, msgtype)):
+        for decoded in decoder.decode(rows.batch):
+            yield decoded.values
+            found = True
+    if not found:
+        topics = decoder.problem or f"its topics: {', '.join(sorted(storage.topics)) or 'none'}"
+        raise DataError(f"{path}: no samples of {topic} ({msgtype}); {topics}")
 
 
 def _sweeps(recording: Recording, down: np.ndarray) -> Iterator[Observation]:

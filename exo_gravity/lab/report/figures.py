@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.numbers import COVER
-from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, PUSH_COLOUR, make_plain
+from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, PUSH_COLOUR, joint_colours, make_plain
 from exo_gravity.lab.report.table import joint_labels, per_minute
 from exo_gravity.lab.report.wearer_share import WearerPart
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
@@ -30,8 +30,9 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
         ("Velocity (deg/s)", np.degrees(recording.velocity)),
         ("Torque (Nm)", recording.effort),
     )
+    colours = joint_colours(len(recording.joint_names))
     for axis, (label, values) in zip(axes, panels, strict=True):
-        for column, name, colour in zip(values.T, joint_labels(recording), JOINT_COLOURS, strict=True):
+        for column, name, colour in zip(values.T, joint_labels(recording), colours, strict=True):
             axis.plot(*_envelope(recording.time, column), color=colour, lw=1.1, label=name)
         for hold in analysis.holds:
             axis.axvspan(hold.start, hold.end, color=HOLD_COLOUR, lw=0, zorder=0, label="hold")
@@ -64,14 +65,15 @@ def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria)
     """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
     figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
     upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.1)))
-    axes = upper.subplots(1, 4, sharex=True, sharey=True)
+    colours = joint_colours(len(recording.joint_names))
+    axes = np.ravel(upper.subplots(1, len(colours), sharex=True, sharey=True))
     for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
         for hold in analysis.holds:
             within = blocks.between(hold.start, hold.end)
             angle = np.degrees(blocks.mean[within, joint])
             time, away = blocks.time[within] - hold.start, angle - angle[:START].mean()
-            axis.plot(time, away, color=JOINT_COLOURS[joint], lw=0.9, alpha=0.75)
-        axis.set_title(name, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+            axis.plot(time, away, color=colours[joint], lw=0.9, alpha=0.75)
+        axis.set_title(name, fontsize=10, color=colours[joint], loc="left", weight="bold")
         axis.set_xlabel("Time in the hold (s)")
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         make_plain(axis)
@@ -87,10 +89,12 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
     numbers = np.arange(1, len(analysis.holds) + 1)
     rates = per_minute([hold.drift_rate for hold in analysis.holds])
     errors = per_minute([hold.drift_rate_uncertainty for hold in analysis.holds])
+    colours = joint_colours(len(recording.joint_names))
     for joint, name in enumerate(joint_labels(recording)):
+        beside = numbers + 0.48 * ((joint + 0.5) / len(colours) - 0.5)
         axis.errorbar(
-            numbers + 0.12 * (joint - 1.5), rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2,
-            color=JOINT_COLOURS[joint], label=name,
+            beside, rates[:, joint], errors[:, joint], fmt="o", ms=4.5, lw=1.2, capsize=2, color=colours[joint],
+            label=name,
         )  # fmt: skip
     axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
     if math.isfinite(criteria.max_rate):
@@ -107,11 +111,12 @@ def _rates(axis: Axes, recording: Recording, analysis: TrialAnalysis, criteria: 
 def wearer(recording: Recording, part: WearerPart) -> Figure:
     """Return the wearer's torque at each joint and their share over time, with their 95 % bands."""
     figure, curve = Figure(figsize=(WIDTH, 8.2), layout="constrained"), part.curve
-    axes = figure.subplots(5, 1, sharex=True, height_ratios=(1, 1, 1, 1, 1.4))
+    colours = joint_colours(len(recording.joint_names))
+    axes = figure.subplots(len(colours) + 1, 1, sharex=True, height_ratios=(*[1.0] * len(colours), 1.4))
     rows = [*curve.torque.T, 100.0 * part.sliding.value]
     bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
     names = [f"{label} (Nm)" for label in joint_labels(recording)]
-    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*JOINT_COLOURS, INK], strict=True)
+    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*colours, INK], strict=True)
     for axis, values, band, name, colour in columns:
         axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
         axis.plot(curve.time, values, color=colour, lw=1.0)

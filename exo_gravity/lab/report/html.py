@@ -8,6 +8,7 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from io import BytesIO
+from itertools import cycle, islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 DPI = 150
 JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+MORE_COLOURS = ("#E69F00", "#56B4E9", "#882255", "#44AA99", "#999933")  # of arms with more joints
 INK, FAINT, GRID_LINE = "#222222", "#9AA3AB", "#D5DADF"
 HOLD_COLOUR, PUSH_COLOUR = "#E8EEF4", "#F9E3B4"
 
@@ -38,7 +40,14 @@ thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5
 tbody th { font-weight: inherit; text-align: left; }
 .joints th::before { content: "●"; margin-right: .4rem; }
 pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
-""" + "\n".join(f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS, 1))
+""" + "\n".join(
+    f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS + MORE_COLOURS, 1)
+)
+
+
+def joint_colours(count: int) -> tuple[str, ...]:
+    """Return a colour for each of `count` joints."""
+    return tuple(islice(cycle(JOINT_COLOURS + MORE_COLOURS), count))
 
 
 def document(title: str, when: str, body: Iterable[str]) -> str:

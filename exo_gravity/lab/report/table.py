@@ -34,16 +34,16 @@ UNITS: dict[str, Callable[[Any], Any]] = {"deg": np.degrees, "deg/s": np.degrees
 class Column(NamedTuple):
     """A number of each joint in each hold or motion."""
 
-    field: str  #: of Hold or Motion, (4,)
+    field: str  #: of Hold or Motion, (joints,)
     key: str  #: in the CSV file
     heading: str  #: with the unit in the second line
     digits: int  #: decimal places
-    largest: bool = False  #: the terminal shows the largest of the four only
+    largest: bool = False  #: the terminal shows the largest of a row only
     spare: int = 0  #: a narrow terminal drops these, from the largest number on
     below: bool = False  #: a joint that read one position throughout a hold has "<" and its uncertainty
 
     def of(self, one: Any) -> np.ndarray:
-        """Return the numbers (4,) of a hold or motion in the column's unit."""
+        """Return the numbers (joints,) of a hold or motion in the column's unit."""
         return np.asarray(UNITS[self.heading.partition("\n")[2]](getattr(one, self.field)))
 
     def texts(self, one: Any) -> list[str]:
@@ -188,7 +188,7 @@ def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable
 
 
 def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis) -> None:
-    """Print the holds and motions of one arm; a cell holds the four joints in order.
+    """Print the holds and motions of one arm; a cell holds the joints in order.
 
     Where the table is wider than the console, spare columns are left out: they are in the CSV files.
     """
@@ -213,7 +213,7 @@ def print_tables(console: Console, recording: Recording, analysis: TrialAnalysis
 
 
 def _cells(rows: Sequence[Hold | Motion], column: Column) -> list[str]:
-    """Return one cell per row: its largest number, or its four numbers, aligned with those of the other rows."""
+    """Return one cell per row: its largest number, or those of all joints, aligned with those of the other rows."""
     if column.largest:
         known = ([value for value in column.of(row) if math.isfinite(value)] for row in rows)
         return [shown(max(values, default=math.nan), column.digits) for values in known]

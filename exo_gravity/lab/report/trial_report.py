@@ -13,7 +13,7 @@ from rich.markup import escape as marked
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.bag.content import Bag, Event
 from exo_gravity.lab.report import figures, html, table, wearer_share
-from exo_gravity.lab.report.verdict import EARLY, Conditions, Report
+from exo_gravity.lab.report.verdict import EARLY, Conditions, Report, unmoved
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 
@@ -79,7 +79,8 @@ def write(
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
             drawn = {"overview": figures.overview(recording, analysis)}
-            if analysis.holds:
+            has_moved = any(hold.stray.max() > table.UNMOVED for hold in analysis.holds)
+            if has_moved:
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if part := report.wearers.get(recording.name):
                 drawn["wearer"] = figures.wearer(recording, part)
@@ -91,6 +92,8 @@ def write(
                 for suffix in formats:
                     html.save_vector(figure, path.with_suffix(f".{suffix}"))
                 pictures.append(html.picture(png, CAPTIONS[name]))
+            if analysis.holds and not has_moved:
+                pictures.append(html.bullets("", [f"In the holds, {unmoved(analysis.holds[0])}."]))
             if part:
                 pictures.append(html.bullets("Wearer", [wearer_share.sentence(part)]))
             sections += table.arm_section(recording, analysis, pictures)

@@ -16,7 +16,7 @@ from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report import table
 from exo_gravity.lab.report.wearer_share import WearerPart
-from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis, failures
+from exo_gravity.lab.trial.analysis import Hold, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.lab.trial.recording import Recording
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
@@ -108,11 +108,17 @@ class Report:
     def verdict(self) -> tuple[str, bool]:
         """The first sentences of the report, and whether they are good news: a bad event comes first."""
         events = [event for arm in self.arms for event in (*_falls(self, *arm), *_strays(self, *arm))]
-        bad, _, event = max(events, default=(False, 0.0, ""))
+        bad, moved, event = max(events, default=(False, 0.0, ""))
         early = f" The trial ended early: {self.trouble}." if self.trouble else ""
         held = f"It did not hold.{early}" if self.failures else self.held
         otherwise = held if self.failures else f"Otherwise it {held.removeprefix('It ')}"
-        text = f"{event[:1].upper()}{event[1:]}. {otherwise}" if bad else f"{held} Worst: {event}." if event else held
+        first = f"{event[:1].upper()}{event[1:]}."
+        if bad:
+            text = f"{first} {otherwise}"
+        elif event:
+            text = f"{held} Worst: {event}." if moved else f"{held} {first}"
+        else:
+            text = held
         return text, not (bad or self.failures)
 
     @property
@@ -174,9 +180,13 @@ def _strays(report: Report, recording: Recording, analysis: TrialAnalysis) -> It
             bad = bool(hold.stray.max() > report.criteria.stray_allowed(hold))
             yield _event(recording, f"within 10 s of hold {number}, ", hold.stray, bad)
         else:
-            code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
-            size = f" ({code:.3f} degrees)" if math.isfinite(code) else ""
-            yield False, 0.0, f"{recording.name}: no joint moved by one position code{size} in a hold"
+            yield False, 0.0, f"{recording.name}: {unmoved(hold)}"
+
+
+def unmoved(hold: Hold) -> str:
+    """Say that no joint moved in a hold, and below what angle a motion would not show: one position code."""
+    code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
+    return "no measurable movement" + (f" (below {code:.3f} degrees)" if math.isfinite(code) else "")
 
 
 def _event(recording: Recording, what: str, angle: np.ndarray, bad: bool, speed: np.ndarray | None = None) -> Worst:

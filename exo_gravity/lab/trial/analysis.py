@@ -8,7 +8,7 @@ start.
 Whether the arm held is judged within any 10 s of a hold, over the whole hold if a rate is given, and from release to
 the end of a scripted hold. The last criterion fails an arm that falls at once and then hangs still.
 
-SI units throughout: rad, rad/s, Nm, s. Arrays (4,) are in the order of the recording's joints.
+SI units throughout: rad, rad/s, Nm, s. Arrays (joints,) are in the order of the recording's joints.
 """
 
 import math
@@ -18,7 +18,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.trial.recording import STILLNESS, Blocks, Recording, Span, in_blocks, still_spans
 from exo_gravity.sim.script import TRUNK_ACTIONS
 
@@ -45,14 +44,14 @@ class Hold:
 
     start: float  #: s
     end: float  #: s
-    pose: np.ndarray  #: (4,) rad, mean
-    drift: np.ndarray  #: (4,) rad, from the first part of the hold to its last
-    drift_rate: np.ndarray  #: (4,) rad/s
-    drift_rate_uncertainty: np.ndarray  #: (4,) rad/s, standard uncertainty; NaN if the joint never changed its code
-    stray: np.ndarray  #: (4,) rad, largest range within any 10 s
-    velocity_rms: np.ndarray  #: (4,) rad/s as measured: half a velocity code for a motor at rest
-    torque_rms: np.ndarray  #: (4,) Nm, measured
-    torque_error: np.ndarray  #: (4,) Nm, RMS of commanded minus measured
+    pose: np.ndarray  #: (joints,) rad, mean
+    drift: np.ndarray  #: (joints,) rad, from the first part of the hold to its last
+    drift_rate: np.ndarray  #: (joints,) rad/s
+    drift_rate_uncertainty: np.ndarray  #: (joints,) rad/s, standard; NaN if the joint never changed its code
+    stray: np.ndarray  #: (joints,) rad, largest range within any 10 s
+    velocity_rms: np.ndarray  #: (joints,) rad/s as measured: half a velocity code for a motor at rest
+    torque_rms: np.ndarray  #: (joints,) Nm, measured
+    torque_error: np.ndarray  #: (joints,) Nm, RMS of commanded minus measured
     after: str  #: kind of the motion before it, or 'start'
 
     @property
@@ -73,10 +72,10 @@ class Motion:
     kind: str
     start: float  #: s
     end: float  #: s
-    peak: np.ndarray  #: (4,) rad, signed, largest distance from the pose before
-    residual: np.ndarray  #: (4,) rad, pose after minus pose before; NaN if the arm was not still again
+    peak: np.ndarray  #: (joints,) rad, signed, largest distance from the pose before
+    residual: np.ndarray  #: (joints,) rad, pose after minus pose before; NaN if the arm was not still again
     until_still: float  #: s from the first movement; NaN likewise
-    speed: np.ndarray  #: (4,) rad/s, peak
+    speed: np.ndarray  #: (joints,) rad/s, peak
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ class Release:
     start: float  #: s
     end: float  #: s
     after: str  #: the script's action before it
-    offset: np.ndarray  #: (4,) rad, at its end
+    offset: np.ndarray  #: (joints,) rad, at its end
     still: bool  #: whether the arm was still at its end
 
 
@@ -177,14 +176,15 @@ def _motion(recording: Recording, blocks: Blocks, left: Span, right: Span) -> Mo
     after = blocks.mean[blocks.between(right[0], min(right[1], right[0] + TUNING.pose_time))].mean(axis=0)
     within = blocks.between(left[1], right[0])
     samples = slice(*blocks.sample[[within.start, within.stop]])
-    away = np.vstack((np.zeros(JOINT_COUNT), recording.position[samples] - before))
+    joints = np.arange(len(before))
+    away = np.vstack((np.zeros(len(before)), recording.position[samples] - before))
     is_still, residual = right[1] > right[0], after - before
     return Motion(
         kind=_kind(recording, left[1], right[0], bool(blocks.empty[within].any()), residual),
         start=left[1],
         end=right[0],
-        peak=away[np.abs(away).argmax(axis=0), np.arange(JOINT_COUNT)],
-        residual=residual if is_still else np.full(JOINT_COUNT, math.nan),
+        peak=away[np.abs(away).argmax(axis=0), joints],
+        residual=residual if is_still else np.full(len(before), math.nan),
         until_still=max(0.0, right[0] - left[1] - STILLNESS.margin) if is_still else math.nan,
         speed=np.abs(recording.velocity[samples]).max(axis=0, initial=0.0),
     )
@@ -209,13 +209,15 @@ def _releases(recording: Recording, blocks: Blocks) -> Iterator[Release]:
         # A hold that was cut short shows the hand that has just let go, not the arm.
         if step.action == "hold" and end - start >= min(MIN_HOLD, step.end - step.start):
             within = blocks.between(start, end)
-            offset = blocks.mean[within.stop - 1] - blocks.mean[within.start]
-            yield Release(start, end, after, offset, bool(blocks.still[within.stop - 1]))
+            filled = within.start + np.flatnonzero(~blocks.empty[within])  # the end may lie in a gap
+            if len(filled):
+                first, last = filled[[0, -1]]
+                yield Release(start, end, after, blocks.mean[last] - blocks.mean[first], bool(blocks.still[last]))
         after = step.action
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square (4,) of the finite values among (n, 4); NaN for a joint that has none."""
+    """Return the root mean square (joints,) of the finite values among (n, joints); NaN for a joint that has none."""
     mean: np.ndarray = np.ma.masked_invalid(np.square(values, dtype=float)).mean(axis=0).filled(math.nan)
     return np.sqrt(mean)
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import State
 
 
@@ -21,13 +20,14 @@ class Stillness:
 
     block: float = 0.1  #: s, the time resolution of the analysis
     speed: float = 0.02  #: rad/s, or 69 degrees per minute: an arm that moves faster is not held
+    blocks: int = 10  #: at most, for each sample: bounds the memory of a recording with long gaps
     margin: float = 0.2  #: s cut off at both ends of a still span, where a smooth motion can be slower than `speed`
 
 
 STILLNESS = Stillness()
 
 
-ARRAYS = ("position", "velocity", "effort", "command")  # of a recording, (n, 4) each
+ARRAYS = ("position", "velocity", "effort", "command")  # of a recording, (n, joints) each
 Span = tuple[float, float]  # start and end in s
 CARRIED = (State.RAMPING_IN, State.ACTIVE)  # the states of an arm's bridge in which its motors carry it
 
@@ -47,19 +47,19 @@ class Recording:
     name: str  #: of the arm
     joint_names: tuple[str, ...]
     time: np.ndarray  #: (n,) s
-    position: np.ndarray  #: (n, 4) rad
-    velocity: np.ndarray  #: (n, 4) rad/s, NaN where unknown
-    effort: np.ndarray  #: (n, 4) Nm, measured, NaN where unknown
-    command: np.ndarray  #: (n, 4) Nm, requested, NaN where unknown
+    position: np.ndarray  #: (n, joints) rad
+    velocity: np.ndarray  #: (n, joints) rad/s, NaN where unknown
+    effort: np.ndarray  #: (n, joints) Nm, measured, NaN where unknown
+    command: np.ndarray  #: (n, joints) Nm, requested, NaN where unknown
     steps: tuple[ScriptedStep, ...] = ()  #: of the script, empty if they were not recorded
     #: The spans in which the motors carried the arm, in order; outside of them it is off or being let down. None if
     #: these were not recorded: the arm is then taken to be carried throughout.
     carried: tuple[Span, ...] | None = None
 
     def __post_init__(self) -> None:
-        if len(self.joint_names) != JOINT_COUNT:
-            raise DataError(f"{self.name}: joints = {', '.join(self.joint_names)}: must be {JOINT_COUNT} joints")
-        shape = (len(self.time), JOINT_COUNT)
+        if not self.joint_names:
+            raise DataError(f"{self.name}: joints = none: must be at least one joint")
+        shape = (len(self.time), len(self.joint_names))
         for field in ARRAYS:
             if getattr(self, field).shape != shape:
                 raise DataError(f"{self.name}: shape of {field} = {getattr(self, field).shape}: must be {shape}")
@@ -90,7 +90,7 @@ class Blocks(NamedTuple):
 
     time: np.ndarray  #: (m + 1,) s, the start of each block and the end of the last
     sample: np.ndarray  #: (m + 1,), the first sample of each block and the end
-    mean: np.ndarray  #: (m, 4) rad, mean position
+    mean: np.ndarray  #: (m, joints) rad, mean position
     still: np.ndarray  #: (m,), whether the arm was still
     empty: np.ndarray  #: (m,), whether the block has no samples
 
@@ -106,9 +106,13 @@ class Blocks(NamedTuple):
 
 
 def in_blocks(recording: Recording) -> Blocks:
-    """Return the recording in blocks of 0.1 s, or of three samples if its rate is below 30 Hz."""
+    """Return the recording in blocks of 0.1 s, or of three samples if its rate is below 30 Hz.
+
+    There are no more than a few blocks for each sample, however long the recording was without any.
+    """
     time, position = recording.time, recording.position
-    length = max(STILLNESS.block, 3.0 * float(np.median(np.diff(time))))
+    sparse = float(time[-1] - time[0]) / (STILLNESS.blocks * len(time))
+    length = max(STILLNESS.block, 3.0 * float(np.median(np.diff(time))), sparse)
     count = int((time[-1] - time[0]) / length) + 1
     starts = time[0] + length * np.arange(count + 1)
     sample = np.searchsorted(time, starts)

@@ -31,7 +31,7 @@ RELIABLE, LATCHED = offered_qos(True, False, 1), offered_qos(True, True, 1)
 
 
 def state(k):
-    return STATES, START + k, made.joint_state(START + k, NAMES, *[(k, 0.1, 0.2, 0.3)] * 3)
+    return STATES, START + k, made.joint_state(START + k, NAMES, *[(k / 1000, 0.1, 0.2, 0.3)] * 3)
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def bag(tmp_path):
 def test_mcap_decodes_the_joint_names_from_the_schema_in_the_file(bag):
     with (bag / "bag.mcap").open("rb") as file:
         decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    assert [message.position[0] for _, _, _, message in decoded] == list(range(100))
+    assert [message.position[0] for _, _, _, message in decoded] == [k / 1000 for k in range(100)]
     schema, channel, record, message = decoded[7]
     assert (schema.name, channel.topic, record.log_time) == (JOINT_STATE, STATES, START + 7)
     assert list(message.name) == NAMES
@@ -67,7 +67,7 @@ def test_rosbags_reads_topics_types_messages_and_the_offered_quality_of_service(
         types = {topic: info.msgtype for topic, info in reader.topics.items()}
         offered = {c.topic: c.ext.offered_qos_profiles[0] for c in reader.connections}
     assert types == {STATES: JOINT_STATE, STEPS: STRING}
-    assert [(stamp, state.position[0]) for _, stamp, state in messages] == [(START + k, k) for k in range(100)]
+    assert [(stamp, state.position[0]) for _, stamp, state in messages] == [(START + k, k / 1000) for k in range(100)]
     assert {offered[topic].reliability for topic in types} == {QosReliability.RELIABLE}
     assert offered[STATES].durability == QosDurability.VOLATILE
     assert offered[STEPS].durability == QosDurability.TRANSIENT_LOCAL

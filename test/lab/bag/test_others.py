@@ -1,0 +1,244 @@
+"""Recordings of others: a clock that was set, copies beside them, damage, degrees, other joints on the same topic.
+
+Each kind comes from a public report. What was recorded is known, so is the verdict: the arm held in all of them.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.clock import timeline, without_outliers
+from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.report.trial_report import analyse
+from exo_gravity.lab.trial.recording import in_blocks
+
+from ...support import synthetic_bags as made
+
+SECOND = 10**9
+DAY = 86_400 * SECOND
+RATE = 50.0  # Hz
+STATES = "/right/joint_states"
+TRIAL = made.trial(made.POSES, hold=6.0, rate=RATE)
+CONTENT = [
+    *made.messages(TRIAL),
+    *(made.status(0.5 * n, "active", state="active") for n in range(32)),
+]
+CONTENT.sort(key=lambda entry: entry[2])
+
+
+def bag_in_order(folder, content, **form):
+    """Write a bag whose messages lie in the order given, whatever their times."""
+    writer = made.Writer(folder, version=9, storage_plugin=form.pop("plugin", StoragePlugin.MCAP))
+    if compression := form.pop("compression", None):
+        writer.set_compression(compression, made.CompressionFormat.ZSTD)
+    with writer:
+        connections = {}
+        for topic, kind, stamp, data in content:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=made.STORE)
+            writer.write(connections[topic], stamp, data)
+    return folder
+
+
+def with_clock(shift, at=5.0):
+    """The content with the clock, and with it arrivals and stamps, set by `shift` ns at `at` s."""
+    for topic, kind, stamp, data in CONTENT:
+        if stamp - made.START < at * SECOND:
+            yield topic, kind, stamp, data
+            continue
+        if kind == made.JOINT_STATE:
+            message = made.STORE.deserialize_cdr(data, kind)
+            then = message.header.stamp.sec * SECOND + message.header.stamp.nanosec + shift
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(then, SECOND)
+            data = bytes(made.STORE.serialize_cdr(message, kind))
+        yield topic, kind, stamp + shift, data
+
+
+def report_of(path):
+    report = analyse(read_bag(path))
+    return report, report.bag.recordings[0], report.arms[0][1]
+
+
+@pytest.mark.parametrize("shift", [-5 * SECOND, -3600 * SECOND, 2 * SECOND, 3600 * SECOND, 100 * DAY], ids=str)
+def test_an_arm_that_held_has_held_whatever_the_clock_did(tmp_path, shift):
+    report, arm, analysis = report_of(bag_in_order(tmp_path / "bag", with_clock(shift)))
+    assert not report.failures
+    np.testing.assert_array_equal(arm.position, TRIAL.position.astype(np.float32))
+    assert all(np.max(hold.stray) < np.radians(0.1) for hold in analysis.holds)
+    assert sum(hold.duration for hold in analysis.holds) > 8.0  # of 12, in three parts
+    steps = [note for note in report.notes if "clock" in note]
+    assert len(steps) == (shift != 2 * SECOND)
+    assert len(in_blocks(arm).still) < 10 * len(arm.time)
+    commanded = np.isfinite(arm.command[:, 0])
+    assert commanded.mean() > 0.95
+
+
+@pytest.mark.parametrize("time", [0, 2**63 - 1], ids=["zero", "beyond"])
+@pytest.mark.parametrize("share", [0.01, 1.0])
+def test_impossible_times_of_arrival_do_not_move_the_arm(tmp_path, time, share):
+    chosen = np.random.default_rng(7).random(len(CONTENT)) < share
+    content = [
+        (topic, kind, time if lost else stamp, data)
+        for (topic, kind, stamp, data), lost in zip(CONTENT, chosen, strict=True)
+    ]
+    folder = bag_in_order(tmp_path / "bag", content, plugin=StoragePlugin.SQLITE3)
+    report, arm, analysis = report_of(folder)
+    np.testing.assert_array_equal(arm.position, TRIAL.position.astype(np.float32))
+    assert not report.failures and len(analysis.holds) == 2
+    assert arm.time[-1] < TRIAL.time[-1] + 1.0
+
+
+def test_a_file_in_another_order_than_that_of_arrival_is_sorted(tmp_path):
+    parts = np.array_split(np.arange(len(CONTENT)), 8)
+    content = [CONTENT[k] for part in np.random.default_rng(1).permutation(8) for k in parts[part]]
+    by_topic = sorted(CONTENT, key=lambda entry: entry[0])
+    for number, order in enumerate((content, by_topic)):
+        report, arm, _ = report_of(bag_in_order(tmp_path / str(number), order))
+        made.assert_same(arm, TRIAL)
+        assert not report.failures and not [note for note in report.notes if "clock" in note]
+
+
+def test_the_timeline_keeps_the_order_of_the_file_and_the_length_of_each_part():
+    times = np.concatenate((np.arange(0, 50), np.arange(20, 80), [10**6], np.arange(81, 90))) * SECOND // 10
+    times += 1_700_000_000 * SECOND
+    line = timeline(3 * np.arange(len(times)), times)
+    found = line.times(3 * np.arange(len(times)), without_outliers(times))
+    assert np.all(np.diff(found) >= 0) and line.steps == (-29 * SECOND // 10,)
+    assert found[-1] == times[-1]  # the longest part keeps its times
+    assert line.times(np.array([0, 3 * len(times)]), np.array([0, 2**62])).tolist() == [found[0], line.end[-1] + DAY]
+
+
+# Files
+
+
+def test_of_two_files_that_hold_the_same_the_one_that_the_metadata_name_is_read(tmp_path):
+    bag = made.write_bag(tmp_path / "bag", CONTENT)
+    shutil.copy(bag / "bag.mcap", bag / "bag_recovered.mcap")
+    (bag / "._bag.mcap").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    report, arm, _ = report_of(bag)
+    made.assert_same(arm, TRIAL)
+    assert "bag_recovered.mcap" in report.notes[0] and "._bag" not in str(report.notes)
+    (bag / "metadata.yaml").unlink()
+    with pytest.raises(DataError, match=r"bag\.mcap and bag_recovered\.mcap hold the same time"):
+        read_bag(bag)
+    made.assert_same(made.only(bag / "bag_recovered.mcap"), TRIAL)
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_compressed_recording_is_read_without_its_metadata(tmp_path, mode, plugin):
+    bag = made.write_bag(tmp_path / "bag", CONTENT, plugin, mode)
+    metadata = (bag / "metadata.yaml").read_text()
+    for text in ("", "{", metadata.replace(".zstd", ""), metadata.replace("version: 9", "version: 99")):
+        (bag / "metadata.yaml").write_text(text)
+        made.assert_same(made.only(bag), TRIAL)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[: len(data) // 2], lambda data: data[:500] + bytes(64) + data[564:]]
+)
+def test_a_compressed_file_that_is_cut_or_damaged_is_refused_in_one_sentence(tmp_path, damage):
+    bag = made.write_bag(tmp_path / "bag", CONTENT, compression=CompressionMode.FILE)
+    (file,) = bag.glob("*.zstd")
+    file.write_bytes(damage(file.read_bytes()))
+    with pytest.raises(DataError, match=r"\.zstd: the compressed file is cut or damaged"):
+        read_bag(bag)
+
+
+def test_a_damaged_chunk_is_left_out_and_named(tmp_path):
+    bag = made.write_bag(tmp_path / "bag", CONTENT * 12, compression=CompressionMode.STORAGE)
+    file = bag / "bag.mcap"
+    data = bytearray(file.read_bytes())
+    data[len(data) // 3 : len(data) // 3 + 9] = bytes(9)
+    file.write_bytes(data)
+    report, arm, _ = report_of(bag)
+    assert "the recording is damaged: parts left out: 1" in report.notes
+    assert len(TRIAL.time) < len(arm.time) < 12 * len(TRIAL.time) and report.bag.is_partial
+
+
+def test_a_write_ahead_log_on_a_read_only_medium_is_read(tmp_path):
+    source = made.write_bag(tmp_path / "bag", CONTENT, StoragePlugin.SQLITE3) / "bag.db3"
+    medium = tmp_path / "medium"
+    medium.mkdir()
+    database = sqlite3.connect(source)
+    database.execute("PRAGMA journal_mode=WAL")
+    rows = database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+    database.execute("DELETE FROM messages")
+    database.commit()
+    database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    database.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    database.commit()
+    for suffix in ("", "-wal"):
+        shutil.copy(f"{source}{suffix}", medium / f"bag.db3{suffix}")
+    database.close()
+    program = (
+        "import sys; from exo_gravity.lab.bag.reader import read_bag; "
+        "print(len(read_bag(sys.argv[1]).recordings[0].time))"
+    )
+    user = None
+    if not os.geteuid():  # whom permissions do not bind
+        user = 65534
+        for folder in (tmp_path, *tmp_path.parents[:2]):
+            folder.chmod(0o755)
+    medium.chmod(0o555)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(medium / "bag.db3")], capture_output=True, text=True, user=user, check=False
+    )
+    medium.chmod(0o755)
+    assert (done.stdout.strip(), done.stderr) == (str(len(TRIAL.time)), "")
+
+
+# What is on the topics
+
+
+def test_degrees_are_refused_and_a_single_impossible_angle_is_left_out(tmp_path):
+    def states(scale):
+        for k, (time, pose) in enumerate(zip(TRIAL.time, TRIAL.position, strict=True)):
+            stamp = made.START + round(float(time) * SECOND)
+            yield STATES, made.JOINT_STATE, stamp, made.joint_state(stamp, made.NAMES, pose * scale(k))
+
+    with pytest.raises(DataError, match=r"right_joint_\d = .* rad: must be within ±2 pi; is it in degrees\?"):
+        read_bag(made.write_bag(tmp_path / "degrees", states(lambda k: 57.3)))
+    read = read_bag(made.write_bag(tmp_path / "once", states(lambda k: 99.0 if k == 300 else 1.0)))
+    assert len(read.recordings[0].time) == len(TRIAL.time) - 1
+    assert "right: joint states left out, a position is beyond ±2 pi: 1" in read.notes
+
+
+def test_a_gripper_on_the_same_topic_and_an_arm_that_nothing_commands_are_named_and_left_out(tmp_path):
+    gripper = [(STATES, made.JOINT_STATE, at + 1000, made.joint_state(at, ["gripper"], [0.1]))
+               for topic, _, at, _ in CONTENT[::7] if topic == STATES]  # fmt: skip
+    other = [("/left/joint_states", *entry[1:]) for entry in CONTENT if entry[0] == STATES]
+    report, arm, _ = report_of(made.write_bag(tmp_path / "bag", [*gripper, *CONTENT, *other]))
+    made.assert_same(arm, TRIAL)
+    assert len(report.arms) == 1 and not report.failures
+    assert any(f"other joints left out: {len(gripper)}" in note for note in report.notes)
+    assert any(note.startswith("/left/joint_states: not reported") for note in report.notes)
+
+
+@pytest.mark.parametrize("commanded", [4, 7])
+def test_of_a_driver_with_seven_joints_those_that_are_commanded_are_reported(tmp_path, commanded):
+    names = (*made.NAMES, "wrist_a", "wrist_b", "wrist_c")
+
+    def more(content):
+        for topic, kind, stamp, data in content:
+            if kind == made.JOINT_STATE and (topic == STATES or commanded > len(made.NAMES)):
+                message = made.STORE.deserialize_cdr(data, kind)
+                arrays = ((*array, 0.3, 0.2, 0.1) if len(array) else () for array in (
+                    message.position, message.velocity, message.effort))  # fmt: skip
+                at = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+                data = made.joint_state(at, names, *arrays)
+            yield topic, kind, stamp, data
+
+    report, arm, analysis = report_of(made.write_bag(tmp_path / "bag", more(CONTENT)))
+    assert arm.joint_names == names[:commanded] and len(analysis.holds) == 2 and not report.failures
+    assert arm.position.shape == arm.command.shape == (len(TRIAL.time), commanded)
+    assert np.isfinite(arm.command[2:]).all()
