@@ -16,6 +16,7 @@ from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
 
 NOTHING = (0.0,) * 4
+WHOLE = (1.0,) * 4
 HEARD = (False,) * 4
 FULL = LIMITS.driven_speed + BARRIER.span  # rad/s
 
@@ -30,7 +31,7 @@ def joints(**changes: float) -> list[JointSample]:
 
 def shaped(effort: tuple[float, ...] = NOTHING, **changes: float) -> Shaped:
     """Return what joints get after a second in which they read `changes`."""
-    return barrier().shape(1.0, joints(**changes), effort, 1.0, NOTHING, NOTHING)
+    return barrier().shape(1.0, joints(**changes), effort, WHOLE, NOTHING, NOTHING)
 
 
 def named(name: str) -> Case:
@@ -107,11 +108,11 @@ def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
 def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
     asked = (3.0, 9.0, 2.0, 3.0)
     arm = barrier()
-    sinking = arm.shape(0.2, joints(velocity=-0.3), asked, 1.0, asked, NOTHING)
+    sinking = arm.shape(0.2, joints(velocity=-0.3), asked, WHOLE, asked, NOTHING)
     assert sinking.damping == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
-    lifted = arm.shape(0.1, joints(velocity=0.3), asked, 1.0, asked, NOTHING)
+    lifted = arm.shape(0.1, joints(velocity=0.3), asked, WHOLE, asked, NOTHING)
     assert lifted.damping == pytest.approx((0.5 * DAMPING, 0.5 * DAMPING, 0.0, 0.5 * DAMPING))
-    hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, 1.0, (1.0,) * 4, NOTHING)
+    hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, WHOLE, (1.0,) * 4, NOTHING)
     assert min(hot.damping) == pytest.approx(DAMPING)
 
 
@@ -143,7 +144,7 @@ def test_the_soft_wall_never_throws_a_joint_back_faster_than_it_came(rate, inert
     position, velocity, torque = limit - 0.15, speed, 0.0
     for _ in range(int(4.0 * rate)):
         read = joints(position=position, velocity=round(velocity / 0.022) * 0.022)
-        limited = arm.shape(period, read, NOTHING, 1.0, (torque,) * 4, NOTHING)
+        limited = arm.shape(period, read, NOTHING, WHOLE, (torque,) * 4, NOTHING)
         torque, *_ = limited.effort
         damping, *_ = arm.damping(period, read, HEARD, limited.effort, limited.damping)
         end = torque / damping if damping else math.inf  # rad/s, where the damping balances the torque

@@ -142,18 +142,21 @@ class VirtualRig(Rig):
 class Raising:
     """Raises the arm of `rig` to `POSE`, and holds it there once `is_raised` is set.
 
-    failures: exceptions that `efforts` and `take` raise from now on.
+    is_carried: returns whether the arm is carried; before that it is asked for nothing. failures: exceptions that `efforts` and `take` raise from now on.
     """
 
     def __init__(self, rig: VirtualRig) -> None:
         self.is_raised = False
+        self.is_carried: Callable[[], bool] = lambda: True
         self.failures: dict[str, Exception] = {}
         self._rig = rig
 
     def efforts(self, _latest: float) -> Efforts:
         self._fail("efforts")
         rig, arm, effort = self._rig, self._rig.device.arm, self._rig.carrying
-        if not self.is_raised:
+        if not self.is_carried():
+            effort = (0.0,) * len(effort)
+        elif not self.is_raised:
             columns = zip(gravity_torque(rig.links, arm.positions), POSE, arm.positions, arm.velocities, strict=True)
             effort = tuple(torque + 4.0 * (to - angle) - 1.0 * speed for torque, to, angle, speed in columns)
         return Efforts(effort, rig.clock.monotonic(), False, False)
@@ -183,6 +186,7 @@ class CarriedArm:
         )
         self.clock, self.wire, self.bus, self.safety, self.loop = arm.clock, arm.wire, arm.bus, arm.safety, arm.loop
         self.run = arm.run
+        self.controller.is_carried = lambda: self.safety.state in (State.RAMPING_IN, State.ACTIVE)
         arm.enable()
         self.run_until(lambda: self.safety.fault or (self.rig.is_raised and self.safety.state is State.ACTIVE))
         assert self.safety.state is State.ACTIVE, self.safety.fault
