@@ -83,7 +83,7 @@ SIMULATOR = (
     Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trial", "", "script file of the virtual wearer, who starts at once if it is set live; empty ends it"),
-    Param("trial_delay", 6.0, "time from the motors being on to the wearer's first step", (0.0, 60.0), "s", fixed=True),
+    Param("trial_delay", 8.0, "time from the motors being on to the wearer's first step", (0.0, 60.0), "s", fixed=True),
     Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
     Param("fault.unplugged", [False] * 4, "motors without power"),
     Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),

@@ -37,7 +37,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
     arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt and resting(*tilt))
-    return OfflineTrial(arm, script, 6.0)
+    return OfflineTrial(arm, script, 8.0)
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ class SafetyMachine:
         self._sent = OFF  # last sent to the motors
         self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
         self._rise = GuidedMotion(JOINT_COUNT)  # of the torque, where it begins
-        self._stall = StallWatch(limits.joint_names)
+        self._stall = StallWatch(limits.joint_names, period)
         self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
         self._rest = RestTracker()
         self._readings = Readings(limits)

@@ -17,7 +17,7 @@ from exo_gravity.core.safety.drive import Fault, FaultCode
 class Stall:
     """What a fall in a pause of the loop looks like."""
 
-    gap: float = 0.025  #: s between two commands, the shortest time-out of known firmware; computers are late by 0.02 s
+    late: float = 0.03  #: s beyond the period of the loop; ordinary computers are late by 0.02 s
     least: float = 0.5  #: Nm that a motor must have applied: a joint that carries nothing falls nowhere
     #: rad/s that a joint gains against that torque: a fall of 20 ms under gravity alone, or a wearer's hard push
     gained: float = 0.3
@@ -27,10 +27,11 @@ STALL = Stall()
 
 
 class StallWatch:
-    """Follows the commands of an arm that is carried. names: of the joints (n,)."""
+    """Follows the commands of an arm that is carried. names: of the joints (n,). period: s, of the loop."""
 
-    def __init__(self, names: Sequence[str]) -> None:
+    def __init__(self, names: Sequence[str], period: float) -> None:
         self._names = names
+        self._longest = period + STALL.late
         self._last = math.inf  # s, of the last command
         self._effort: Sequence[float] = ()
         self._before: Sequence[JointSample] = ()  # the readings before a pause, until the ones after it are judged
@@ -47,7 +48,7 @@ class StallWatch:
         joints: (n,) the newest readings. effort: (n,) Nm, of the last command.
         """
         gap, self._last = now - self._last, now
-        if gap > STALL.gap:
+        if gap > self._longest:
             self._before, self._effort, self._resumed, self._gap = joints, effort, now, gap
             return True, None
         if not self._before or not all(joint.time >= self._resumed for joint in joints):
