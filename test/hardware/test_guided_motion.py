@@ -66,7 +66,7 @@ def test_an_empty_cuff_that_is_carried_again_rises_slowly():
 @pytest.mark.parametrize("roll", [-30.0, 30.0])
 def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
     read = [UPRIGHT]
-    arm = CompensatedArm(pose=HANGING, limit=PEAK, imu=lambda now, state: read[0], mode="zero_g")
+    arm = CompensatedArm(pose=HANGING, limit=PEAK, has_wearer=False, imu=lambda now, state: read[0], mode="one_g")
     put_down(arm)
     for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
         read[0] = TrunkReading(gravity_in_trunk(0.0, angle).tolist())

@@ -40,6 +40,7 @@ class Guidance:
     brake: float = 1.5  #: Nm at most, by which the motors damp beyond `calm`: a wearer feels 0.5 kg in the hand
     watch: float = 1.0  #: s after its end in which a joint that begins to move is still guided
     small: float = 0.05  #: Nm; a smaller difference needs no guiding
+    light: float = 0.5  #: Nm; a smaller one goes back no faster than this one, or a hanging arm that swings had no end
 
 
 GUIDANCE = Guidance()
@@ -96,7 +97,7 @@ def pace(velocity: float | None, change: float) -> float:
         return 1.0 / g.longest
     along = velocity if change > 0.0 else -velocity
     if along > g.calm:
-        return -g.gain * (along - g.calm) / size
+        return -g.gain * (along - g.calm) / max(g.light, size)
     calm = min(1.0 / g.time, max(g.rate / size, 1.0 / g.longest))
     return calm * (1.0 - max(0.0, along) / g.calm) + g.release * max(0.0, -along - g.thrown) / size
 
