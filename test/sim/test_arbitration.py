@@ -104,8 +104,7 @@ def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
     for data in (lambda can_id: command(can_id - 1), lambda can_id: ENTER, lambda can_id: command(can_id - 1, 1.0)):
         for can_id in IDS:
             host.send(frame(can_id, data(can_id)))
-            while is_awaiting and not host.recv(0.002):
-                pass
+            assert not is_awaiting or host.recv(0.01)
     wire.clock.sleep(0.01)
     while host.recv(0.0):
         pass
