@@ -118,7 +118,7 @@ def one_of(**choices: tuple[Any, ...]) -> Callable[[random.Random], Values]:
 
 
 def reach(random: random.Random) -> Values:
-    return {"pose": pose(random, HORIZONTAL), "duration": round(random.uniform(1.0, 2.0), 2)}
+    return {"pose": list(pose(random, HORIZONTAL)), "duration": round(random.uniform(1.0, 2.0), 2)}
 
 
 def pose(random: random.Random, farthest: tuple[float, ...]) -> tuple[float, ...]:

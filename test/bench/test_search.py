@@ -1,0 +1,49 @@
+"""The search: a seed replays its case, the truth judges it, and a run goes on where the last one ended."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from bench.search.__main__ import kept
+from bench.search.case import KINDS, Bound, Case, Event, bound_of, draw
+from bench.search.events import ACTS
+from bench.search.play import play_case
+from exo_gravity.core.safety.drive import State
+
+POSE = (0.0, 0.5, 0.1, 0.3)
+
+
+def case_of(*events: Event, begin: str = "carried") -> Case:
+    return Case(0, 100.0, False, 0.0, 0.2, POSE, begin, events)
+
+
+def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happen():
+    cases = [draw(seed) for seed in range(500)]
+    assert cases[:20] == [draw(seed) for seed in range(20)]
+    assert {event.name for case in cases for event in case.events} == set(KINDS) == set(ACTS)
+    assert json.loads(json.dumps(cases[0].events)) == [list(event) for event in cases[0].events]
+
+
+def test_an_unseen_cause_has_a_bound_of_its_own():
+    reversed_, dropped = Event(0.0, "torque_reversed", {}), Event(1.0, "payload_dropped", {})
+    assert bound_of(case_of(Event(0.0, "disable", {})), clamped=False) == Bound(0.6, 0.3)
+    assert bound_of(case_of(reversed_), clamped=False) == Bound(3.2, 0.1)
+    assert bound_of(case_of(dropped), clamped=True).speed == 2.9
+
+
+def test_an_arm_that_is_disabled_comes_down_within_its_bound():
+    played, records = play_case(case_of(Event(0.1, "disable", {})))
+    states = [state for _, state, _ in played.states]
+    assert states[-3:] == [State.ACTIVE, State.LETTING_DOWN, State.DISABLED]
+    assert not played.error and played.share < 1.0
+    assert records["position"][:, 1].max() == pytest.approx(POSE[1], abs=0.05)
+    assert not records["on"][-1].any()
+
+
+def test_a_run_goes_on_with_the_cases_that_are_not_kept_also_after_a_line_was_cut_off(tmp_path):
+    path = tmp_path / "search.jsonl"
+    assert kept(path) == {}
+    path.write_text('{"seed": 3, "share": 0.5}\n{"seed": 4, "sh')
+    assert kept(path) == {3: {"seed": 3, "share": 0.5}}
