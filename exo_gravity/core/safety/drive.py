@@ -108,7 +108,7 @@ class FaultCode(str, Enum):
     # The bus and the computer
     FOREIGN_COMMAND = "foreign_command", "another sender commands a motor of this arm", RECHECK
     BUS_ERROR = "bus_error", "the CAN bus cannot be opened, or sending or receiving failed", RESUME
-    REPLIES_LATE = "replies_late", "a motor answers commands older than 0.06 s: a queue between it and the bridge grows"
+    REPLIES_LATE = "replies_late", "a motor answers commands older than 0.04 s: a queue between it and the bridge grows"
     WATCHDOG_DEAD = "watchdog_dead", "the watchdog process has died"
     INTERNAL_ERROR = "internal_error", "an unexpected exception in the control loop, or a node that stood still"
 
