@@ -30,6 +30,7 @@ from exo_gravity.core.params import Param
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.operation import BridgeServices
+from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, age_of_request, prepare_transitions
 from exo_gravity.nodes.ros.parameters import accept_changes
 from exo_gravity.nodes.ros.subscriptions import PolledSubscription
@@ -225,8 +226,6 @@ def test_messages_pass_through_the_executor_where_rclpy_has_no_wait_set_for_one_
 
 
 def test_an_executor_that_stood_still_knows_it_without_stamps_of_the_middleware(served, monkeypatch):
-    from exo_gravity.nodes.ros import inner
-
     monkeypatch.setattr(inner, "STOOD_STILL", 0.2)
     served.executor.spin_once(0.0)
     time.sleep(0.3)

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 class ReplyAge:
     """When replies are too old."""
 
-    longest: float = 0.04  #: s; an ordinary computer or adapter is late by 0.02 s, efforts are stale at 0.05 s
+    longest: float = 0.04  #: s; a computer is late by 0.02 s; a pause as long must not silence a motor (0.05 s)
     fewest: int = 3  #: commands under way: at a low rate one or two may be longer than `longest`
     quiet: float = 0.02  #: s without a reply that show that none is under way; an adapter's longest timer is 0.016 s
     looks: int = 3  #: cycles of it at least
