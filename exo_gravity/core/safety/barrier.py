@@ -11,7 +11,8 @@ feed-forward of a joint, v > 0 its speed along tau, V = `driven_speed` and F = V
 From F on kd v >= |tau|: the motor as a whole takes energy out of the joint, however wrong tau is. So no feed-forward
 drives a joint beyond F, but for what happens within a cycle. The motor itself applies kd v, without delay and to its
 true speed: one wrong speed in a reply moves nothing. A light arm passes F within a cycle, so v leads the newest speed
-by its change over BARRIER.lead. A wearer who lifts their arm feels nothing up to V; at F they lift it without support.
+by its change over BARRIER.lead. An empty forearm under 3 Nm still reaches 2.7 rad/s at 250 Hz, and 6.4 at 100 Hz. A
+wearer who lifts their arm feels nothing up to V; at F they lift it without support.
 
 Damping is bounded, too: kd times the newest speed stays within `max_effort`, so that neither a wearer's jerk nor a fall
 makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule with others.
