@@ -35,6 +35,7 @@ PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
 LIFT = 1.5  # s in which the wearer raises the arm to the pose of a case
 LONGEST = 3.0  # s that are judged
 WINDOW = 0.01  # s, over which a rate of torque is taken
+MOVING = 0.2  # rad/s
 DRIVES = 0.5  # Nm; gravity and the other joints move an arm that gets less
 TAP = 1.0 / 6.0  # s, half a tap
 
@@ -155,26 +156,25 @@ class Motion:
 
 @dataclass(frozen=True)
 class Felt:
-    """What a wearer feels of a rule while they move: Nm at most and on average, J in all, beyond no rule."""
+    """What a wearer who moves one joint feels of a rule."""
 
-    peak: float
-    mean: float
-    work: float
+    largest: float  #: Nm, the largest torque of theirs
+    brake: float  #: Nm, mean brake of that joint while it moves
+    work: float  #: J, what they do more than without a rule
 
 
 def felt(motion: Motion, free: Motion) -> Felt:
     """Return what the rule of `motion` costs the wearer, against `free`, the same without a rule."""
-    joint = int(np.argmax(np.ptp(np.array(free.position), axis=0)))  # that which they move
-    grid = np.arange(free.time[0], free.time[-1], 0.002)
+    joint = int(np.argmax(np.ptp(np.array(free.position), axis=0)))
 
-    def on_grid(run: Motion, rows: Sequence[Sequence[float]]) -> np.ndarray:
-        return np.interp(grid, run.time, np.array(rows)[:, joint])
+    def work(run: Motion) -> float:
+        power = np.array(run.wearer)[:, joint] * np.array(run.velocity)[:, joint]
+        return float((power[:-1] * np.diff(run.time)).sum())
 
-    torque, before = on_grid(motion, motion.wearer), on_grid(free, free.wearer)
-    moving = np.abs(on_grid(free, free.velocity)) > 0.2
-    power = torque * on_grid(motion, motion.velocity) - before * on_grid(free, free.velocity)
-    beyond = np.abs(torque - before)[moving]
-    return Felt(float(beyond.max()), float(beyond.mean()), float(power.sum() * 0.002))
+    brake = np.abs(np.array(motion.forward) - np.array(motion.torque))[:, joint]
+    moving = np.abs(np.array(motion.velocity)[:, joint]) > MOVING
+    largest = float(np.abs(np.array(motion.wearer)[:, joint]).max())
+    return Felt(largest, float(brake[moving].mean()), work(motion) - work(free))
 
 
 def play(case: Case, make: Callable[[Limits, Sequence[float]], Barrier] | None, rate: float = 250.0) -> Motion:

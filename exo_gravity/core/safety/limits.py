@@ -40,8 +40,7 @@ class SoftWall:
     width: float = 0.1  #: rad before a joint limit, as in crisp_controllers
     stiffness: float = 25.0  #: Nm/rad
     most: float = 5.0  #: Nm, of the spring
-    damping: float = DAMPING  #: Nm s/rad, from `edge` on
-    edge: float = 0.02  #: rad into the wall over which the damping rises
+    edge: float = 0.02  #: rad into the wall over which its damping rises to DAMPING
     release: float = 0.03  #: rad/s out of the wall, from which on the spring no longer pushes
 
 
