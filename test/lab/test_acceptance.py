@@ -12,7 +12,7 @@ from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.acceptance import STEPS, Bench, Lift, Step, Weight, accept, record
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_arm import VirtualArm
 
@@ -54,9 +54,11 @@ def loaded_links():
 def acceptance(true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor, ...] = MOTORS, **spoil) -> list[Step]:
     """Run the acceptance of a device with the motors `true`, which the file takes for `assumed`.
 
-    spoil: attributes of the person, or `temperature` of the first motor.
+    spoil: attributes of the person, `temperature` of the first motor, or `timeout` of the firmware.
     """
-    device = SimulatedDevice(SimulatedArm(ArmConfig(links=loaded_links())), [SimulatedMotor(one) for one in true])
+    firmware = Firmware(timeout=spoil.pop("timeout", 0.0))
+    boards = [SimulatedMotor(one, firmware) for one in true]
+    device = SimulatedDevice(SimulatedArm(ArmConfig(links=loaded_links())), boards)
     person, lift = Person(), Lift(LIMITS, 1.0 / RATE)
     device.motors[0].temperature = spoil.pop("temperature", 25.0)
     for motor in device.motors[1:]:
@@ -104,10 +106,13 @@ def test_a_torque_range_that_is_not_the_firmwares_fails_at_the_known_weight():
     assert "ratio" in results[-1].sentence
 
 
-def test_a_time_out_that_the_file_does_not_know_of_fails():
-    assumed = (*MOTORS[:3], replace(MOTORS[3], timeout=0.2))
-    results = acceptance(assumed=assumed)  # this simulated motor never lets go
-    assert failed(results) == "time_out" and "the motor held; it must let go" in results[-1].sentence
+@pytest.mark.parametrize(
+    ("true", "assumed", "sentence"),
+    [(0.0, 0.2, "the motor held; it must let go"), (0.2, 0.0, "the motor let go; it must hold")],
+)
+def test_a_time_out_that_is_not_that_of_the_file_fails(true, assumed, sentence):
+    results = acceptance(assumed=(*MOTORS[:3], replace(MOTORS[3], timeout=assumed)), timeout=true)
+    assert failed(results) == "time_out" and sentence in results[-1].sentence
 
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
