@@ -5,11 +5,8 @@ Each kind comes from a public report. What was recorded is known, so is the verd
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -158,7 +155,8 @@ def test_a_damaged_chunk_is_left_out_and_named(tmp_path):
     bag = made.write_bag(tmp_path / "bag", CONTENT * 12, compression=CompressionMode.STORAGE)
     file = bag / "bag.mcap"
     data = bytearray(file.read_bytes())
-    data[len(data) // 3 : len(data) // 3 + 9] = bytes(9)
+    chunk = data.index(b"\x28\xb5\x2f\xfd", data.index(b"\x28\xb5\x2f\xfd") + 4)  # the second one
+    data[chunk + 4 : chunk + 40] = bytes(36)
     file.write_bytes(data)
     report, arm, _ = report_of(bag)
     assert "the recording is damaged: parts left out: 1" in report.notes
@@ -180,21 +178,9 @@ def test_a_write_ahead_log_on_a_read_only_medium_is_read(tmp_path):
     for suffix in ("", "-wal"):
         shutil.copy(f"{source}{suffix}", medium / f"bag.db3{suffix}")
     database.close()
-    program = (
-        "import sys; from exo_gravity.lab.bag.reader import read_bag; "
-        "print(len(read_bag(sys.argv[1]).recordings[0].time))"
-    )
-    user = None
-    if not os.geteuid():  # whom permissions do not bind
-        user = 65534
-        for folder in (tmp_path, *tmp_path.parents[:2]):
-            folder.chmod(0o755)
-    medium.chmod(0o555)
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(medium / "bag.db3")], capture_output=True, text=True, user=user, check=False
-    )
-    medium.chmod(0o755)
-    assert (done.stdout.strip(), done.stderr) == (str(len(TRIAL.time)), "")
+    (medium / "bag.db3-shm").mkdir()  # sqlite cannot write its index of the log, whoever runs this
+    read = read_bag(medium / "bag.db3")
+    made.assert_same(read.recordings[0], TRIAL)
 
 
 # What is on the topics
