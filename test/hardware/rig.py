@@ -142,7 +142,8 @@ class VirtualRig(Rig):
 class Raising:
     """Raises the arm of `rig` to `POSE`, and holds it there once `is_raised` is set.
 
-    is_carried: returns whether the arm is carried; before that it is asked for nothing. failures: exceptions that `efforts` and `take` raise from now on.
+    is_carried: returns whether the arm is carried; before that it is asked for nothing.
+    failures: exceptions that `efforts` and `take` raise from now on.
     """
 
     def __init__(self, rig: VirtualRig) -> None:

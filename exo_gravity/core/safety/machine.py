@@ -26,7 +26,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.barrier import BARRIER, Barrier
+from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
 from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
@@ -218,7 +218,7 @@ class SafetyMachine:
 
     def _watch_stalls(self) -> None:
         """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
-        self._guard = max(0.0, self._guard - BARRIER.rate * self._dt)
+        self._guard = max(0.0, self._guard - DAMPING / DESCENT.damping_rise * self._dt)
         if self.state not in CARRIED:
             self._stall.reset()
             return

@@ -53,7 +53,7 @@ class Layout(NamedTuple):
 class Decoded(NamedTuple):
     """Messages of one layout."""
 
-    index: np.ndarray  #: (n,) in the batch
+    rows: np.ndarray  #: (n,) in the batch
     layout: Layout
     values: np.ndarray  #: (n,) of the type `layout.numbers`
 
@@ -97,7 +97,8 @@ class _Walk:
         self.numbers[path] = (form, shape), self.take(form.itemsize * int(np.prod(shape, dtype=int)))
 
     def message_of(self, msgtype: str, prefix: str = "") -> None:
-        for name, (node, of) in TYPES.fielddefs[msgtype][1]:
+        fields: Any = TYPES.fielddefs[msgtype][1]
+        for name, (node, of) in fields:
             path = prefix + name
             if node == Nodetype.NAME:
                 self.message_of(of, f"{path}.")
@@ -161,8 +162,8 @@ class Decoder:
                 yield Decoded(chosen[same], layout, np.ascontiguousarray(rows[same]).view(layout.numbers)[:, 0])
                 chosen, rows = chosen[~same], rows[~same]
             for index, row in zip(chosen, rows, strict=True):  # layouts that change with every message
-                if layout := self._layout(row):
-                    yield Decoded(np.array([index]), layout, row.view(layout.numbers))
+                if own := self._layout(row):
+                    yield Decoded(np.array([index]), own, row.view(own.numbers))
 
     def _matching(self, rows: np.ndarray, length: int) -> np.ndarray | None:
         """Return which rows have the known layout or, if none has, that of the first row; None if that is damaged."""
