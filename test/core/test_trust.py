@@ -172,3 +172,28 @@ def test_a_restart_of_the_motors_after_an_emergency_stop_asks_the_operator_again
     assert arm.machine.state is State.CHECKING
     assert "the operator to confirm the pose" in arm.machine.waiting_for
     assert "d 23" in arm.machine.pose.text
+
+
+def test_a_hanging_arm_for_which_much_torque_is_asked_is_refused_at_an_untrusted_start_only():
+    arm = SafetyRun()
+    arm.while_hanging = (0.0, 3.8, 0.0, 0.0)  # of the robot alone, by an IMU that is mounted 90 degrees otherwise
+    arm.enable().cycle(3.0)
+    assert (arm.machine.state, arm.fault_code) == (State.FAULT, "torque_while_hanging")
+    arm.while_hanging = (0.0, 1.0, 0.0, 0.0)
+    arm.machine.clear(arm.now)
+    arm.until_active()
+
+
+@pytest.mark.parametrize(("moved", "waited"), [(0.1, 0.0), (0.0, 11.0)], ids=["the arm moves", "time passes"])
+def test_a_confirmation_lapses_and_is_asked_for_again(moved, waited):
+    arm = SafetyRun(start_pose="confirm")
+    assert arm.machine.confirm_pose(arm.now).startswith("nothing to confirm: the arm is disabled")
+    arm.enable().cycle(0.5)
+    assert arm.machine.pose.asked
+    assert arm.machine.confirm_pose(arm.now) == "" and not arm.machine.pose.asked
+    arm.machine.hindrance = "the watchdog to start" if waited else ""
+    arm.changes[3] = {"position": moved, "velocity": 0.0}
+    arm.cycle(max(0.02, waited))
+    arm.machine.hindrance = ""
+    arm.cycle(2.0)
+    assert arm.machine.state is State.CHECKING and arm.machine.pose.asked
