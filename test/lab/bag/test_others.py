@@ -140,9 +140,7 @@ def test_a_compressed_recording_is_read_without_its_metadata(tmp_path, mode, plu
         made.assert_same(made.only(bag), TRIAL)
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda data: data[: len(data) // 2], lambda data: data[:500] + bytes(64) + data[564:]]
-)
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda data: bytes(4) + data[4:]])
 def test_a_compressed_file_that_is_cut_or_damaged_is_refused_in_one_sentence(tmp_path, damage):
     bag = made.write_bag(tmp_path / "bag", CONTENT, compression=CompressionMode.FILE)
     (file,) = bag.glob("*.zstd")
