@@ -40,12 +40,16 @@ def named(name: str) -> Case:
 
 @pytest.mark.parametrize(
     ("name", "most"),
-    [("out of the cuff, rated", 2.9), ("out of the cuff, peak", 2.9), ("clamped, arm abducted", 1.9), ("IMU", 2.9)],
+    [("out of the cuff, rated", 2.9), ("out of the cuff, peak", 2.9), ("clamped, arm abducted", 1.9)],
 )
 def test_whatever_drives_an_arm_by_mistake_does_not_throw_it(name, most):
     motion = play(named(name), None)
     assert motion.time and motion.fault == ""
     assert motion.driven < most
+
+
+def test_an_arm_whose_imu_is_wrong_by_30_degrees_is_not_carried():
+    assert "torque_while_hanging" in play(named("IMU"), None).fault
 
 
 def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_nothing():

@@ -147,7 +147,7 @@ def drop(mass: float, pose: tuple[float, ...]) -> tuple[OfflineTrial, Compensato
     setup = ArmSetup(
         "right", device, motors, Limits(JOINTS, max_effort=MOST, sign_check_torque=0.0), settings, 250.0, None
     )
-    trial = OfflineTrial(setup, script, 2.0, compensator)
+    trial = OfflineTrial(setup, script, 4.0, compensator)
     recording = trial.run()
     start = recording.steps[2].start
     keep = (recording.time > start - 0.01) & (recording.time < start + 3.0)
@@ -160,11 +160,11 @@ def test_a_load_of_2_kg_that_is_dropped_moves_the_arm_little_and_its_torque_goes
     assert trial.trouble == "" and compensator.dropped == 2.0
     assert compensator.settings.arm.payload[0] == 0.0
     assert np.abs(rows[:, 5:]).max() < 4.0
-    assert np.abs(rows[-1, 1:5] - rows[0, 1:5]).max() < 1.2
+    assert np.abs(rows[-1, 1:5] - rows[0, 1:5]).max() < 0.8
     assert np.abs(rows[-1, 5:]).max() < GUIDANCE.calm
     monkeypatch.setattr(DropWatch, "step", lambda *_: False)
-    unwatched, _, _ = drop(2.0, (0.0, 0.4, 0.2, 0.5))
-    assert "over_speed" in unwatched.trouble
+    _, _, unwatched = drop(2.0, (0.0, 0.4, 0.2, 0.5))
+    assert np.abs(unwatched[:, 1:5] - unwatched[0, 1:5]).max() > np.abs(rows[:, 1:5] - rows[0, 1:5]).max() + 0.3
 
 
 def test_the_lifting_of_a_load_is_no_drop():

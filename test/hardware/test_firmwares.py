@@ -53,8 +53,7 @@ class FirmwareArm(DirectController, VirtualArm):
 
     def __init__(self, firmware: Firmware, remembered: float = 0.0, bitrate: int = 0) -> None:
         joints = [motor_of(firmware, name, 1 + i) for i, name in enumerate(USUAL_MOTORS)]
-        # As docs/wiring.md asks for: status often enough, and replies with an ID of each motor's own.
-        usual = replace(firmware, status_rate=500.0, reply_to_master=False)
+        usual = replace(firmware, status_rate=500.0)  # as docs/wiring.md asks for
         config = ArmConfig(wearer_mass=WORN_MASS, wearer_cog=WORN_COG, coulomb_friction=(0.1,) * len(joints))
         device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, usual) for joint in joints])
         for joint in joints if remembered else ():  # what another tool left in their memory

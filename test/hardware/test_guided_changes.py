@@ -17,7 +17,7 @@ from exo_gravity.sim.virtual_time import TICK
 
 from .compensated_arm import PEAK, CompensatedArm
 
-SAFE_SPEED = 0.6  # rad/s
+SAFE_SPEED = 0.65  # rad/s, at which an arm without friction sinks under the damping of the motors
 CODE = 0.009  # Nm, of a torque of the AK80-9 on the wire
 RAISED, UPRIGHT = (0.0, 1.2, 0.3, 0.3), (0.0, 2.4, 0.3, 0.3)
 ONE_G, NO_WEARER = {"mode": "one_g"}, {"mode": "one_g", "has_wearer": False}
@@ -117,7 +117,7 @@ def test_a_wearer_who_moves_on_is_not_stopped():
         arm.change(**ONE_G)
         arm.run(3.5)
         assert arm.safety.state is State.ACTIVE
-        assert arm.top_speed < 1.3 * speed + 0.05
+        assert arm.top_speed < 1.3 * speed + 0.1
         felt[is_damped] = np.array(hand.torques)
     length = min(map(len, felt.values()))
     assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDANCE.brake + 1.0  # Nm that damping costs

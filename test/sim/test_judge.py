@@ -165,7 +165,7 @@ def test_damping_that_drives_a_joint_is_seen(records):
     done = driven(records)
     assert (done.speed, done.joint) == (pytest.approx(0.3), 2)
     assert done.energy == pytest.approx(0.5 * 1.5 * 0.3, abs=0.01)
-    assert done.damping == pytest.approx(0.5)  # 1.5 Nm of 3
+    assert done.damping == pytest.approx(1.5 / 9.0)  # Nm, of what an AK80-9 is rated for
 
 
 def test_a_motor_does_not_drive_what_the_wearer_moves(lifted):

@@ -150,9 +150,9 @@ def test_frames_of_a_wrong_length_are_ignored(data):
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
 
 
-def test_any_8_bytes_are_a_command():
+def test_any_8_bytes_below_the_special_frames_are_a_command():
     motor = entered()
-    assert motor.receive(b"\xff" * 8, 0.0, 0.0, 0.0) is not None
+    assert motor.receive(b"\xff" * 7 + b"\xed", 0.0, 0.0, 0.0) is not None  # above it they are special
     assert motor.torque(0.0, 0.0) == SPEC.peak_torque
 
 

@@ -100,11 +100,15 @@ def missing_for_a_start(
 
 
 def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | None:
-    """Return the fault that `effort` (n,) in Nm, asked for on an arm that hangs, shows, or None."""
-    for name, torque in zip(limits.joint_names, effort, strict=True):
-        if not abs(torque) <= HANGING_ARM.torque:
+    """Return the fault that `effort` (n,) in Nm, asked for on an arm that hangs, shows, or None.
+
+    What assistance and terms may add, `largest_addition`, they may add here too.
+    """
+    for name, torque, addition in zip(limits.joint_names, effort, limits.largest_addition, strict=True):
+        most = HANGING_ARM.torque + addition
+        if not abs(torque) <= most:
             reason = (
-                f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {HANGING_ARM.torque:g}: let "
+                f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
                 "the whole arm hang, or correct rotation_trunk_from_imu, can_id, joint_names, side or the masses"
             )
             return Fault(FaultCode.TORQUE_WHILE_HANGING, reason)
