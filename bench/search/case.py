@@ -80,6 +80,7 @@ def lasting(shortest: float, longest: float) -> Callable[[random.Random], Values
 
 
 def span(random: random.Random, shortest: float, longest: float) -> float:
+    """Draw a number between two, short ones as often as long ones."""
     return round(math.exp(random.uniform(math.log(shortest), math.log(longest))), 3)
 
 
@@ -94,12 +95,14 @@ def some_motors(shortest: float, longest: float) -> Callable[[random.Random], Va
 
 
 def slip(random: random.Random) -> Values:
+    """Draw a joint and an error of its encoder in rad: a turn of the rotor, or 0.3 rad."""
     joint = random.choice(JOINTS)
     turn = 2.0 * math.pi / MOTORS[USUAL_MOTORS[joint]].gear_ratio
     return {"joint": joint, "error": random.choice((-1.0, 1.0)) * random.choice((round(turn, 3), 0.3))}
 
 
 def wrong_speed(random: random.Random) -> Values:
+    """Draw a joint, the factor of its reported speed, and a duration in s."""
     factor = random.choice((-1.0, 0.0, 0.3, 3.0))
     return {"joint": random.choice(JOINTS), "factor": factor, "duration": span(random, 0.1, 5.0)}
 
@@ -118,15 +121,18 @@ def one_of(**choices: tuple[Any, ...]) -> Callable[[random.Random], Values]:
 
 
 def reach(random: random.Random) -> Values:
+    """Draw a pose (4,) rad and the time to reach it in s."""
     return {"pose": list(pose(random, HORIZONTAL)), "duration": round(random.uniform(1.0, 2.0), 2)}
 
 
 def pose(random: random.Random, farthest: tuple[float, ...]) -> tuple[float, ...]:
+    """Draw a pose (4,) rad that is no farther than `farthest`."""
     least = -farthest[0], 0.2, -0.5 * farthest[2], 0.1
     return tuple(round(random.uniform(*ends), 2) for ends in zip(least, farthest, strict=True))
 
 
 def push(random: random.Random) -> Values:
+    """Draw torques (4,) N m and a duration in s."""
     most = (2.0, 4.0, 1.5, 0.5)
     torque = [round(random.uniform(-limit, limit), 2) for limit in most]
     return {"torque": torque, "duration": round(random.uniform(0.2, 0.6), 2)}
@@ -207,6 +213,7 @@ def pair(random: random.Random) -> tuple[str, str]:
 
 
 def event(random: random.Random, name: str, time: float) -> Event:
+    """Draw the values of an event; what is wired wrong happens at 0 s."""
     return Event(0.0 if name in AT_POWER_UP else round(time, 3), name, KINDS[name].draw(random))
 
 

@@ -38,24 +38,29 @@ def gradually(stage: Stage, duration: float, step: Callable[[float], None]) -> N
 
 
 def toggle(stage: Stage, duration: float) -> None:
+    """Disable the arm, and enable it `duration` s later."""
     stage.between_cycles(stage.safety.disable)
     stage.clock.later(duration, lambda: stage.between_cycles(stage.safety.enable))
 
 
 def rearm(stage: Stage, duration: float) -> None:
+    """Clear the fault, and enable the arm `duration` s later."""
     stage.between_cycles(stage.safety.clear)
     stage.clock.later(duration, lambda: stage.between_cycles(stage.safety.enable))
 
 
 def mode(stage: Stage) -> None:
+    """Change from zero-G to one-G, or back."""
     stage.change(mode="one_g" if stage.settings.mode == "zero_g" else "zero_g")
 
 
 def max_effort(stage: Stage, share: float) -> None:
+    """Lower every effort limit to a share of what it is."""
     stage.change(max_effort=tuple(share * most for most in stage.settings.max_effort))
 
 
 def body_mass(stage: Stage, mass: float) -> None:
+    """Set the mass of the wearer's body, in kg, as the operator would."""
     load = Wearer(mass).on_links(stage.settings.loaded.length)
     stage.change(wearer_mass=load.mass.tolist(), wearer_cog=load.cog.tolist())
 
@@ -78,6 +83,8 @@ def supply_cut(stage: Stage, motors: list[int], duration: float) -> None:
 
 
 def lost(which: str) -> Act:
+    """Return the act that loses commands or replies of some motors for a time."""
+
     def inject(stage: Stage, motors: list[int], duration: float) -> None:
         joints: set[int] = getattr(stage.wire, which)
         during(stage, duration, lambda: joints.update(motors), lambda: joints.difference_update(motors))
@@ -86,6 +93,7 @@ def lost(which: str) -> Act:
 
 
 def encoder_slip(stage: Stage, joint: int, error: float) -> None:
+    """Add `error` rad to what the encoder of a joint reads."""
     stage.arm.catch_up()
     errors = list(stage.device.encoder_error)
     errors[joint] += error
@@ -93,70 +101,85 @@ def encoder_slip(stage: Stage, joint: int, error: float) -> None:
 
 
 def wrong_speed(stage: Stage, joint: int, factor: float, duration: float) -> None:
+    """Multiply the speed that a motor reports for `duration` s."""
     setting(stage, stage.motors[joint], "speed_factor", factor, 1.0, duration)
 
 
 def torque_reversed(stage: Stage, joint: int) -> None:
+    """Let a motor turn against its commands."""
     stage.motors[joint].reversed = True
 
 
 def motor_error(stage: Stage, joint: int, code: int) -> None:
+    """Let a motor report an error code from now on."""
     stage.motors[joint].error = code
 
 
 def motor_warms(stage: Stage, joint: int, most: float) -> None:
+    """Warm a motor from 60 to `most` degC."""
     motor = stage.motors[joint]
     gradually(stage, WARMING, lambda share: setattr(motor, "temperature", 60.0 + share * (most - 60.0)))
 
 
 def stall(stage: Stage, duration: float) -> None:
+    """Stop the control loop for `duration` s."""
     stage.controller.stall = duration
 
 
 def efforts(fault: str) -> Act:
+    """Return the act that spoils the compensator's efforts for a time."""
     return lambda stage, duration: setting(stage, stage.controller, "fault", fault, "", duration)
 
 
 def efforts_late(stage: Stage, duration: float) -> None:
+    """Delay the compensator's efforts for `duration` s."""
     stage.controller.delay = min(0.3, duration)
     setting(stage, stage.controller, "fault", "late", "", duration)
 
 
 def reach(stage: Stage, pose: list[float], duration: float) -> None:
+    """Let the wearer move their arm to a pose (4,) rad within `duration` s."""
     stage.act({"move": list(pose), "over": duration})
 
 
 def resist(stage: Stage, duration: float) -> None:
+    """Let the wearer hold their arm where it is for `duration` s."""
     stage.arm.catch_up()
     stage.act({"move": stage.device.arm.positions, "over": duration})
 
 
 def spasm(stage: Stage, size: float) -> None:
+    """Shake the arm: eight pushes of 0.15 s, to and fro."""
     torque = [0.0, 2.5 * size, 1.2 * size, 0.6 * size]
     stage.act(*({"push": [sign * each for each in torque], "over": 0.15} for sign in (1.0, -1.0) * 4))
 
 
 def push(stage: Stage, torque: list[float], duration: float) -> None:
+    """Push the joints with torques (4,) N m for `duration` s."""
     stage.act({"push": list(torque), "over": duration})
 
 
 def payload_taken(stage: Stage, mass: float, told: float) -> None:
+    """Let the wearer pick up `mass` kg; the operator sets `told` times as much."""
     stage.arm.catch_up()
     stage.device.arm.carry(mass)
     stage.change(payload_mass=told * mass)
 
 
 def payload_dropped(stage: Stage) -> None:
+    """Let the wearer drop what they carry."""
     stage.arm.catch_up()
     stage.device.arm.carry(0.0)
 
 
 def payload_flicked(stage: Stage) -> None:
+    """Let the wearer throw upwards what they carry."""
     stage.act({"push": [0.0, 3.0, 1.0, 1.0], "over": 0.2})
     stage.clock.later(0.15, lambda: payload_dropped(stage))
 
 
 def out_of_cuff(stage: Stage) -> None:
+    """Let the wearer pull their arm out of the exoskeleton."""
     stage.arm.catch_up()
     arm = stage.device.arm
     arm.config = replace(arm.config, wearer_mass=(0.0,) * len(arm.config.wearer_mass))
@@ -164,6 +187,8 @@ def out_of_cuff(stage: Stage) -> None:
 
 
 def imu_wrong(stage: Stage, pitch: float, roll: float, duration: float) -> None:
+    """Let the IMU's error grow to `pitch` and `roll` rad within `duration` s."""
+
     def step(share: float) -> None:
         stage.imu_error = [share * pitch, share * roll]
 
@@ -171,10 +196,12 @@ def imu_wrong(stage: Stage, pitch: float, roll: float, duration: float) -> None:
 
 
 def imu_frozen(stage: Stage, duration: float) -> None:
+    """Repeat the IMU's newest reading for `duration` s."""
     setting(stage, stage, "imu_frozen", stage.newest_reading, None, duration)
 
 
 def imu_silent(stage: Stage, duration: float) -> None:
+    """Silence the IMU for `duration` s."""
     setting(stage, stage, "imu_silent", True, False, duration)
 
 

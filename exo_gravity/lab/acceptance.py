@@ -35,7 +35,7 @@ from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 
 @dataclass(frozen=True)
-class Acceptance:
+class BenchAcceptance:
     """What each step needs and permits."""
 
     spread: int = 15  #: K between the coldest and the warmest of motors that rested in one room
@@ -55,7 +55,7 @@ class Acceptance:
     fastest: float = 0.6  #: rad/s of any joint meanwhile
 
 
-ACCEPTANCE = Acceptance()
+ACCEPTANCE = BenchAcceptance()
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Weight:
 
 
 @dataclass(frozen=True)
-class Step:
+class BenchStep:
     """The result of one step."""
 
     name: str
@@ -177,7 +177,7 @@ class Bench:
         return fault.reason if fault else ""
 
 
-def cold(bench: Bench) -> Step:
+def cold(bench: Bench) -> BenchStep:
     """Check that motors that rested for an hour read the temperature of the room."""
     bench.ask("the motors have rested for an hour: let the arm hang and switch their supply on", lambda: "")
     bench.until(lambda: all(sample.time > -math.inf for sample in bench.loop.samples), ACCEPTANCE.start)
@@ -187,10 +187,10 @@ def cold(bench: Bench) -> Step:
     passed = passed and max(known) - min(known) <= ACCEPTANCE.spread
     shown = ", ".join("none" if degrees is None else str(degrees) for degrees in read)
     expected = f"must be {CHECK.coldest} to {CHECK.hottest} degC, and within {ACCEPTANCE.spread} K of each other"
-    return Step("cold", passed, f"the motors read {shown} degC: {expected}", {"temperature_degC": read})
+    return BenchStep("cold", passed, f"the motors read {shown} degC: {expected}", {"temperature_degC": read})
 
 
-def zero(bench: Bench) -> Step:
+def zero(bench: Bench) -> BenchStep:
     """Check that a hanging arm is at its zero, also after its supply was off."""
     before, silent = bench.angles, set[int]()
 
@@ -211,22 +211,22 @@ def zero(bench: Bench) -> Step:
         f"turned by {math.degrees(moved):.1f} degrees at most, must be within {math.degrees(ACCEPTANCE.same):g}; it is "
         f"{'near' if is_home else 'not near'} zero"
     )
-    return Step("zero", passed, sentence, {"before_rad": before, "after_rad": after, "silent": sorted(silent)})
+    return BenchStep("zero", passed, sentence, {"before_rad": before, "after_rad": after, "silent": sorted(silent)})
 
 
-def sign(bench: Bench) -> Step:
+def sign(bench: Bench) -> BenchStep:
     """Check that every motor switches on, and pushes its joint the way that its encoder shows."""
     bench.ask(f"hang {bench.weight.mass:g} kg at {bench.weight.lever:g} m from the elbow; stand clear", lambda: "")
     why = bench.carry()
-    return Step("sign", not why, why or "every joint moved the way it was pushed")
+    return BenchStep("sign", not why, why or "every joint moved the way it was pushed")
 
 
-def torque(bench: Bench) -> Step:
+def torque(bench: Bench) -> BenchStep:
     """Check that the torque that holds a known weight is what its mass, lever and angle need."""
     needed, angles = [], []
     for share in (1.0, ACCEPTANCE.higher, 1.0):  # up, higher, and down again
         if why := bench.lift_weight(share):
-            return Step("torque", False, why)
+            return BenchStep("torque", False, why)
         angles.append(bench.angles)
         needed.append(bench.needed(bench.angles))
     asked, reported, held = bench.lift.asked, bench.loop.samples[-1].effort, 0.5 * (needed[0] + needed[-1])
@@ -240,10 +240,10 @@ def torque(bench: Bench) -> Step:
         constant = motor.spec.torque_per_ampere * asked / reported
         measured["torque_per_ampere"] = constant
         sentence += f"; the board reports {reported:.2f} Nm: torque_per_ampere of this motor is {constant:.3f}"
-    return Step("torque", abs(ratio - 1.0) <= ACCEPTANCE.torque, sentence, measured)
+    return BenchStep("torque", abs(ratio - 1.0) <= ACCEPTANCE.torque, sentence, measured)
 
 
-def let_down(bench: Bench) -> Step:
+def let_down(bench: Bench) -> BenchStep:
     """Check that the arm comes down slowly, and that its motors are off then."""
     fastest = 0.0
 
@@ -261,13 +261,15 @@ def let_down(bench: Bench) -> Step:
         f"{'off' if is_down else 'not off'} after {lasted:.1f} s, must be within {ACCEPTANCE.down:g}; the fastest "
         f"joint turned at {fastest:.2f} rad/s, must be at most {ACCEPTANCE.fastest:g}"
     )
-    return Step("let_down", is_down and fastest <= ACCEPTANCE.fastest, sentence, {"s": lasted, "rad_per_s": fastest})
+    return BenchStep(
+        "let_down", is_down and fastest <= ACCEPTANCE.fastest, sentence, {"s": lasted, "rad_per_s": fastest}
+    )
 
 
-def time_out(bench: Bench) -> Step:
+def time_out(bench: Bench) -> BenchStep:
     """Check that a motor without commands lets go if `motor_timeout` says so, and holds if that is 0."""
     if why := bench.carry() or bench.lift_weight(1.0):
-        return Step("time_out", False, why)
+        return BenchStep("time_out", False, why)
     timeout, before = bench.motors[-1].timeout, bench.angles[-1]
     paused = bench.loop.call(lambda: bench.clock.sleep(ACCEPTANCE.pause))
     bench.until(paused.done, 2.0 * ACCEPTANCE.pause)
@@ -279,15 +281,17 @@ def time_out(bench: Bench) -> Step:
         f"the weight fell by {math.degrees(fallen):.1f} degrees in {ACCEPTANCE.pause:g} s without a command: the motor "
         f"{'let go' if has_let_go else 'held'}; {expected}"
     )
-    return Step("time_out", has_let_go is bool(timeout), sentence, {"fallen_rad": fallen, "motor_timeout_s": timeout})
+    return BenchStep(
+        "time_out", has_let_go is bool(timeout), sentence, {"fallen_rad": fallen, "motor_timeout_s": timeout}
+    )
 
 
 STEPS = (cold, zero, sign, torque, let_down, time_out)
 
 
-def accept(bench: Bench, say: Callable[[str], None]) -> list[Step]:
+def accept(bench: Bench, say: Callable[[str], None]) -> list[BenchStep]:
     """Run the steps until one does not pass; return their results. The arm is let down in the end."""
-    results: list[Step] = []
+    results: list[BenchStep] = []
     try:
         for step in STEPS:
             result = step(bench)
@@ -301,7 +305,7 @@ def accept(bench: Bench, say: Callable[[str], None]) -> list[Step]:
     return results
 
 
-def record(results: Sequence[Step], arm: str, is_simulated: bool) -> dict[str, Any]:
+def record(results: Sequence[BenchStep], arm: str, is_simulated: bool) -> dict[str, Any]:
     """Return the record of an acceptance, for a JSON file."""
     passed = [result.name for result in results if result.passed] == [step.__name__ for step in STEPS]
     date = datetime.now().astimezone().isoformat(timespec="seconds")

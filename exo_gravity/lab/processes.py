@@ -94,17 +94,17 @@ def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def asking_on_terminal(bridges: Sequence[str]) -> Iterator[None]:
+def asking_on_terminal(bridges: Sequence[str], say: Callable[[str], None]) -> Iterator[None]:
     """Ask on this terminal whether the arms of `bridges` hang as they are drawn, when their starts wait for that.
 
-    Where there is no terminal, print which services to call.
+    say: where there is no terminal, is called with each sentence that names the service to call.
     """
     if not (bridges and sys.stdin.isatty()):
         for bridge in bridges:
-            print(CONFIRMING.format(bridge), flush=True)
+            say(CONFIRMING.format(bridge))
         yield
         return
-    program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}pose_prompt")
+    program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}ros.pose_prompt")
     with subprocess.Popen([sys.executable, "-c", program, *bridges]) as prompt:
         try:
             yield

@@ -12,6 +12,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from datetime import datetime
+from functools import partial
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
@@ -67,7 +68,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
-        with asking_on_terminal(launcher.asking):
+        with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
             dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

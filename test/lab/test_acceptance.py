@@ -11,7 +11,7 @@ import pytest
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.acceptance import STEPS, Bench, Lift, Step, Weight, accept, record
+from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_arm import VirtualArm
@@ -51,7 +51,9 @@ def loaded_links():
     return replace(DEFAULT_LINKS, mass=mass, cog=cog)
 
 
-def acceptance(true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor, ...] = MOTORS, **spoil) -> list[Step]:
+def acceptance(
+    true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor, ...] = MOTORS, **spoil
+) -> list[BenchStep]:
     """Run the acceptance of a device with the motors `true`, which the file takes for `assumed`.
 
     spoil: attributes of the person, `temperature` of the first motor, or `timeout` of the firmware.
@@ -74,7 +76,7 @@ def acceptance(true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor,
     return results
 
 
-def failed(results: list[Step]) -> str:
+def failed(results: list[BenchStep]) -> str:
     """The name of the only step that did not pass, which is the last one, '' for none."""
     assert [result.name for result in results] == NAMES[: len(results)]
     assert all(result.passed for result in results[:-1])

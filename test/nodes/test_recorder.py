@@ -37,6 +37,8 @@ PROGRAM = "from exo_gravity.nodes.recorder import node; node.SILENCE = 3.0; node
 NODE = [sys.executable, "-c", PROGRAM, "--ros-args"]
 NAMES = ["j1", "j2", "j3", "j4"]
 COUNT = 300
+STEP = 1e-4  # rad by which each message's angles are larger than those of the one before
+FIELDS = (("/right/joint_states", "position", STEP), ("/right/effort_commands", "effort", 1.0))
 
 
 def start(output, *arguments, **options):
@@ -82,7 +84,7 @@ class PublishingArm:
 
     def publish(self, k):
         stamp = Time(nanoseconds=time.time_ns()).to_msg()
-        state = JointState(name=NAMES, position=[float(k)] * 4, velocity=[0.0] * 4, effort=[1.0] * 4)
+        state = JointState(name=NAMES, position=[STEP * k] * 4, velocity=[0.0] * 4, effort=[1.0] * 4)
         effort = JointState(name=NAMES, effort=[float(k)] * 4)
         image = Imu()
         for message in (state, effort, image):
@@ -136,13 +138,12 @@ def recorded(path, topic):
         return [(stamp, reader.deserialize(data, c.msgtype)) for c, stamp, data in reader.messages(chosen)]
 
 
-@pytest.mark.parametrize("topic", ["/right/joint_states", "/right/effort_commands", "/right/assist_efforts"])
-def test_every_message_of_an_arm_is_recorded_with_its_time_of_arrival(session, topic):
+@pytest.mark.parametrize(("topic", "field", "step"), [*FIELDS, ("/right/assist_efforts", "effort", 1.0)])
+def test_every_message_of_an_arm_is_recorded_with_its_time_of_arrival(session, topic, field, step):
     path, _, code, _ = session
     assert code == 0 and (path / "metadata.yaml").exists()  # closed by Ctrl-C
-    field = "position" if topic.endswith("states") else "effort"
     messages = recorded(path, topic)
-    assert [round(getattr(message, field)[0]) for _, message in messages] == list(range(COUNT))
+    assert [round(getattr(message, field)[0] / step) for _, message in messages] == list(range(COUNT))
     for stamp, message in messages:
         assert 0 < stamp - to_nanoseconds(message.header.stamp) < PATIENCE * 10**9
 
@@ -181,7 +182,7 @@ def test_a_wrong_parameter_ends_the_recorder_with_2_and_is_named(tmp_path, param
 
 def test_a_live_line_has_joints_step_and_faults(session):
     line = json.loads(session[1][-1])
-    assert line["right"]["names"] == NAMES and line["right"]["position"] == [float(COUNT - 1)] * 4
+    assert line["right"]["names"] == NAMES and line["right"]["position"] == [STEP * (COUNT - 1)] * 4
     assert line["right"]["command"] == [float(COUNT - 1)] * 4 and line["right"]["step"]["action"] == "hold"
     assert line["faults"] == ["right/bridge: motor 2 is silent"]
 
@@ -218,8 +219,8 @@ def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_re
     assert process.returncode == 0
     missed, unwritten = map(int, re.findall(r"messages lost so far: (\d+) did not arrive, (\d+) were not", errors)[-1])
     found = [
-        [round(getattr(m, field)[0]) for _, m in recorded(tmp_path / "bag", topic)]
-        for topic, field in (("/right/joint_states", "position"), ("/right/effort_commands", "effort"))
+        [round(getattr(m, field)[0] / step) for _, m in recorded(tmp_path / "bag", topic)]
+        for topic, field, step in FIELDS
     ]
     assert unwritten == 0 and missed >= sum(3050 - len(numbers) for numbers in found) > 100
     assert any(
@@ -238,7 +239,7 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
             process.stdin.close()  # the launcher has died
     assert process.poll() is None
     assert process.wait(PATIENCE) == 0
-    assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0]) == k
+    assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0] / STEP) == k
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
 

@@ -41,7 +41,7 @@ WRONG = [
     ("validate", ["--output", "taken.html/folder"], "taken.html"),
 ]
 WITHOUT = {  # by tool: the package, words that need it, and how it is installed
-    "report": ("rosbags.rosbag2", ["b"], "exo_gravity[report]"),
+    "report": ("rosbags.typesys", ["b"], "exo_gravity[report]"),
     "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
     "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
 }

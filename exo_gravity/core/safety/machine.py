@@ -44,9 +44,9 @@ from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
 from exo_gravity.core.safety.limits import CONFIRM, DAMPING, Limits
 from exo_gravity.core.safety.monitors import REST, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
-from exo_gravity.core.safety.power import POWER, Change, MotorPower, Power, SwitchingOn
+from exo_gravity.core.safety.power import POWER, MotorPower, Power, PowerChange, SwitchingOn
 from exo_gravity.core.safety.stall import StallWatch
-from exo_gravity.core.safety.transitions import TRANSITIONS, Event
+from exo_gravity.core.safety.transitions import TRANSITIONS, StateEvent
 from exo_gravity.core.safety.trust import Readings
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
@@ -115,19 +115,19 @@ class SafetyMachine:
             return False
         self.waiting_for, self.refusal = "the first replies of the motors", ""
         self._calm_since = now
-        self._on(Event.ENABLE, now)
+        self._on(StateEvent.ENABLE, now)
         return True
 
     def disable(self, now: float) -> None:
         """Let the arm down if it is carried, else switch it off; then go to DISABLED. A latched fault stays."""
-        self._on(Event.DISABLE, now)
+        self._on(StateEvent.DISABLE, now)
 
     def clear(self, now: float) -> bool:
         """Clear a latched fault, on the operator's request only. Return False, and do nothing, unless in FAULT."""
         if self.state is not State.FAULT:
             return False
         self.fault = None
-        self._on(Event.CLEAR, now)
+        self._on(StateEvent.CLEAR, now)
         return True
 
     @property
@@ -161,19 +161,19 @@ class SafetyMachine:
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or Fault(code, reason)
-        self._on(Event.FAULT, now)
+        self._on(StateEvent.FAULT, now)
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
         self._sent, self._left = Drive(tuple(effort), tuple(damping), COMMANDS, True), effort
-        self._change_power(Change.TAKEN_OVER)
+        self._change_power(PowerChange.TAKEN_OVER)
         self.state = State.ACTIVE
-        self._on(Event.DISABLE, now)
+        self._on(StateEvent.DISABLE, now)
 
     def probe(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
         self._descent = ArmDescent(now, NO_TORQUE, (DAMPING,) * len(self.power), self.limits.max_effort)
-        self._change_power(Change.PROBED)
+        self._change_power(PowerChange.PROBED)
 
     def is_at_rest(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
@@ -214,7 +214,7 @@ class SafetyMachine:
             # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
             for power, held in zip(self.power, self._left, strict=True):
                 if power.state is Power.UNSURE and power.is_heard and abs(held) <= 2.0 * POWER.torque:
-                    power.change(Change.SHOWN_ON)
+                    power.change(PowerChange.SHOWN_ON)
 
     def _watch_stalls(self) -> None:
         """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
@@ -289,7 +289,7 @@ class SafetyMachine:
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             self._delivery.reset()
-            self._on(Event.PASSED)
+            self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
             self._refuse(f"not enabled within {patience:g} s: waited for {self.waiting_for}")
 
@@ -310,7 +310,7 @@ class SafetyMachine:
             self._readings.prove()
             self.motion.reset()
             self._rise.begin((1.0,) * len(self.power))
-            self._on(Event.PROVEN)
+            self._on(StateEvent.PROVEN)
 
     def _push(self) -> Drive:
         """Return a drive that switches the motors on one by one, then pushes them gently.
@@ -337,7 +337,7 @@ class SafetyMachine:
         if self.state is State.RAMPING_IN:
             self._rise.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
             if self._rise.is_over:
-                self._on(Event.RAMPED)
+                self._on(StateEvent.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
@@ -356,8 +356,8 @@ class SafetyMachine:
         if self._is_switched_off or descent.is_down(self._now, self._rest.since):
             for power, is_silent in zip(self.power, silent, strict=True):
                 if not is_silent:
-                    power.change(Change.SWITCH_OFF)
-            self._on(Event.DOWN_AFTER_FAULT if self.fault else Event.DOWN)
+                    power.change(PowerChange.SWITCH_OFF)
+            self._on(StateEvent.DOWN_AFTER_FAULT if self.fault else StateEvent.DOWN)
             return self._stand()
         delivered = self._delivery.step(self._dt, joints, self._sent.effort, self._sent.damping) is None
         send = self._lowering_sends()
@@ -379,7 +379,7 @@ class SafetyMachine:
         if any(power.state is Power.ON for power in self.power):
             if self.state is State.CHECKING:
                 self.refusal = "a motor was still on: it is let down"
-            self._on(Event.FOUND_ON)
+            self._on(StateEvent.FOUND_ON)
             return self._descend()
         if self._all_off:
             return OFF._replace(send=tuple(self._lowering_sends()))
@@ -390,7 +390,7 @@ class SafetyMachine:
         """Switch motors off that may be on, but reply without torque."""
         for power in self.power:
             if power.state in (Power.UNSURE, Power.UNKNOWN) and power.is_quiet:
-                power.change(Change.SWITCH_OFF)
+                power.change(PowerChange.SWITCH_OFF)
 
     @property
     def _is_switched_off(self) -> bool:
@@ -413,17 +413,17 @@ class SafetyMachine:
 
     def _refuse(self, reason: str) -> None:
         self.refusal = reason
-        self._on(Event.REFUSED)
+        self._on(StateEvent.REFUSED)
 
     def _trip(self, fault: Fault | None) -> None:
         if fault:
             self.trip(*fault, self._now)
 
-    def _change_power(self, change: Change) -> None:
+    def _change_power(self, change: PowerChange) -> None:
         for power in self.power:
             power.change(change)
 
-    def _on(self, event: Event, now: float = -math.inf) -> None:
+    def _on(self, event: StateEvent, now: float = -math.inf) -> None:
         """Go to the state that `TRANSITIONS` has for this event; stay where it has none."""
         before, after = self.state, TRANSITIONS.get((self.state, event))
         if after is None:
@@ -432,11 +432,11 @@ class SafetyMachine:
         self.pose.withdraw()
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:
-            self._change_power(Change.SWITCH_ON)
+            self._change_power(PowerChange.SWITCH_ON)
         elif before is State.PROVING and after is not State.RAMPING_IN:
-            self._change_power(Change.SWITCH_OFF)
+            self._change_power(PowerChange.SWITCH_OFF)
         elif after is State.RAMPING_IN:
-            self._change_power(Change.SHOWN_ON)
+            self._change_power(PowerChange.SHOWN_ON)
         elif after is State.LETTING_DOWN and before in CARRIED:
             sent = self._sent
             self._descent = ArmDescent(self._since, sent.effort, sent.damping, self.limits.max_effort)

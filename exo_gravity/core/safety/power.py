@@ -54,7 +54,7 @@ class Power(str, Enum):
     LEAVING = "leaving"  #: is being switched off; not confirmed yet
 
 
-class Change(str, Enum):
+class PowerChange(str, Enum):
     """What changes a motor's state: an order of the safety machine, or what its replies show."""
 
     SWITCH_ON = "order: switch on"
@@ -68,19 +68,19 @@ class Change(str, Enum):
     CONFIRMED = "replied to EXIT"
 
 
-NEXT: dict[tuple[Power, Change], Power] = {
-    (Power.OFF, Change.SWITCH_ON): Power.ENTERING,
-    (Power.OFF, Change.SWITCH_OFF): Power.OFF,
-    (Power.ENTERING, Change.SHOWN_ON): Power.ON,
-    (Power.ON, Change.SILENT): Power.SILENT,
-    (Power.SILENT, Change.REPLIES): Power.ON,
-    (Power.SILENT, Change.CUT): Power.UNSURE,
-    (Power.UNSURE, Change.SHOWN_ON): Power.ON,
-    (Power.UNKNOWN, Change.SHOWN_ON): Power.ON,
-    (Power.LEAVING, Change.CONFIRMED): Power.OFF,
-    **{(state, Change.SWITCH_OFF): Power.LEAVING for state in Power if state is not Power.OFF},
-    **{(state, Change.TAKEN_OVER): Power.UNSURE for state in Power},
-    **{(state, Change.PROBED): Power.UNKNOWN for state in Power},
+NEXT: dict[tuple[Power, PowerChange], Power] = {
+    (Power.OFF, PowerChange.SWITCH_ON): Power.ENTERING,
+    (Power.OFF, PowerChange.SWITCH_OFF): Power.OFF,
+    (Power.ENTERING, PowerChange.SHOWN_ON): Power.ON,
+    (Power.ON, PowerChange.SILENT): Power.SILENT,
+    (Power.SILENT, PowerChange.REPLIES): Power.ON,
+    (Power.SILENT, PowerChange.CUT): Power.UNSURE,
+    (Power.UNSURE, PowerChange.SHOWN_ON): Power.ON,
+    (Power.UNKNOWN, PowerChange.SHOWN_ON): Power.ON,
+    (Power.LEAVING, PowerChange.CONFIRMED): Power.OFF,
+    **{(state, PowerChange.SWITCH_OFF): Power.LEAVING for state in Power if state is not Power.OFF},
+    **{(state, PowerChange.TAKEN_OVER): Power.UNSURE for state in Power},
+    **{(state, PowerChange.PROBED): Power.UNKNOWN for state in Power},
 }
 # What a motor is sent: on V1 and V2 boards, and on V3 boards, which a command switches on.
 SENT: dict[Power, tuple[Send, Send]] = {
@@ -126,7 +126,7 @@ class MotorPower:
         """Whether it has shown no torque for long enough to be off."""
         return self._heard_for >= POWER.read_time
 
-    def change(self, change: Change) -> None:
+    def change(self, change: PowerChange) -> None:
         """Go to the state that `NEXT` has for this change; stay where it has none."""
         before, self.state = self.state, NEXT.get((self.state, change), self.state)
         if self.state is before:
@@ -144,21 +144,21 @@ class MotorPower:
         if is_silent:
             self._silent_for += dt
             self._torque = self._heard_for = 0.0
-            self.change(Change.SILENT)
+            self.change(PowerChange.SILENT)
             if self._silent_for >= POWER.cut:
-                self.change(Change.CUT)
+                self.change(PowerChange.CUT)
             return
         self._silent_for = 0.0
-        self.change(Change.REPLIES)
+        self.change(PowerChange.REPLIES)
         if joint.time > self._newest:
             self._torque += min(1.0, dt / POWER.smoothing) * (joint.effort - self._torque)
             self._heard_for += dt
             is_confirmed = len(self._exits) == 2 and joint.time >= self._exits[1]
             if is_confirmed and (self._board == 0 or abs(joint.effort) < POWER.torque):
-                self.change(Change.CONFIRMED)
+                self.change(PowerChange.CONFIRMED)
         self._newest = max(self._newest, joint.time)
         if abs(self._torque) > POWER.torque and self.state in (Power.UNSURE, Power.UNKNOWN):
-            self.change(Change.SHOWN_ON)
+            self.change(PowerChange.SHOWN_ON)
 
     def send(self, now: float) -> Send:
         """Return what the motor is sent at `now` s."""

@@ -10,7 +10,7 @@ from enum import Enum
 from exo_gravity.core.safety.drive import State
 
 
-class Event(str, Enum):
+class StateEvent(str, Enum):
     """What may change the state."""
 
     ENABLE = "enable"  #: by the operator
@@ -26,27 +26,27 @@ class Event(str, Enum):
     DOWN_AFTER_FAULT = "down after a fault"
 
 
-TRANSITIONS: dict[tuple[State, Event], State] = {
-    (State.DISABLED, Event.ENABLE): State.CHECKING,
-    (State.DISABLED, Event.FAULT): State.FAULT,
-    (State.DISABLED, Event.FOUND_ON): State.LETTING_DOWN,
-    (State.CHECKING, Event.PASSED): State.PROVING,
-    (State.CHECKING, Event.REFUSED): State.DISABLED,
-    (State.CHECKING, Event.DISABLE): State.DISABLED,
-    (State.CHECKING, Event.FAULT): State.FAULT,
-    (State.CHECKING, Event.FOUND_ON): State.LETTING_DOWN,
-    (State.PROVING, Event.PROVEN): State.RAMPING_IN,
-    (State.PROVING, Event.DISABLE): State.DISABLED,
-    (State.PROVING, Event.FAULT): State.FAULT,
-    (State.RAMPING_IN, Event.RAMPED): State.ACTIVE,
-    (State.RAMPING_IN, Event.DISABLE): State.LETTING_DOWN,
-    (State.RAMPING_IN, Event.FAULT): State.LETTING_DOWN,
-    (State.ACTIVE, Event.DISABLE): State.LETTING_DOWN,
-    (State.ACTIVE, Event.FAULT): State.LETTING_DOWN,
-    (State.LETTING_DOWN, Event.DOWN): State.DISABLED,
-    (State.LETTING_DOWN, Event.DOWN_AFTER_FAULT): State.FAULT,
-    (State.FAULT, Event.CLEAR): State.DISABLED,
-    (State.FAULT, Event.FOUND_ON): State.LETTING_DOWN,
+TRANSITIONS: dict[tuple[State, StateEvent], State] = {
+    (State.DISABLED, StateEvent.ENABLE): State.CHECKING,
+    (State.DISABLED, StateEvent.FAULT): State.FAULT,
+    (State.DISABLED, StateEvent.FOUND_ON): State.LETTING_DOWN,
+    (State.CHECKING, StateEvent.PASSED): State.PROVING,
+    (State.CHECKING, StateEvent.REFUSED): State.DISABLED,
+    (State.CHECKING, StateEvent.DISABLE): State.DISABLED,
+    (State.CHECKING, StateEvent.FAULT): State.FAULT,
+    (State.CHECKING, StateEvent.FOUND_ON): State.LETTING_DOWN,
+    (State.PROVING, StateEvent.PROVEN): State.RAMPING_IN,
+    (State.PROVING, StateEvent.DISABLE): State.DISABLED,
+    (State.PROVING, StateEvent.FAULT): State.FAULT,
+    (State.RAMPING_IN, StateEvent.RAMPED): State.ACTIVE,
+    (State.RAMPING_IN, StateEvent.DISABLE): State.LETTING_DOWN,
+    (State.RAMPING_IN, StateEvent.FAULT): State.LETTING_DOWN,
+    (State.ACTIVE, StateEvent.DISABLE): State.LETTING_DOWN,
+    (State.ACTIVE, StateEvent.FAULT): State.LETTING_DOWN,
+    (State.LETTING_DOWN, StateEvent.DOWN): State.DISABLED,
+    (State.LETTING_DOWN, StateEvent.DOWN_AFTER_FAULT): State.FAULT,
+    (State.FAULT, StateEvent.CLEAR): State.DISABLED,
+    (State.FAULT, StateEvent.FOUND_ON): State.LETTING_DOWN,
 }
 
 # What the motors receive in each state, in words for readers; `power.SENT` has the frames.

@@ -27,7 +27,7 @@ from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outlier
 from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
-from exo_gravity.lab.bag.storage import Rows, Storage
+from exo_gravity.lab.bag.storage import Storage, StoredRows
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
 
@@ -185,7 +185,7 @@ class _Contents:
         self._states: dict[str, list[tuple[Row, str]]] = {}  # by arm: row, state
         self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
 
-    def add(self, rows: Rows) -> None:
+    def add(self, rows: StoredRows) -> None:
         """Add messages. A topic with an invalid message becomes a problem, and its rest is ignored."""
         for (topic, msgtype), chosen, batch in rows.by_topic():
             ordinals = self._count + chosen

@@ -48,7 +48,7 @@ Topic = tuple[str, str]  # name, type
 Message = tuple[str, str, int, bytes]  # topic, type, time of arrival in ns since 1970, serialised message
 
 
-class Rows(NamedTuple):
+class StoredRows(NamedTuple):
     """Messages of several topics in the order of their file."""
 
     topics: Mapping[int, Topic]  #: by their numbers
@@ -110,7 +110,7 @@ class Storage:
             for number, stamp, data in zip(rows.topic.tolist(), arrivals, rows.batch.messages(), strict=True):
                 yield *rows.topics[number], stamp, data
 
-    def rows(self, wanted: Wanted) -> Iterator[Rows]:
+    def rows(self, wanted: Wanted) -> Iterator[StoredRows]:
         """Yield the messages of the `wanted` topics, file by file.
 
         Raises DataError for a file of unknown format, for one that is compressed and cut or damaged, and where two
@@ -130,7 +130,7 @@ class Storage:
                 yield rows
             spans.append((file, low, high))
 
-    def _of_file(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
+    def _of_file(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
         with ExitStack() as stack:
             kind = file.suffix
             content = file
@@ -143,7 +143,7 @@ class Storage:
                 if decompressed := self._decompressed(rows):
                     yield decompressed
 
-    def _decompressed(self, rows: Rows) -> Rows | None:
+    def _decompressed(self, rows: StoredRows) -> StoredRows | None:
         """Return rows whose messages are not compressed; None without any."""
         topics, topic, batch = rows
         whole = (batch.length > len(ZSTD)) & (batch.start + batch.length <= len(batch.data))
@@ -153,7 +153,7 @@ class Storage:
         if not len(topic):
             return None
         if not np.any(batch.data[batch.start] == ZSTD[0]):
-            return Rows(topics, topic, batch)
+            return StoredRows(topics, topic, batch)
         messages, kept = [], []
         for index, message in enumerate(batch.messages()):
             try:
@@ -163,9 +163,9 @@ class Storage:
                 self.damaged += 1
         if not kept:
             return None
-        return Rows(topics, topic[kept], _batch(messages, batch.arrival[kept]))
+        return StoredRows(topics, topic[kept], _batch(messages, batch.arrival[kept]))
 
-    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
+    def _mcap(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
@@ -176,7 +176,7 @@ class Storage:
             where = "without an index" if reading.at == len(data) else "within a record, or is damaged"
             self.cut_short = f"{file.name} ends {where}"
 
-    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[Rows]:
+    def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
         with ExitStack() as stack:
             try:
                 database, topics = _open_database(file, stack)
@@ -196,13 +196,13 @@ class Storage:
                 self.cut_short = f"{file.name} {error}"
             yield from self._whole(found, chosen)
 
-    def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[Rows]:
+    def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[StoredRows]:
         """Yield rows of a database without those that are damaged, which have values of other types."""
         whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
         self.damaged += len(found) - len(whole)
         if whole:
             numbers, stamps, data = zip(*whole, strict=True)
-            yield Rows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
+            yield StoredRows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
 
 
 class _McapFile:
@@ -214,7 +214,7 @@ class _McapFile:
         self.chosen: dict[int, Topic] = {}  # the wanted topics by channel
         self.at, self.is_complete = 0, False
 
-    def rows(self, data: bytes | mmap, at: int) -> Iterator[Rows]:
+    def rows(self, data: bytes | mmap, at: int) -> Iterator[StoredRows]:
         """Yield the messages among the records from `at` on, also those in chunks, up to a cut or damage."""
         end, size, unpack, unpack_message = len(data), RECORD.size, RECORD.unpack_from, MESSAGE.unpack_from
         chosen, buffer = self.chosen, np.frombuffer(data, np.uint8)
@@ -223,11 +223,11 @@ class _McapFile:
         starts: list[int] = []
         ends: list[int] = []
 
-        def taken() -> Iterator[Rows]:
+        def taken() -> Iterator[StoredRows]:
             if numbers:
                 start = np.array(starts) + MESSAGE.size
                 batch = Batch(buffer, start, np.array(ends) - start, plausible(np.array(stamps, np.uint64)))
-                yield Rows(chosen, np.array(numbers), batch)
+                yield StoredRows(chosen, np.array(numbers), batch)
                 for column in (numbers, stamps, starts, ends):
                     column.clear()
 

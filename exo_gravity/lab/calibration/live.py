@@ -139,7 +139,7 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
         path = Path(folder, "params.yaml")
         path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
         launcher = Launcher(path, on_line)
-        with asking_on_terminal(launcher.asking):
+        with asking_on_terminal(launcher.asking, say):
             dead = launcher.run(ending)
     for number, handler in handlers.items():
         signal.signal(number, handler)

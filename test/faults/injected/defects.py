@@ -15,12 +15,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from exo_gravity.core.safety.drive import Send
+from exo_gravity.core.safety.power import Power
+
 STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
 TRUSTED = "core.safety.trust:Readings.trusted"  # zeros and signs
 ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDescent", "JointDescent.__init__"))
 DESCENT = "core.safety.descent:DESCENT"  # its tuning
 DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
-SUPPLY = "core.safety.monitors:SupplyMonitor.suspect"
+SENT = "core.safety.power:SENT"  # what a motor is sent in each state
 RIDE, RIDING = (f"core.safety.monitors:RideThrough.{name}" for name in ("step", "is_riding"))
 MONITOR, MOTION = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:MOTION"
 WALL = "core.safety.barrier:Barrier._wall"
@@ -143,9 +146,9 @@ def without_timeout(limits: Any, *others: Any) -> Any:
     return patient, *others
 
 
-def once(suspect: Callable[..., None]) -> Callable[..., None]:
-    """Suspect the motors only when the monitor is made."""
-    return lambda self, held: None if hasattr(self, "unsure") else suspect(self, held)
+def commands_unsure(sent: dict[Power, tuple[Send, Send]]) -> dict[Power, tuple[Send, Send]]:
+    """Send ENTER, or to a V3 board a command, to a motor that may have lost its power."""
+    return {**sent, Power.UNSURE: (Send.ENTER, Send.COMMAND)}
 
 
 def rides_on(fault: Any, ride: Any, *_: Any) -> None:
@@ -274,7 +277,7 @@ DEFECTS = (
     Defect(
         "powered frames are sent while the supply is cut",
         ("V3 boards: supply cut for 2 s", "supply cut for 2 s"),
-        {SUPPLY: once},
+        {SENT: commands_unsure},
     ),
     Defect(
         "an enable never expires",

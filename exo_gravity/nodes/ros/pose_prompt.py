@@ -7,6 +7,7 @@ operator like any other: the question comes from /diagnostics, the answer is a c
 import contextlib
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import rclpy
 from rclpy.node import Node
@@ -25,12 +26,12 @@ class PosePrompt(Node):
     """The operator at a terminal.
 
     bridges: full names of the nodes can_bridge to ask for.
-    ask: shows a question and returns the line that was typed.
+    ask: shows a question and returns the line that was typed. say: shows a sentence.
     """
 
-    def __init__(self, bridges: Sequence[str], ask: Callable[[str], str]) -> None:
+    def __init__(self, bridges: Sequence[str], ask: Callable[[str], str], say: Callable[[str], None]) -> None:
         super().__init__("operator")
-        self._ask = ask
+        self._ask, self._say = ask, say
         self._statuses = Statuses(self)
         self._services = {bridge: self.create_client(Trigger, f"{bridge}/confirm_pose") for bridge in bridges}
         self._answered: set[str] = set()  # the bridges whose present question was answered
@@ -45,12 +46,12 @@ class PosePrompt(Node):
                 self._answered.add(bridge)
                 question = f"{bridge}: does the arm hang as it is drawn, joints at {pose} degrees? [y/N] "
                 if self._ask(question).strip().lower() not in ("y", "yes"):
-                    print(f"{bridge}: not confirmed; let the arm hang, or calibrate its zeros, and enable it again")
+                    self._say(f"{bridge}: not confirmed; let the arm hang, or calibrate its zeros, and enable it again")
                     continue
                 sent = service.call_async(Trigger.Request())
                 rclpy.spin_until_future_complete(self, sent, timeout_sec=ANSWER_TIMEOUT)
                 response = sent.result() if sent.done() else None
-                print(f"{bridge}: {response.message if response else 'the bridge did not answer'}", flush=True)
+                self._say(f"{bridge}: {response.message if response else 'the bridge did not answer'}")
 
 
 def main() -> None:
@@ -58,7 +59,7 @@ def main() -> None:
     keep_to_this_machine()
     rclpy.init(args=[sys.argv[0], *ENCLAVE], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.suppress(KeyboardInterrupt, EOFError):
-        prompt = PosePrompt(sys.argv[1:], input)
+        prompt = PosePrompt(sys.argv[1:], input, partial(print, flush=True))
         while True:
             rclpy.spin_once(prompt, timeout_sec=0.1)
             prompt.look()
