@@ -92,7 +92,8 @@ def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_ma
 
     arm.wire.carry = queue
     assert arm.run_until(lambda: arm.safety.state is not State.ACTIVE, 20.0)
-    assert arm.safety.fault.code is FaultCode.REPLIES_LATE
+    # The pause that is to tell can itself make a motor silent.
+    assert arm.safety.fault.code in (FaultCode.REPLIES_LATE, FaultCode.MOTOR_SILENT)
     assert 0.02 * (arm.now - begin) < 0.1
     arm.run(8.0)
     assert arm.top_speed < SPEED

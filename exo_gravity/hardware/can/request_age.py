@@ -7,7 +7,7 @@ pause tells them apart: a motor that is sent nothing still replies to all that i
 
     oldest command without a reply older than `longest`    the motor is sent nothing until it is known why:
         no reply for `quiet`                                    those commands were lost, and are forgotten
-        replies, which show a queue as long as `longest`        the replies are `late`: a fault
+        replies, which show a queue as long as `longest`        twice within `again`: the replies are `late`, a fault
 
 While replies are late, a motor is sent a command only if no more are under way than `longest` holds: a queue that our
 own commands fill gets no longer.
@@ -26,6 +26,10 @@ class ReplyAge:
     fewest: int = 3  #: commands under way: at a low rate one or two may be longer than `longest`
     quiet: float = 0.02  #: s without a reply that show that none is under way; an adapter's longest timer is 0.016 s
     looks: int = 3  #: cycles of it at least
+    #: s at most that pass between two looks: where more have, the whole computer may have stood still, and the replies
+    #: that wait are no older than others
+    look: float = 0.025
+    again: float = 0.5  #: s within which a second such pause must follow: a device that stood still once is no queue
     most: int = 256  #: commands that are remembered
 
 
@@ -33,7 +37,7 @@ AGE = ReplyAge()
 
 
 class Requests:
-    """The commands to one motor, and their replies. Times are in s.
+    """The commands to one motor, and their replies. Times are in s; ages are in s for which this process ran.
 
     last: when the motor was last sent a frame; -inf for never.
     late: how old its replies are at least, in s, if that is too old; else 0.
@@ -42,14 +46,17 @@ class Requests:
     def __init__(self) -> None:
         self.last = -math.inf
         self.late = 0.0
+        self._ran, self._seen = 0.0, math.inf  # s for which this process has run, and when it last looked
         self._open: deque[float] = deque(maxlen=AGE.most)  # when each command without a reply was sent
         self._sent: list[float] = []  # of a pause: `_open` when it began; empty without a pause
         self._replies: list[float] = []  # when they arrived in the pause
+        self._suspected = -math.inf  # when replies last showed a long queue
         self._looks = 0  # cycles without a command since the last reply
         self._replied = self._paused = -math.inf  # when the last reply arrived, and when the pause began
 
     def may_send(self, now: float) -> bool:
         """Return whether the motor is to be sent a command in this cycle."""
+        now = self._run(now)
         if self._sent:
             self._looks += 1
             since = self._replies[-1] if self._replies else self._paused
@@ -71,10 +78,13 @@ class Requests:
     def sent(self, now: float, frames: int) -> None:
         """Note frames that the motor answers."""
         self.last = now
+        now = self._run(now)
         self._open.extend([now] * frames)
 
     def replied(self, now: float) -> float:
         """Note a reply; return when the motor was last asked, or `now` if it never was: the reading is no newer."""
+        asked = now if self.last == -math.inf else self.last
+        now = self._run(now)
         self._replied, self._looks = now, 0
         if self._open:
             self._open.popleft()
@@ -85,8 +95,15 @@ class Requests:
             count = len(self._replies)  # so many commands at least were under way when the pause began
             age = self._replies[0] - self._sent[-min(count, len(self._sent))]
             if count >= AGE.fewest and age > AGE.longest:
-                self.late, self._sent = age, []
-        return now if self.last == -math.inf else self.last
+                self.late = age if now - self._suspected <= AGE.again else 0.0
+                self._suspected, self._sent = now, []
+        return asked
+
+    def _run(self, now: float) -> float:
+        """Return the time in s for which this process has run until `now`."""
+        self._ran += min(AGE.look, max(0.0, now - self._seen))
+        self._seen = now
+        return self._ran
 
     def _forget(self) -> None:
         self._open.clear()
