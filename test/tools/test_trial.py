@@ -76,7 +76,7 @@ def column(folder, name):
 def test_an_offline_trial_ends_with_a_report_of_its_recording(run, capsys):
     code, folder = run("--offline")
     assert code == 0
-    report_files = {"holds.csv", "motions.csv", "report.html", "right_overview.png", "right_drift.png"}
+    report_files = {"holds.csv", "motions.csv", "report.html", "right_overview.png"}  # it held: no drift to draw
     assert {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
     text = capsys.readouterr().out
     assert "times real time" in text and "It held." in text
