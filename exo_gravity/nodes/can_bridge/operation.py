@@ -54,7 +54,7 @@ REQUEST_LIFE = 1.0  # s; a busy computer delays requests by tenths of that
 
 # What follows a request that was carried out, by the state that it led to.
 FOLLOWS = {
-    State.CHECKING: "torque follows in 3 s, at the first start in 10 s; if not, /diagnostics says what is missing",
+    State.CHECKING: "torque follows in 5 s, at the first start in 10 s; if not, /diagnostics says what is missing",
     State.LETTING_DOWN: "the motors are switched off once the arm is down; /diagnostics shows the state",
 }
 MOTOR_UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
