@@ -149,7 +149,12 @@ def test_the_compensator_answers_with_what_gravity_needs_and_publishes_it(compen
     running = compensator()
     answer = settled(running)
     assert answer.name == NAMES
-    wait_until(lambda: received and received[-1] == running.answer(states()), lambda: executor.spin_once(0.01))
+
+    def is_received():
+        answer = running.answer(states())  # the first ones may precede the discovery of this subscription
+        return received and received[-1] == answer
+
+    wait_until(is_received, lambda: executor.spin_once(0.01))
 
 
 def test_joint_states_of_another_publisher_withdraw_the_efforts(compensator, node):
@@ -164,8 +169,8 @@ def test_joint_states_of_another_publisher_withdraw_the_efforts(compensator, nod
 
     for _ in range(20):
         assert cycle().effort
-    other.publish(states())
-    wait_until(lambda: not cycle().effort)
+    # One message of the other may be lost between two of ours: the middleware keeps few.
+    wait_until(lambda: other.publish(states()) or not cycle().effort)
 
 
 def test_an_exception_of_the_step_ends_the_answers_for_good_and_is_kept(compensator, monkeypatch):

@@ -182,11 +182,14 @@ def test_short_and_remote_frames_are_filled_with_what_is_left_of_the_frame_befor
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0 * is_command, abs=STEP)
 
 
-def test_a_v3_board_of_image_3_2_reads_1_35_times_its_torque():
+def test_a_v3_board_of_image_3_2_reads_its_torque_by_the_firmwares_constant_and_1_35_times_it_by_the_rated_ones():
     motor = SimulatedMotor(V3_JOINT, FIRMWARES["v3_2"])
     motor.receive(V3_JOINT.command(2.0, 0.0), 0.0, 0.0, 0.0)
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=STEP)
-    assert V3_JOINT.sample(motor.status(0.0, 0.0)[1], 0.0).effort == pytest.approx(2.0 * 3.0 / 7.4 / 0.2997, abs=STEP)
+    status = motor.status(0.0, 0.0)[1]
+    assert V3_JOINT.sample(status, 0.0).effort == pytest.approx(2.0, abs=STEP)
+    by_rated = replace(V3_JOINT, spec=replace(V3_JOINT.spec, torque_per_ampere=3.0 / 7.4))
+    assert by_rated.sample(status, 0.0).effort == pytest.approx(2.0 * 3.0 / 7.4 / 0.2997, abs=STEP)
 
 
 @pytest.mark.parametrize(("name", "is_obeyed"), [("v3", False), ("v3_2", True), ("v3_query", True)])

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import FrameError
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MotorCommand, MotorReply
+from exo_gravity.core.motors.specs import MotorCommand, MotorReply, unpack_fields
 from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, Frame, V3Format
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.motors.firmware import (
@@ -204,7 +204,11 @@ class SimulatedMotor:
             try:
                 self._command, self._data = joint.wire_format.unpack_command(joint.spec, data), data
             except FrameError:
-                return False
+                if len(data) != _FULL_LENGTH:
+                    return False
+                # We never send it, because it is special on some firmware. This one takes it for a command.
+                fields = unpack_fields(joint.spec, int.from_bytes(data, "big"), *MotorCommand._fields)
+                self._command, self._data = MotorCommand(*fields), data
         self._age = 0.0
         self.entered = self.entered or not (joint.enter or self._is_refused)
         return True
