@@ -128,8 +128,8 @@ def write_parameters(
             # With the IMU's noise an answer could not be matched to its reply. The node `imu` still runs.
             values.update(use_imu=False, thread_priority=thread_priority)
         elif name.endswith("/simulator"):
-            # The delay ends a second after the ramp: it starts when the motors are switched on.
-            values.update(trial=str(script), trial_delay=2.0, trunk={"pitch": 0.0, "roll": 0.0})
+            # The delay ends after the torque has risen: it starts when the motors are switched on.
+            values.update(trial=str(script), trial_delay=3.5, trunk={"pitch": 0.0, "roll": 0.0})
     all_nodes, simulators = folder / "params.yaml", folder / "simulators.yaml"
     all_nodes.write_text(yaml.safe_dump(content), encoding="utf-8")
     content = {name: entry for name, entry in content.items() if name.endswith("/simulator")}

@@ -233,7 +233,7 @@ class ControlLoop:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
         self.safety.unsent = self.bus.unsent
-        if late := self.bus.late_replies:
+        if (late := self.bus.late_replies) and self.safety.state in CARRYING:
             self.safety.trip(FaultCode.REPLIES_LATE, late, self._now())
         if self.bus.foreign_commands > self._foreign_commands:
             self._foreign_commands = self.bus.foreign_commands

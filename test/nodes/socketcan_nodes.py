@@ -38,7 +38,7 @@ TRIAL = {"name": "short", "steps": [{"move": [0.1, 0.8, 0.7, 0.6], "over": 0.5},
 CHANGES = {
     "can_bridge": {"rate": 50.0, "command_timeout": 0.1, "sign_check_torque": 0.0},
     "compensator": {"use_imu": False},
-    "simulator": {"imu": {"rate": 10.0}, "trunk": {"pitch": 0.0, "roll": 0.0}, "trial_delay": 0.6},
+    "simulator": {"imu": {"rate": 10.0}, "trunk": {"pitch": 0.0, "roll": 0.0}, "trial_delay": 3.0},
 }
 
 

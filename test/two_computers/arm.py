@@ -32,7 +32,7 @@ def write_parameters(folder: Path, hold: float, timing: Mapping[str, Parameters]
     """Write script and parameter file of an arm that the wearer brings to POSE and lets go for `hold` s."""
     script = folder / "hold.yaml"
     script.write_text(yaml.safe_dump({"name": "hold", "steps": [{"move": POSE, "over": MOVE}, {"hold": hold}]}))
-    nodes = LaunchedNodes(folder, timing=timing, truth=True, simulator={"trial": str(script), "trial_delay": 0.5})
+    nodes = LaunchedNodes(folder, timing=timing, truth=True, simulator={"trial": str(script), "trial_delay": 3.0})
     content = yaml.safe_load(nodes.path.read_text())
     for node, name in (("/robot/recorder", "robot"), ("/recorder", "desk")):
         content[node] = {"ros__parameters": {"output": str(folder / f"bag_{name}"), "live": name == "robot"}}
