@@ -8,7 +8,6 @@ import numpy as np
 
 from exo_gravity.core.safety.gate import START_GATE
 from exo_gravity.core.safety.guidance import GUIDANCE
-from exo_gravity.core.safety.guidance import GUIDANCE
 
 from .loop import QUIET, QUIET_OTHERS, THREAD_PRIORITY, LoopRun, run_loop
 from .table import Row
