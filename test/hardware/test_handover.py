@@ -72,13 +72,13 @@ def test_an_arm_that_is_reached_again_late_is_let_down(is_adapter):
 
     if is_adapter:
         rig.clock.later(0.1, lose)
-        rig.clock.later(11.0, lambda: setattr(rig.wire, "refusal", None))
+        rig.clock.later(14.0, lambda: setattr(rig.wire, "refusal", None))
     else:
         rig.device.cut_off = (False, True, False, False)
-        rig.clock.later(11.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
+        rig.clock.later(14.0, lambda: setattr(rig.device, "cut_off", (False,) * 4))
     assert rig.let_down(log=log.append)
     assert log == ["a motor does not reply; it may still be powered; trying again"]
-    assert rig.clock.monotonic() > start + 11.0
+    assert rig.clock.monotonic() > start + 14.0
     rig.assert_let_down()
 
 

@@ -80,7 +80,7 @@ def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
     arm = CarriedArm(wire_format=wire_format)
     arm.rig.device.bus_silent = True
-    arm.run(14.0)
+    arm.run(16.0)
     assert arm.safety.state is State.FAULT and arm.safety.is_unreached
     assert arm.rig.motors_on == [True] * 4
     arm.rig.device.bus_silent = False

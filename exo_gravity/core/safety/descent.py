@@ -18,9 +18,9 @@ alone holds: an arm of 3.7 Nm then sinks at 0.74 rad/s. V halves whenever the jo
 arm comes to rest, and recovers slowly. A joint is down when s is zero and k holds nothing: it hangs, or lies on
 something.
 
-A motor that does not reply is taken to obey: k rises, and s fades slowly and blindly. If it was cut off it applies its
-last torque instead, and drops that when it hears its commands again, under full damping. When it replies and has
-received these, s and k go on; else s continues from the torque that it reports.
+A motor that does not reply is taken to obey: k rises, and s stays for `blind_hold`, then fades slowly and blindly. If
+it was cut off it applies its last torque instead, and drops what has faded when it hears its commands again, under full
+damping. When it replies and has received these, s and k go on; else s continues from the torque that it reports.
 """
 
 import math
@@ -59,7 +59,8 @@ class Descent:
     free_damping: float = 0.2
     rest_time: float = 2.0  #: s at rest with nothing holding the arm, until it is down
     longest_rest: float = 7.5  #: s with nothing holding the arm, after which it is down even if the wearer moves it
-    longest_silence: float = 9.0  #: s for which a silent motor is waited for: until it has faded
+    longest_silence: float = 12.0  #: s for which a silent motor is waited for: until it has faded
+    blind_hold: float = 3.0  #: s for which a silent joint's torque stays: a bus that is back by then finds no step
     blind_fade_time: float = 8.0  #: s from full torque to none of a silent joint, as slowly as a horizontal arm sinks
 
 
@@ -75,6 +76,7 @@ class JointDescent:
 
     def __init__(self, effort: float, damping: float, max_effort: float) -> None:
         self._carried, self._most = 0.0, max_effort
+        self._blind = 0.0  # s without a reading
         self._speed, self._direction = DESCENT.speed, 0.0
         self.restart(effort, damping)
 
@@ -92,13 +94,16 @@ class JointDescent:
         self._is_rising = True  # the damping has not yet reached DAMPING
 
     def step_blind(self, dt: float) -> None:
-        """Advance by `dt` s without a reading: damping rises and stays, torque fades slowly."""
-        self._approach(0.0, max(DESCENT.min_fade_rate, abs(self._carried)) / DESCENT.blind_fade_time, dt)
+        """Advance by `dt` s without a reading: damping rises and stays, torque stays for a while, then fades slowly."""
+        self._blind += dt
+        if self._blind > DESCENT.blind_hold:
+            self._approach(0.0, max(DESCENT.min_fade_rate, abs(self._carried)) / DESCENT.blind_fade_time, dt)
         self.damping = min(DAMPING, self.damping + DAMPING / DESCENT.damping_rise * dt)
         self._is_rising = True
 
     def step(self, dt: float, velocity: float) -> None:
         """Advance by `dt` s with the joint's `velocity` in rad/s; NaN is taken as 0."""
+        self._blind = 0.0
         if not math.isfinite(velocity):
             velocity = 0.0
         self._speed += (DESCENT.speed - self._speed) * dt / DESCENT.speed_recovery
