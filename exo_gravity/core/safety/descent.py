@@ -186,8 +186,8 @@ class ArmDescent:
             self._held = now
 
     def rejoin(self, i: int) -> None:
-        """Continue joint `i` without torque and damping: its motor was found off, and is switched on again."""
-        self._joints[i].restart(0.0)
+        """Continue joint `i` without torque, under full damping: its motor was found off, and is switched on again."""
+        self._joints[i].restart(0.0, DAMPING)
 
     def is_down(self, now: float, rest_since: float) -> bool:
         """Return whether the arm is down at `now` (s), as far as its motors reply; at rest since `rest_since` (s)."""
