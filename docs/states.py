@@ -71,7 +71,7 @@ def draw_arrow(axes: Axes, arrow: Arrow, events: list[str], has_opposite: bool) 
             begin, end, connectionstyle=f"arc3,rad={bend}", arrowstyle="-|>", mutation_scale=13, color="0.3", lw=1.1
         )
     )
-    # The middle of a quadratic curve whose control point stands beside the middle of the chord.
+    # The middle of a quadratic curve whose control point is offset from the middle of the chord.
     middle = (begin[0] + end[0]) / 2.0, (begin[1] + end[1]) / 2.0
     across = end[1] - begin[1], begin[0] - end[0]
     at = middle[0] + 0.5 * bend * across[0], middle[1] + 0.5 * bend * across[1]

@@ -73,8 +73,8 @@ class Power(Barrier):
 class Tank(Barrier):
     """Work: a tank for each joint, which feed-forward fills, and which loses 0.5 W per Nm of it.
 
-    Work beyond the carried load's potential energy cannot be told apart: the feed-forward is that energy's derivative,
-    whether the load is still there or gone.
+    It cannot tell a lift from a throw: the feed-forward is the derivative of the load's potential energy, whether the
+    load is still there or gone.
     """
 
     levels: Sequence[float] = NO_TORQUE  # J

@@ -1,1 +1,1 @@
-"""A search for ways to throw an arm that nobody listed: random pairs of events in virtual time, judged by the truth."""
+"""Search for unlisted events that throw an arm: random pairs in virtual time, judged by the arm's true motion."""

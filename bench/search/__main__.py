@@ -1,4 +1,4 @@
-"""python -m bench.search [--minutes 60] [--seed S]: search for ways to throw an arm that nobody listed.
+"""python -m bench.search [--minutes 60] [--seed S]: search for unlisted events that throw an arm.
 
 Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what
 is permitted, or beyond. build/search.jsonl keeps every case by its seed: the next run goes on where this one ended.

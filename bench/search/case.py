@@ -61,7 +61,7 @@ class Bound(NamedTuple):
     energy: float = 0.3
 
 
-# Causes that nobody can see at once have bounds of their own: docs/safety.md has the reason for each.
+# Faults that cannot be detected at once have bounds of their own; docs/safety.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
 REVERSED = Bound(3.2, 0.1)
 
