@@ -13,6 +13,11 @@ JOINT_COUNT = 4
 COVER = 1.96  # standard deviations of a 95 % band
 
 
+def limited(wanted: float, last: float, step: float) -> float:
+    """Return `wanted` within `step` of `last`."""
+    return max(last - step, min(last + step, wanted))
+
+
 def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:
     """Return `values` as a read-only array (4,), or raise ParameterError unless they are 4 numbers in [low, high]."""
     return floats(name, values, JOINT_COUNT, low, high, unit)

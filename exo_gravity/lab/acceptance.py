@@ -22,6 +22,7 @@ from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.motors.boards import CHECK
 from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES, JointMotor, JointSample
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -95,7 +96,7 @@ class Lift:
         """Answer the newest sample of each joint, unless a motor is silent."""
         if any(self._limits.is_silent(now, sample) for sample in samples):
             return
-        self.asked += max(-self._step, min(self._step, self.goal - self.asked))
+        self.asked = limited(self.goal, self.asked, self._step)
         effort = (*(0.0 for _ in samples[:-1]), self.asked)
         self._newest = Efforts(effort, min(sample.time for sample in samples), damped=True, held=False)
 

@@ -17,11 +17,12 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import Torque, exact_torque
 from exo_gravity.core.arm.kinematics import turning_torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
-from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange, limited
+from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
 from exo_gravity.core.compensation.weighing import Weighing
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again

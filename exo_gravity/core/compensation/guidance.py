@@ -145,11 +145,6 @@ def _longest(now: float, new: float, ways: Iterable[tuple[Load, float, float]]) 
     return max(found, key=lambda each: each[0])[1:]
 
 
-def limited(wanted: float, last: float, step: float) -> float:
-    """Return `wanted` within `step` of `last`."""
-    return max(last - step, min(last + step, wanted))
-
-
 class CommandFade:
     """Effort commands for an effort controller of ros2_control, which keeps its last command for ever.
 

@@ -17,7 +17,7 @@ class BoardCheck:
     """When a board counts as set up otherwise than its parameters say."""
 
     silence: float = 1.2  #: s without a status frame; a V3 board sends one at least each second
-    recent: float = 1.0  #: s for which a frame that was no reply explains why there is none
+    recent: float = 1.0  #: s for which a malformed frame counts as the reason for a missing reply
     window: float = 0.5  #: s over which status frames are counted, so that a start knows before its calm second is over
     share: float = 0.9  #: of the control rate that status frames must reach: the rest is jitter of that count
     restart: float = 2.0  #: s without a reply after which a motor may have been switched off and on
@@ -105,9 +105,9 @@ class Boards:
         for can_id, degrees in odd:
             if degrees < CHECK.coldest or len(odd) == 1 < len(known):
                 others = sorted(other for own, other in known if own != can_id)
-                beside = f", the others {others[0]} to {others[-1]}" if others else ""
+                rest = f", the others {others[0]} to {others[-1]}" if others else ""
                 return (
-                    f"motor {can_id} read {degrees} degC when it was switched on{beside}: a cold motor must read room "
+                    f"motor {can_id} read {degrees} degC when it was switched on{rest}: a cold motor must read room "
                     "temperature; its firmware may send it with another offset than 40, and would overheat unseen"
                 )
         return ""

@@ -70,6 +70,7 @@ class JointMotor:
     #: rated torque is commanded; and for seconds
     rated_effort: float = field(init=False)
     peak_effort: float = field(init=False)
+    idle: Frame = field(init=False)  #: a command without torque and gains
     peak_damping: float = field(init=False)  #: Nm s/rad at the joint, the most that a command can ask for
 
     def __post_init__(self) -> None:
@@ -98,6 +99,7 @@ class JointMotor:
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
+        object.__setattr__(self, "idle", (self.command_id, self.command(0.0, 0.0)))
 
     def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.

@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_COMMAND, MAX_EFFORT_RATE, WALL, Limits
 
@@ -85,7 +86,7 @@ class Barrier:
 
         Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
         """
-        step, step_of_damping = MAX_EFFORT_RATE * dt, DAMPING / DESCENT.damping_rise * dt
+        step, step_of_damping = MAX_EFFORT_RATE * dt, DESCENT.damping_rate * dt
         shaped, dampings, acted = [], [], set()
         for i, (name, joint) in enumerate(zip(self._limits.joint_names, joints, strict=True)):
             if not abs(effort[i]) <= MAX_COMMAND:
@@ -94,13 +95,12 @@ class Barrier:
             permitted = self._permitted(i, joint)
             wanted = share[i] * (effort[i] + spring)
             clamped = max(-permitted, min(permitted, wanted))
-            limited = max(before[i] - step, min(before[i] + step, clamped))
+            given = limited(clamped, before[i], step)
             # The compensator may have clamped it already: all that is permitted counts as clamped.
-            missing = limited if abs(limited) >= permitted else wanted - limited
+            missing = given if abs(given) >= permitted else wanted - given
             asked = DAMPING if missing * joint.velocity < 0.0 else damping[i]
-            last = self._asked[i]
-            self._asked[i] = max(last - step_of_damping, min(last + step_of_damping, asked))
-            shaped.append(limited)
+            self._asked[i] = limited(asked, self._asked[i], step_of_damping)
+            shaped.append(given)
             # A wall's damping rises at once, since it already rises with the position.
             dampings.append(max(wall, self._asked[i]))
             if wall:
@@ -109,7 +109,7 @@ class Barrier:
                 acted.add(f"derating ({name})")
             if clamped != wanted:
                 acted.add(f"max_effort ({name})")
-            if limited != clamped:
+            if given != clamped:
                 acted.add(f"max_effort_rate ({name})")
         return Shaped(tuple(shaped), tuple(dampings), frozenset(acted))
 

@@ -28,6 +28,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.delivery import DELIVERY
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
@@ -62,6 +63,11 @@ class Descent:
     longest_silence: float = 12.0  #: s for which a silent motor is waited for: until it has faded
     blind_hold: float = 3.0  #: s for which a silent joint's torque stays: a bus that is back by then finds no step
     blind_fade_time: float = 8.0  #: s from full torque to none of a silent joint, as slowly as a horizontal arm sinks
+
+    @property
+    def damping_rate(self) -> float:
+        """Nm s/rad a second, by which damping rises."""
+        return DAMPING / self.damping_rise
 
 
 DESCENT = Descent()
@@ -98,7 +104,7 @@ class JointDescent:
         self._blind += dt
         if self._blind > DESCENT.blind_hold:
             self._approach(0.0, max(DESCENT.min_fade_rate, abs(self._carried)) / DESCENT.blind_fade_time, dt)
-        self.damping = min(DAMPING, self.damping + DAMPING / DESCENT.damping_rise * dt)
+        self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * dt)
         self._is_rising = True
 
     def step(self, dt: float, velocity: float) -> None:
@@ -128,15 +134,14 @@ class JointDescent:
 
     def _approach(self, effort: float, rate: float, dt: float) -> None:
         """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
-        most = min(MAX_EFFORT_RATE, rate) * dt
-        self.effort += max(-most, min(most, effort - self.effort))
+        self.effort = limited(effort, self.effort, min(MAX_EFFORT_RATE, rate) * dt)
 
     def _step_damping(self, dt: float, excess: float) -> None:
         if self._is_rising:
-            self.damping = min(DAMPING, self.damping + DAMPING / DESCENT.damping_rise * dt)
+            self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * dt)
             self._is_rising = self.damping < DAMPING
         elif excess:
-            rise = DAMPING / DESCENT.damping_rise * min(1.0, excess / self._speed)
+            rise = DESCENT.damping_rate * min(1.0, excess / self._speed)
             self.damping = min(DAMPING, self.damping + rise * dt)
         elif self.effort == 0.0:
             self.damping *= math.exp(-dt / DESCENT.damping_fade)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, limited
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 
@@ -148,7 +148,7 @@ class PoseQuestion:
         return True
 
     def missing(self, now: float, joints: Sequence[JointSample], others: str) -> str:
-        """Return what the start lacks at `now` s, '' for nothing; others: what it lacks beside the answer."""
+        """Return what the start lacks at `now` s, '' for nothing; others: what it lacks apart from the answer."""
         pose = tuple(joint.position for joint in joints)
         pairs = zip(pose, self._confirmed, strict=True) if self._confirmed else ()
         if now > self._until or any(not abs(angle - then) <= HANGING_ARM.moved for angle, then in pairs):
@@ -220,7 +220,7 @@ class SwitchOnCheck:
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque
             step = MAX_EFFORT_RATE * dt
-            self.effort[i] += max(-step, min(step, target - self.effort[i]))
+            self.effort[i] = limited(target, self.effort[i], step)
         self.done = all(self._is_on) and not any(self.effort)
         return None
 
@@ -312,8 +312,7 @@ class SignCheck:
 
     def _approach(self, i: int, effort: float, rate: float) -> None:
         """Bring the push on joint `i` nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
-        step = rate * self._dt
-        self.effort[i] += max(-step, min(step, effort - self.effort[i]))
+        self.effort[i] = limited(effort, self.effort[i], rate * self._dt)
 
     def _fault(self, i: int, reason: str, code: FaultCode = FaultCode.SIGN_UNPROVEN) -> Fault:
         return Fault(code, f"{self._names[i]}: {reason}")

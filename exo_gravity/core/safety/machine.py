@@ -209,7 +209,7 @@ class SafetyMachine:
         readings.step(self._now, joints, self._sent.powered)
         self._rest.step(self._now, readings.joints, readings.silent)
         for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
-            power.step(self._now, self._dt, joint, is_silent)
+            power.step(self._dt, joint, is_silent)
         if self._left and any(power.state is Power.ON for power in self.power):
             # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
             for power, held in zip(self.power, self._left, strict=True):
@@ -218,7 +218,7 @@ class SafetyMachine:
 
     def _watch_stalls(self) -> None:
         """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
-        self._guard = max(0.0, self._guard - DAMPING / DESCENT.damping_rise * self._dt)
+        self._guard = max(0.0, self._guard - DESCENT.damping_rate * self._dt)
         if self.state not in CARRIED:
             self._stall.reset()
             return
@@ -328,7 +328,7 @@ class SafetyMachine:
             self._delivery.reset()
         boards = zip(again, self._replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
-        rise = DAMPING / DESCENT.damping_rise * self._dt
+        rise = DESCENT.damping_rate * self._dt
         drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
         return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
 
@@ -360,7 +360,7 @@ class SafetyMachine:
             self._on(StateEvent.DOWN_AFTER_FAULT if self.fault else StateEvent.DOWN)
             return self._stand()
         delivered = self._delivery.step(self._dt, joints, self._sent.effort, self._sent.damping) is None
-        send = self._lowering_sends()
+        send = self._sends()
         for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
             asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
             is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
@@ -382,9 +382,9 @@ class SafetyMachine:
             self._on(StateEvent.FOUND_ON)
             return self._descend()
         if self._all_off:
-            return OFF._replace(send=tuple(self._lowering_sends()))
+            return OFF._replace(send=tuple(self._sends()))
         self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
-        return self._powered(*self._descent.applied, self._lowering_sends())
+        return self._powered(*self._descent.applied, self._sends())
 
     def _switch_quiet_off(self) -> None:
         """Switch motors off that may be on, but reply without torque."""
@@ -396,7 +396,7 @@ class SafetyMachine:
     def _is_switched_off(self) -> bool:
         return all(power.state in (Power.OFF, Power.LEAVING) for power in self.power)
 
-    def _lowering_sends(self) -> list[Send]:
+    def _sends(self) -> list[Send]:
         return [power.send(self._now) for power in self.power]
 
     @property

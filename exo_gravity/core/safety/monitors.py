@@ -1,4 +1,4 @@
-"""What the safety machine watches beside the motors' readings: the arm's rest, and the age of the efforts."""
+"""What the safety machine watches besides the motors' readings: whether the arm is at rest, and how old efforts are."""
 
 import math
 from collections.abc import Sequence

@@ -32,8 +32,8 @@ class PowerTuning:
     torque: float = 0.2  #: Nm, smoothed, from which on it is on; less cannot throw an arm when it is switched off
     smoothing: float = 0.05  #: s, time constant
     read_time: float = 0.2  #: s without torque that show a motor off; an arm that sinks under damping shows it sooner
-    #: s of silence after which its power may have been cut on purpose: whoever presses an emergency stop releases it
-    #: later. A supply that dips is back sooner.
+    #: s of silence after which an operator may have cut its power: nobody releases an emergency stop sooner. A supply
+    #: that dips is back by then.
     cut: float = 0.2
     off_share: float = 0.25  #: of the torque asked for, less of which a motor gives that does not deliver: it is off
     exit_period: float = 0.5  #: s between two EXIT frames to a motor that is off, in case it was switched on unseen
@@ -70,7 +70,6 @@ class PowerChange(str, Enum):
 
 NEXT: dict[tuple[Power, PowerChange], Power] = {
     (Power.OFF, PowerChange.SWITCH_ON): Power.ENTERING,
-    (Power.OFF, PowerChange.SWITCH_OFF): Power.OFF,
     (Power.ENTERING, PowerChange.SHOWN_ON): Power.ON,
     (Power.ON, PowerChange.SILENT): Power.SILENT,
     (Power.SILENT, PowerChange.REPLIES): Power.ON,
@@ -139,7 +138,7 @@ class MotorPower:
         elif self.state is Power.LEAVING:
             self._exits = []
 
-    def step(self, now: float, dt: float, joint: JointSample, is_silent: bool) -> None:
+    def step(self, dt: float, joint: JointSample, is_silent: bool) -> None:
         """Take the newest reply, `dt` s after the last call."""
         if is_silent:
             self._silent_for += dt

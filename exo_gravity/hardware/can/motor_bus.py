@@ -221,48 +221,44 @@ class MotorBus:
     def _frames(self, joint: int, now: float) -> tuple[Frame, ...]:
         """Return what a motor is sent in the present drive."""
         send, motor = self._drive.send[joint], self._motors[joint]
-        idle = (motor.command_id, motor.command(0.0, 0.0))
         if send is Send.COMMAND:
             return (self._command(joint, now),)
         if send is Send.POLL:
-            return (idle,) if self.replies[joint] else ()
+            return (motor.idle,) if self.replies[joint] else ()
         if send is Send.EXIT:
             return motor.exit
         if send is Send.ENTER:
             return motor.enter
-        return (*motor.enter, idle) if send is Send.CLEAR else ()
+        return (*motor.enter, motor.idle) if send is Send.CLEAR else ()
 
-    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, frozenset[int]]:
-        """Return the kind of a frame, and the IDs of the motors that it concerns: only FOREIGN_COMMAND has several."""
+    def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
+        """Return the kind of a frame, and the ID of its motor: BROADCAST_ID for all V3 boards of a bus, 0 for none."""
         if message.is_error_frame:
-            return "error frame", frozenset()
+            return "error frame", 0
         if message.is_fd:
-            return "FD frame", frozenset()
+            return "FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
         for own, board, can_ids in self._ids:
             if own is not port:
                 continue
             kind, can_id = board.classify(frame_id, message.data, can_ids, message.is_remote_frame)
-            if kind == COMMAND and port.is_echo(message):
-                return "echo", frozenset()
             if kind == COMMAND:
-                return FOREIGN_COMMAND, can_ids if can_id == BROADCAST_ID else frozenset((can_id,))
+                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
             if kind != OTHER:
-                return kind, frozenset((can_id,))
-        return "foreign frame", frozenset()
+                return kind, can_id
+        return "foreign frame", 0
 
     def _take(self, port: CanPort, message: can.Message) -> None:
-        kind, can_ids = self._sort(port, message)
-        joints = [self._joint_of[can_id] for can_id in can_ids]
+        kind, can_id = self._sort(port, message)
         if kind != REPLY:
             self.ignored[kind] += 1
-            for joint in joints if kind == FOREIGN_COMMAND else ():
-                self._oppose(joint, bytes(message.data))
-            for joint in joints if kind in (MALFORMED, SERVO) else ():
-                self.boards.heard(joint, kind, bytes(message.data), self._now())
+            if kind == FOREIGN_COMMAND:
+                for joint in self._commanded(port, can_id):
+                    self._oppose(joint, bytes(message.data))
+            elif kind in (MALFORMED, SERVO):
+                self.boards.heard(self._joint_of[can_id], kind, bytes(message.data), self._now())
             return
-        (joint,) = joints
-        now = self._now()
+        joint, now = self._joint_of[can_id], self._now()
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
@@ -272,6 +268,12 @@ class MotorBus:
         else:
             self._held[joint] = sample.position
         self.samples[joint] = sample
+
+    def _commanded(self, port: CanPort, can_id: int) -> list[int]:
+        """Return the joints of the motors that obey a command to this ID."""
+        if can_id != BROADCAST_ID:
+            return [self._joint_of[can_id]]
+        return [joint for joint, own in enumerate(self._ports) if own is port and not self.replies[joint]]
 
     def _follow(self, joint: int, sample: JointSample) -> None:
         """Let the held position of a contested joint follow it slowly, or at once if its motor does not hold it."""

@@ -22,11 +22,10 @@ from dataclasses import dataclass, replace
 from exo_gravity.core.errors import FrameError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.motors.specs import MotorCommand, MotorReply, unpack_fields
-from exo_gravity.core.motors.wire_formats import EXTENDED, MASTER_ID, Frame, V3Format
+from exo_gravity.core.motors.wire_formats import BROADCAST_ID, EXTENDED, MASTER_ID, Frame, V3Format
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.motors.firmware import (
     BOOT_LOADER,
-    BROADCAST_ID,
     CLEAR_FAULTS,
     ENCODER_ERROR,
     SHUT_OFF,

@@ -26,7 +26,6 @@ BOOT_LOADER, CLEAR_FAULTS, QUERY = 0xFB, 0xF0, 0xEE  # last bytes of special fra
 WARM, SHUT_OFF = 2, 4  # bits of its error byte, which reads 2 and then 6
 WARM_ABOVE, SHUT_OFF_AT = 81.0, 120.0  # degC at which it sets them
 ENCODER_ERROR = 5  # MOTOR_ERRORS
-BROADCAST_ID = 0xFF
 REPLY_DELAY = (200e-6, 400e-6)  # s, as measured on AK motors
 _NO_CONSTANTS: Mapping[str, float] = MappingProxyType({})
 
