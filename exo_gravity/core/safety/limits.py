@@ -102,8 +102,8 @@ class Limits:
     reply_timeout: float = READING.reply_timeout
     start_pose: str = owned(
         "confirm",
-        "who vouches that the arm hangs as its angles say, before a start from unknown zeros: confirm: the operator, by "
-        "the service `~/confirm_pose`, the page or the launcher; hanging: the person who starts the nodes",
+        "who vouches that the arm hangs as its angles say, before a start from unknown zeros: confirm: the operator, "
+        "by the service `~/confirm_pose`, the page or the launcher; hanging: the person who starts the nodes",
         choices=START_POSES,
     )
     enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
