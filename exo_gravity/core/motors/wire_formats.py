@@ -49,6 +49,7 @@ _STATUS = struct.Struct(">hhhbB")
 
 Frame = tuple[int, bytes]  # arbitration ID and data
 OPEN_DRIVE_BITS = 0x7F  # of an ID that the open drive compares
+OPEN_DRIVE_LENGTH = 7  # bytes of its reply, which no other board is known to send
 # What a frame is. MALFORMED is a reply of a wrong length; SERVO the status frame of a motor that does not speak `mit`:
 # a V1 or V2 board in servo mode, or a V3 board.
 REPLY, COMMAND, MALFORMED, SERVO, OTHER = "reply", "command", "malformed reply", "servo mode", "other"

@@ -30,6 +30,7 @@ from exo_gravity.core.motors.wire_formats import (
     COMMAND,
     EXTENDED,
     MALFORMED,
+    OPEN_DRIVE_LENGTH,
     OTHER,
     REPLY,
     SERVO,
@@ -93,6 +94,7 @@ class MotorBus:
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+        self._open_drives: set[int] = set()  # IDs of motors whose board obeys other IDs, too: it compares 7 bits
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
         self._drive = OFF  # last sent
@@ -243,7 +245,10 @@ class MotorBus:
                 continue
             kind, can_id = board.classify(frame_id, message.data, can_ids, message.is_remote_frame)
             if kind == COMMAND:
-                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
+                if port.is_echo(message):
+                    return "echo", 0
+                is_obeyed = message.is_extended_id or frame_id == can_id or can_id in self._open_drives
+                return (FOREIGN_COMMAND, can_id) if is_obeyed else ("foreign frame", 0)
             if kind != OTHER:
                 return kind, can_id
         return "foreign frame", 0
@@ -258,6 +263,8 @@ class MotorBus:
             elif kind in (MALFORMED, SERVO):
                 self.boards.heard(self._joint_of[can_id], kind, bytes(message.data), self._now())
             return
+        if len(message.data) == OPEN_DRIVE_LENGTH:
+            self._open_drives.add(can_id)
         joint, now = self._joint_of[can_id], self._now()
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
