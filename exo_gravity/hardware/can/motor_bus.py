@@ -51,7 +51,8 @@ CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correctin
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
-HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
+HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint,
+HOLD_STEP = 0.01  # s for which it does so at once, at most: after a stall of the loop the torque must not step
 FOREIGN_COMMAND = "foreign command"
 AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
@@ -287,7 +288,8 @@ class MotorBus:
         position = sample.position
         if self._hold(joint, sample.time):
             away = position - self._held[joint]
-            step = max(HOLD_SPEED * (sample.time - self.samples[joint].time), abs(away) - HOLD_REACH)
+            passed = min(HOLD_STEP, sample.time - self.samples[joint].time)
+            step = max(HOLD_SPEED * passed, abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 
