@@ -117,12 +117,12 @@ def commands_and_site() -> Iterator[str]:
 
 def safety_case() -> Iterator[str]:
     """Yield each difference between the rows of the fault matrix and those that the safety case names, once each."""
-    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety.md"))
+    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
     cells = (line.split(" | ")[-1] for table in found for line in table.splitlines())
     named = Counter(name for cell in cells for name in re.findall(r"`([^`]+)`", cell))
     played = Counter(case.name for case in CASES)
-    yield from (f"docs/safety.md does not name the row {row}" for row in played - named)
-    yield from (f"docs/safety.md names the row {row}, which is not played or is named before" for row in named - played)
+    yield from (f"docs/safety_case.md does not name the row {row}" for row in played - named)
+    yield from (f"docs/safety_case.md names the row {row}, which is not played, or named twice" for row in named - played)
 
 
 def troubleshooting() -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Writes the tables of docs/parameters.md, simulator.md, motors.md, safety.md and topics.md from the declarations in the code.
+"""Writes the tables of the documents from the declarations in the code.
 
 `python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -->`. Needs the extra `sim`, not ROS.
@@ -48,7 +48,8 @@ PARAMETERS = {
     "calibrator": CALIBRATOR,
 }
 BASES = ("can_bridge", "compensator")
-REPEATING = ("simulator", "calibrator", "urdf_arm")  # their tables name what they share with one of BASES, and leave it out
+# Their tables name the parameters that they share with one of BASES, and leave them out.
+REPEATING = ("simulator", "calibrator", "urdf_arm")
 HEAD = ("parameter", "default", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
