@@ -21,6 +21,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
+import states  # noqa: E402
 import tables  # noqa: E402
 
 from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
@@ -89,7 +90,7 @@ def links_and_paths() -> Iterator[str]:
 
 
 def generated_tables() -> Iterator[str]:
-    """Yield each table that differs from the code, or has no place in a document."""
+    """Yield each generated table, and the picture of the states, that differs from the code or has no place."""
     places: set[str] = set()
     for path in DOCUMENTS:
         document = text_of(path)
@@ -98,6 +99,8 @@ def generated_tables() -> Iterator[str]:
             yield f"{path.relative_to(ROOT)}: table {table} differs from the code; run {tables.COMMAND}"
     if missing := {*tables.PARAMETERS, "faults", "firmwares", "topics"} - places:
         yield f"no document has a place for the tables {', '.join(sorted(missing))}"
+    if text_of(states.PICTURE) != states.drawing():
+        yield "docs/states.svg differs from the transitions; run python docs/states.py"
 
 
 def commands_and_site() -> Iterator[str]:
@@ -108,6 +111,8 @@ def commands_and_site() -> Iterator[str]:
     with_run = {path.name for path in DOCUMENTS if "ros2 run exo_gravity" in text_of(path)}
     if with_run != {"README.md", "installation.md"}:  # the example of a workspace, and the rule
         yield f"`ros2 run exo_gravity` belongs before no command, see docs/installation.md: {', '.join(with_run)}"
+    unpublished = {path.name for path in DOCUMENTS if re.search(r"pip install '?exo_gravity\b(?!-)", text_of(path))}
+    yield from (f"{name}: nothing on PyPI is ours: name a wheel, or a folder" for name in unpublished)
     trees_of_site = re.findall(r"```{toctree}\n(.*?)```", text_of("docs/index.md"), re.DOTALL)
     listed = {line for tree in trees_of_site for line in tree.splitlines()}
     for path in sorted((ROOT / "docs").glob("*.md")):
@@ -122,7 +127,7 @@ def safety_case() -> Iterator[str]:
     named = Counter(name for cell in cells for name in re.findall(r"`([^`]+)`", cell))
     played = Counter(case.name for case in CASES)
     yield from (f"docs/safety_case.md does not name the row {row}" for row in played - named)
-    yield from (f"docs/safety_case.md names the row {row}, which is not played, or named twice" for row in named - played)
+    yield from (f"docs/safety_case.md names {row}, which is not played, or named twice" for row in named - played)
 
 
 def troubleshooting() -> Iterator[str]:
