@@ -20,14 +20,21 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, JointMotor, JointSample, Traffic
+from exo_gravity.core.motors.joint_motor import (
+    REPLY_SHARE,
+    SIMULATED_BUSES,
+    JointMotor,
+    JointSample,
+    Traffic,
+    source_of_bus,
+)
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.gate import at_least, turns_back
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, Answer, BridgeWarning, Reason, Source, words
+from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Reason, words
 from exo_gravity.hardware.can.adapter import serial_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -254,7 +261,7 @@ class BridgeReport:
     ) -> None:
         self._diagnostics = Diagnostics(node)
         self._limits, self._names = arm.limits, arm.limits.joint_names
-        self._source = Source.SIMULATED if arm.address[0] in SIMULATED_BUSES else Source.UNKNOWN
+        self._source = source_of_bus(*arm.address[:2])
         self._lease, self._services = lease, services
         self._traffic = traffic
         self._rate = Rate()
@@ -317,7 +324,7 @@ class BridgeReport:
             "refused message text": refusal,
         }
         for name, joint, (power, rms, share) in zip(self._names, samples, loads, strict=True):
-            values[f"{name} temperature (degC)"] = joint.temperature
+            values[f"{name} temperature (degC)"] = UNKNOWN if joint.temperature is None else joint.temperature
             values[f"{name} torque (Nm)"] = row([joint.effort], 2)
             values[f"{name} power (W)"] = row([power], 1)
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)
