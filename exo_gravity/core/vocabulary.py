@@ -153,6 +153,17 @@ class CompensatorWarning(Word):
     CLAMPED = "clamped"
 
 
+class AssistProblem(Word):
+    """Why the efforts of the outer loop are not used, or not in full."""
+
+    OFF = "off"
+    NO_MESSAGES = "no_messages"
+    STOPPED = "stopped"
+    INVALID = "invalid"
+    SECOND_PUBLISHER = "second_publisher"
+    LATE = "late"
+
+
 class SupportRequested(Word):
     """What a compensator makes of requests for support."""
 

@@ -99,7 +99,8 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         }
     if terms:
         values["terms"] = words(*terms.active)
-        values["assist"], values["assist text"] = terms.assist.state, terms.assist.reason
+        why_not = terms.assist.reason
+        values |= {"assist": terms.assist.state, "assist reason": why_not.word, "assist text": why_not}
         values["inertia tank (J)"] = f"{terms.tank.level:.2f}"
     return values
 
