@@ -86,7 +86,7 @@ SEARCHES = {
     "removeprefix", "removesuffix", "match", "fullmatch", "search", "findall", "finditer", "splitlines", "lower",
 }  # fmt: skip
 IN_SCRIPT = re.compile(
-    r"""(\.message|\.text|\[[`'"][^`'"]* text[`'"]\]|\bmessage|\bsentence|\btext)\s*(\?\?\s*[^)]*\))?\s*\??
+    r"""(\.message|\[[`'"][^`'"]*\stext[`'"]\]|\bmessage|\bsentence)\s*(\?\?\s*[^)]*\))?\s*\??
     \.(match|matchAll|includes|startsWith|endsWith|search|split|indexOf|replace)\(""",
     re.VERBOSE,
 )
