@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Compensation
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
 from exo_gravity.core.motors.specs import MOTORS
@@ -105,12 +105,17 @@ def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
 
 @pytest.fixture
 def ask(node):
-    """A function that asks for a service of a bridge whose control thread is `loop`; it returns why not, or ''."""
+    """A function that asks for a service of a bridge whose control thread is `loop`; it returns why not, or ''.
 
-    def ask(service, loop, data=None, zero=0.0):
+    last: the keys `request` and `answer` after it.
+    """
+
+    def ask(service, loop, data=None, zero=0.0, hindrance=""):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        services = BridgeServices(node, lambda: loop, motors, lambda: "")
+        services = BridgeServices(node, lambda: loop, motors, lambda: hindrance)
+        assert services.last == ("none", "none")
         response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
+        ask.last = services.last
         if response.success:
             assert ("/diagnostics" in response.message) is (loop.safety.state is State.CHECKING)
             return ""
@@ -145,13 +150,35 @@ def standing():
 
 def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
     loop = standing()
-    assert ask("enable", loop, True) == ""
-    assert ask("enable", loop, True).startswith("refused")
+    assert ask("enable", loop, True) == "" and ask.last == ("enable", "done")
+    assert ask("enable", loop, True).startswith("refused") and ask.last == ("enable", "refused")
     loop.safety.trip(FaultCode.BUS_ERROR, "unplugged", 1.0)
     assert "unplugged" in ask("enable", loop, True)
     assert ask("enable", loop, False) == ask("clear_fault", loop) == ""
-    assert ask("clear_fault", loop).startswith("no fault to clear")
-    assert ask("enable", None, True) == "the node is not active"
+    assert ask("clear_fault", loop).startswith("no fault to clear") and ask.last == ("clear_fault", "refused")
+    assert ask("enable", None, True) == "the node is not active" and ask.last == ("enable", "inactive")
+
+
+def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monkeypatch):
+    loop = standing()
+    assert ask("enable", loop, True, hindrance="leaves") == "leaves" and ask.last == ("enable", "leaving")
+    assert ask("enable", loop, False, hindrance="leaves") == "" and ask.last == ("let_down", "done")
+    run, waiting = loop.call, Future()
+    loop.call = lambda function: waiting
+    monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.0)
+    assert "did not respond" in ask("enable", loop, True) and ask.last == ("enable", "no_response")
+    broken = Future()
+    broken.set_exception(BusError("unplugged"))
+    loop.call = lambda function: broken
+    assert ask("resume", loop) == "unplugged" and ask.last == ("resume", "bus_error")
+    overtaken = Future()
+    overtaken.cancel()
+    loop.call = lambda function: overtaken
+    assert "asked to be let down" in ask("confirm_pose", loop) and ask.last == ("confirm_pose", "overtaken")
+    loop.call = run
+    monkeypatch.setattr(operation, "age_of_request", lambda node: 1.5)
+    assert "1.5 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
+    assert ask("enable", loop, False) == ""
 
 
 def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
