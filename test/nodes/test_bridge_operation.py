@@ -30,6 +30,7 @@ from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 from ..hardware.rig import CarriedArm
+from ..support.keys import broken
 from ..support.waiting import wait_until
 
 NAMES = ("a", "b", "c", "elbow")
@@ -101,6 +102,46 @@ def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
     assert reports[15][:2] == (WARN, "active, riding through: efforts 70 ms old")
     assert reports[15][2]["rides"] == 1
     assert reports[-1][:2] == (OK, "active")
+
+
+def keys_of(report):
+    """Return what programs read of a report, which must keep to docs/keys.md."""
+    values = {"interface": "1", **{key: str(value) for key, value in report[2].items()}}
+    assert not broken("right/can_bridge", values)
+    return values
+
+
+def test_what_a_start_waits_for_and_why_it_ended_have_words_and_figures(sent):
+    limits, loop = Limits(NAMES), carrying(0.0)
+    hanging = JointSample(0.0, 0.0, 0.0, None, 0, math.inf)
+    loop.samples = [hanging] * 3 + [hanging._replace(position=limits.position_max[3] + math.radians(2.0))]
+    loop.safety = safety = SafetyMachine(limits, 0.004)
+    safety.enable(0.0)
+    safety.step(0.0, loop.samples, NO_EFFORTS)
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["motors"], values["waiting for"]) == ("checking", "off", "joint_limits")
+    assert (values["joints outside limits"], float(values["turn back (deg)"])) == (
+        "elbow",
+        pytest.approx(-2.0, abs=0.11),
+    )
+    assert values["refusal"] == "none" and values["elbow temperature (degC)"] == "unknown"
+    safety.step(30.0, loop.samples, NO_EFFORTS)
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["waiting for"], values["refusal"]) == ("disabled", "none", "joint_limits")
+    loop.samples = [hanging] * 4
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["joints outside limits"], values["turn back (deg)"]) == ("none", "none")
+
+
+def test_an_inactive_bridge_has_its_state_and_who_controls_it(sent):
+    values = keys_of(sent(lambda _: None, 1)[-1])
+    assert (values["state"], values["source"], values["control held by"]) == ("inactive", "simulated", "nobody")
+
+
+def test_every_key_of_a_carried_arm_is_documented(sent):
+    values = keys_of(sent(lambda n: carrying(6.0, 20 * n, temperature=-15), 1200)[-1])
+    assert values["warnings"] == "above_rated_torque, odd_temperature, slow_loop"
+    assert values["joints above rated torque"] == "elbow" and values["fault"] == "none"
 
 
 @pytest.fixture
