@@ -58,9 +58,10 @@ def is_guided(params: Path) -> bool:
 
 
 def check_bridges(params: Path) -> None:
-    """Raise ParameterError if no node of the parameter file carries an arm: a trial would wait for it in vain."""
-    if not stages(load(params))[0]:
-        expected = "a file with a can_bridge, which carries the arm: a trial begins once it is active"
+    """Raise ParameterError unless the parameter file has a can_bridge: a trial follows the arm that it carries."""
+    nodes = load(params)
+    if not stages(nodes)[0]:
+        expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
         raise ParameterError("params", str(params), expected)
 
 
