@@ -22,9 +22,21 @@ from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
+from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
-from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
+from exo_gravity.lab.bag.content import (
+    BRIDGE,
+    COMMANDS,
+    JOINT_STATE,
+    STATES,
+    STEPS,
+    Bag,
+    Event,
+    NodeStatus,
+    arm_of,
+    leaf,
+)
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.storage import Storage, StoredRows
@@ -169,7 +181,7 @@ class _Contents:
         self.parameters: dict[str, str] = {}
         self.losses = ""
         self.session = Session()
-        self.events: list[tuple[Any, ...]] = []  # row, text and setting of faults and changed parameters
+        self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
         self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
@@ -304,15 +316,16 @@ class _Contents:
             self.parameters[node.strip()] = f"{node}:{text}"
 
     def _add_status(self, row: Row, status: Any) -> None:
-        level = int(status.level)
-        last = self._last.get(status.name, (0, ""))
+        level, values = int(status.level), {entry.key: entry.value for entry in status.values}
+        fault = values.get("fault", NONE), values.get("fault text", "")
+        last, found = self._last.get(status.name, (0, "")), NodeStatus(status.name, level, status.message, *fault)
         if level > 0 and (level, status.message) != last:
-            self.events.append((row, f"{status.name}: {status.message}"))
+            self.events.append((row, f"{status.name}: {status.message}", None, found))
         elif level == 0 and last[0] > 0:
-            self.events.append((row, f"{status.name}: OK, {status.message}"))
+            self.events.append((row, f"{status.name}: OK, {status.message}", None, found))
         self._last[status.name] = (level, status.message)
         for entry in status.values:
-            if entry.key == "state" and entry.value:
+            if entry.key == "state" and entry.value and leaf(status.name) == BRIDGE:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:

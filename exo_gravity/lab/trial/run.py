@@ -23,9 +23,10 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import Launcher, Stopping
-from exo_gravity.lab.trial.screen import LEAD, TrialScreen
+from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import TrialScript
 
@@ -55,6 +56,14 @@ Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in 
 def is_guided(params: Path) -> bool:
     """Return whether a person performs the script, because the parameter file has no simulator."""
     return not any(node.endswith("/simulator") for node in load(params))
+
+
+def check_bridges(params: Path) -> None:
+    """Raise ParameterError unless the parameter file has a can_bridge: a trial follows the arm that it carries."""
+    nodes = load(params)
+    if not stages(nodes)[0]:
+        expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
+        raise ParameterError("params", str(params), expected)
 
 
 @dataclass(frozen=True)
@@ -165,7 +174,9 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
             return f"the recorder ended with exit code {code} before the trial was done"
         if screen.silence > RECORDER_TIMEOUT:
             return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
-        if message := fault_of(screen.status)[1]:
+        if screen.has_no_bridge:
+            return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
+        if message := fault_of(screen.status)[1] or ("" if screen.guided else refusal_of(screen.status)):
             return message
         if screen.done:
             stopped.wait(GRACE)
@@ -185,9 +196,15 @@ def is_falling(status: Status) -> bool:
 def fault_of(status: Status) -> tuple[str, str]:
     """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
     for name, values in status.items():
-        if values.get("fault", "none") != "none":
+        if values.get("fault", NONE) != NONE:
             return str(values["fault"]), f"{name}: {values['message']}"
     return "", ""
+
+
+def refusal_of(status: Status) -> str:
+    """Return the message of a bridge whose start has ended without a fault, or '': only a person starts it again."""
+    ended = (name for name, values in status.items() if values.get("refusal", NONE) != NONE)
+    return next((f"{name}: {status[name]['message']}" for name in ended), "")
 
 
 def too_busy(status: Status) -> str:

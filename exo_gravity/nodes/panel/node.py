@@ -28,6 +28,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
@@ -247,7 +248,8 @@ class Panel(Node):
     def _note(self, text: str) -> None:
         """Write `text` to the log, and to /diagnostics, which recordings hold."""
         self._noted += 1
-        self._diagnostics.report(OK, f"action {self._noted}: {text}")
+        values = {"state": NodeState.RUNNING, "actions": self._noted, "action text": text}
+        self._diagnostics.report(OK, f"action {self._noted}: {text}", values)
 
     def _send_state(self) -> None:
         if not self._server.is_running:
