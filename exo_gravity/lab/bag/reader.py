@@ -28,6 +28,7 @@ from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Ba
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.storage import Storage, StoredRows
+from exo_gravity.lab.source import Source
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
 
@@ -53,6 +54,7 @@ class Plausible:
 
 
 PLAUSIBLE = Plausible()
+KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
@@ -95,6 +97,7 @@ def read_bag(path: str | Path) -> Bag:
     return Bag(
         Path(path), start, recordings, events, contents.parameters, tuple(contents.notes), tuple(contents.problems),
         contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
+        contents.sources,
     )  # fmt: skip
 
 
@@ -171,6 +174,7 @@ class _Contents:
         self.session = Session()
         self.events: list[tuple[Any, ...]] = []  # row, text and setting of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
+        self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
         self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
         self.notes: list[str] = []
@@ -314,6 +318,10 @@ class _Contents:
         for entry in status.values:
             if entry.key == "state" and entry.value:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
+            elif entry.key == "source" and entry.value in KNOWN:
+                self.sources.setdefault(arm_of(status.name), Source(entry.value))
+        if leaf(status.name) == "simulator":
+            self.sources[arm_of(status.name)] = Source.SIMULATED
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""

@@ -14,6 +14,8 @@ from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event
 from exo_gravity.lab.bag.layout import TYPES
 from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
+from exo_gravity.lab.inputs.parameter_file import node_of
+from exo_gravity.lab.source import Source
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
 
@@ -36,10 +38,13 @@ def write_recordings(
         *((content.PARAMETERS, 0.0, STRING, (text,)) for text in parameters.values()),
         (content.SESSION, 0.0, STRING, (json.dumps(asdict(session)),)),
         *(_status(now, 1, *text.split(": ", 1)) for now, text, _ in events),
+        *(_status(0.0, 0, node_of(arm.name, "simulator").lstrip("/"), "in virtual time") for arm in arms),
         *(message for arm in arms for message in _of_arm(arm)),
     ]
     messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
+    for arm in arms:
+        writer.describe(content.source_key(arm.name), Source.SIMULATED.value)
     for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
         writer.add_topic(topic, kind, offered_qos(True, topic in (content.PARAMETERS, content.SESSION), 1))
     writer.write([_serialised(start, *message) for message in messages])
