@@ -52,7 +52,6 @@ export class Picture {
     this.camera = new T.PerspectiveCamera(40, 1, 0.05, 20);
     this.camera.up.set(0, 0, 1);
     this.scene = new T.Scene();
-    this.scene.background = new T.Color("#f3f5f7");
     this.scene.add(new T.HemisphereLight("#ffffff", "#8a94a0", 2.5));
     const gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0x0a4f9e, 0.09, 0.05);
     this.scene.add(gravity);
@@ -169,6 +168,7 @@ export class Picture {
       this.camera.aspect = width / height;
       this.camera.updateProjectionMatrix();
     }
+    this.scene.background = new this.three.Color(getComputedStyle(document.documentElement).getPropertyValue("--ground").trim());
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }
