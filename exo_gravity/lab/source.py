@@ -5,24 +5,11 @@ parameter file names a bus that leads to motors. Otherwise its source is unknown
 """
 
 from collections.abc import Iterable, Mapping
-from enum import Enum
 from typing import Any
 
-from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
-
-VIRTUAL_CAN = "vcan"  # how Linux names CAN interfaces that lead to no motor; a simulator may play behind one
-
-
-class Source(str, Enum):
-    """Where the numbers of an arm come from."""
-
-    SIMULATED = "simulated"
-    REAL = "real"
-    UNKNOWN = "unknown"
-
-    def __str__(self) -> str:
-        return str(self.value)
-
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import source_of_bus
+from exo_gravity.core.vocabulary import Source
 
 # What a report says of it, of several arms together.
 STATEMENTS = {
@@ -36,13 +23,15 @@ def source_of(bridge: Mapping[str, Any], has_simulator: bool) -> Source:
     """Return the source of an arm.
 
     bridge: the parameters of its `can_bridge`, {} if they are not known.
-    has_simulator: whether a simulator reports on this arm.
+    has_simulator: whether a simulator plays this arm.
     """
-    interface = bridge.get("can.interface", "")
-    if has_simulator or interface in SIMULATED_BUSES:
+    if has_simulator:
         return Source.SIMULATED
-    is_virtual = VIRTUAL_CAN in str(bridge.get("can.channel", ""))
-    return Source.REAL if interface and not is_virtual else Source.UNKNOWN
+    interface = bridge.get("can.interface")
+    try:
+        return source_of_bus(interface, bridge.get("can.channel", "")) if interface else Source.UNKNOWN
+    except ParameterError:  # a channel that this version does not know
+        return Source.UNKNOWN
 
 
 def of_all(sources: Iterable[Source]) -> Source:

@@ -39,7 +39,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, is_guided, run_attempts
+    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, check_bridges, is_guided, run_attempts
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
@@ -55,6 +55,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
             from exo_gravity.lab.trial.from_file import record_offline
         end = record_offline(trial, console, stopped.is_set)
     else:
+        if trial.params:
+            check_bridges(trial.params)
         trial.prepare()
         tell(folder=str(folder))
         end = run_attempts(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))

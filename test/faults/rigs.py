@@ -266,7 +266,7 @@ class SuccessorRig(AssistedRig):
         return died
 
     def _wait_for(self, state: str) -> None:
-        self.probe.wait_until(lambda: (self.probe.diagnostic("compensator", "assist") or "").startswith(state))
+        self.probe.wait_until(lambda: self.probe.diagnostic("compensator", "assist") == state)
 
     def bring_to(self, stage: str) -> None:
         self.end("successor")

@@ -21,6 +21,7 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.vocabulary import NO_REASON
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -60,9 +61,9 @@ def sent(node, monkeypatch):
 
     def sent(loop, count, answered=None):
         arm = ArmOnBus(("virtual", "arm", {}), MOTORS_OF_ARM, Limits(NAMES), 0.004)
-        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
+        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease(), SimpleNamespace(last=("none", "none")))
         for n in range(count):
-            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), "none")
+            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), NO_REASON)
             clock.now += 0.1
         return reports
 
@@ -214,7 +215,7 @@ def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
     compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
     exchange.take(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
     command = await_efforts(
-        exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, "", (), "", (), False, held))
+        exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, NO_REASON, (), "", (), False, held))
     )
     assert (tuple(command.effort), command.damped, command.held) == (effort, False, bool(held))
 

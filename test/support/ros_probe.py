@@ -178,7 +178,8 @@ class RosProbe:
         """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home."""
         helped = -math.inf
         while self.state != "active":
-            misplaced = self.fault == "implausible_zero" or self.status_contains("can_bridge", "to be moved")
+            is_outside = self.diagnostic("can_bridge", "joints outside limits") not in (None, "none")
+            misplaced = self.fault == "implausible_zero" or is_outside
             if misplaced and time.monotonic() > helped + HELP_TIME:
                 helped = time.monotonic()
                 self.set_parameters("simulator", trial=str(CONFIG / "home.yaml"))

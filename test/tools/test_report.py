@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.bag.content import Event
+from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.report import figures
 from exo_gravity.lab.report.trial_report import analyse, print_report, write, write_empty
@@ -260,7 +260,8 @@ def test_a_trial_of_which_nothing_was_recorded_has_a_report_too(tmp_path):
 COMPENSATOR = """/right/compensator:
   ros__parameters: {side: right, mode: zero_g, support: 0.3, wearer.body_mass: 75.0, wearer.sex: female}
 """
-FAULT = "right/can_bridge: letting down: over_speed: right_elbow_flexion turns too fast"
+REASON = "right_elbow_flexion turns too fast"
+FAULT = f"right/can_bridge: letting down: over_speed: {REASON}"
 WHOLE = made.trial(made.POSES, hold=6.0, rate=250.0)
 
 
@@ -269,6 +270,15 @@ def report_of(recording, *events, given=COMPENSATOR, **more):
     session = Session("P01", "pilot", "first visit", "1.2.3")
     parameters = {"/right/compensator": given}
     return analyse(made.bag_of(recording, events=events, parameters=parameters, session=session, **more))
+
+
+def reported(seconds, node, level, message, fault="none", fault_text=""):
+    """Return the event of a status on /diagnostics."""
+    return Event(seconds, f"{node}: {message}", status=NodeStatus(node, level, message, fault, fault_text))
+
+
+def fault_at(seconds):
+    return reported(seconds, "right/can_bridge", 2, f"letting down: over_speed: {REASON}", "over_speed", REASON)
 
 
 def mode_set(seconds, mode):
@@ -301,7 +311,7 @@ def let_down(end, **more):
 
 
 def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it_unless_it_was_planned():
-    report = report_of(let_down(12.5), Event(12.6, FAULT))
+    report = report_of(let_down(12.5), fault_at(12.6))
     text, good = report.verdict
     lowest = np.abs(np.degrees(made.POSES[1])).max()  # rotates back to 0
     moved = re.search(r"joint 4 moved ([\d.]+) degrees, at up to (\d+) deg/s", text)
@@ -312,7 +322,7 @@ def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it_unless_it_was
     assert planned[1] and "let down" not in planned[0]
     unscripted = let_down(12.5, steps=())
     assert "let down" not in report_of(unscripted).verdict[0]
-    assert "let down" in report_of(unscripted, Event(12.5, FAULT)).verdict[0]
+    assert "let down" in report_of(unscripted, fault_at(12.5)).verdict[0]
 
 
 def test_a_motion_after_a_change_of_load_names_the_change_but_not_one_to_the_same_value():
@@ -344,9 +354,9 @@ def test_where_nothing_moved_the_resolution_is_stated():
 
 
 def test_lines_of_the_start_are_left_out_and_markers_are_listed(page_of):
-    starting = [Event(0.1 * n, f"right/can_bridge: checking: waiting for {n}") for n in range(5)]
-    starting += [Event(0.6, "right/can_bridge: OK, active"), Event(0.7, "imu: WARN that lasts")]
+    starting = [reported(0.1 * n, "right/can_bridge", 1, f"checking: waiting for {n}") for n in range(5)]
+    starting += [reported(0.6, "right/can_bridge", 0, "OK, active"), reported(0.7, "imu", 1, "WARN that lasts")]
     carried = replace(WHOLE, carried=((1.0, 16.0),))
-    text = page_of(report_of(carried, *starting, Event(3.0, FAULT), markers=(Event(2.0, "cramp"),))).text
+    text = page_of(report_of(carried, *starting, fault_at(3.0), markers=(Event(2.0, "cramp"),))).text
     assert "checking" not in text and "OK, active" not in text
     assert text.index("WARN that lasts") < text.index("2.0 s  marker: cramp") < text.index(f"3.0 s  {FAULT}")

@@ -13,6 +13,7 @@ from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUND
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
+from exo_gravity.core.vocabulary import Source
 
 # In the format `mit` the first byte of a reply is the motor's ID. The position of our commands is 0, unless they hold a
 # joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like replies.
@@ -133,6 +134,7 @@ class JointMotor:
 
 LARGEST_ZERO = max(spec.position_range for spec in MOTORS.values())  # rad; `JointMotor` has the limit of each motor
 SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
+VIRTUAL_CAN = "vcan"  # begins Linux's names of CAN interfaces without an adapter: only programs are behind one
 
 # fmt: off
 # `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
@@ -180,6 +182,14 @@ def channels_of(channel: str) -> list[str]:
         expected = f"one channel for all motors, or {JOINT_COUNT} with commas between them, one for each motor"
         raise ParameterError("can.channel", channel, expected)
     return names * (JOINT_COUNT // len(names))
+
+
+def source_of_bus(interface: str, channel: str) -> Source:
+    """Return whether the motors on a bus are real: the values of `can.interface` and `can.channel`."""
+    if interface in SIMULATED_BUSES:
+        return Source.SIMULATED
+    is_virtual = any(name.startswith(VIRTUAL_CAN) for name in channels_of(channel))
+    return Source.UNKNOWN if is_virtual else Source.REAL
 
 
 def buses_of(channel: str, options: Mapping[str, Any]) -> dict[str, tuple[list[int], dict[str, Any]]]:

@@ -23,6 +23,7 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, 
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
 NO_ROTATION = ZERO  # rad/s
@@ -114,16 +115,19 @@ class TiltInput:
             return math.inf
         return (TILT.turn_rate if any(self._angular_velocity) else TILT.turn_rate_alone) * (now - self._in_time)
 
-    def problem(self, now: float) -> str:
-        """Return why there is no fresh tilt at `now`; '' if there is one."""
+    def problem(self, now: float) -> Reason:
+        """Return why there is no fresh tilt at `now`; false if there is one."""
         if now - self._time <= self.timeout:
-            return ""
-        text = f"trunk tilt older than {self.timeout * 1000:.0f} ms"
+            return NO_REASON
+        word, text = Withdrawal.LATE_TILT, f"trunk tilt older than {self.timeout * 1000:.0f} ms"
         if self._time == -math.inf:
-            text = "no trunk tilt yet"
+            word, text = Withdrawal.NO_TILT, "no trunk tilt yet"
         elif now - self._arrival <= self.timeout:
-            text += " by its stamp: the IMU driver lags, or its clock differs"
-        return f"{text} (the newest was refused: {self._refusal})" if self._refusal else text
+            lags = "by its stamp: the IMU driver lags, or its clock differs"
+            word, text = Withdrawal.LATE_TILT_STAMP, f"{text} {lags}"
+        if self._refusal:
+            return Reason(Withdrawal.REFUSED_TILT, f"{text} (the newest was refused: {self._refusal})")
+        return Reason(word, text)
 
     def _set(self, now: float, gravity: Callable[[], Vector], angular_velocity: Sequence[float], age: float) -> None:
         """Take a direction of gravity, or note why it is refused and raise ParameterError."""

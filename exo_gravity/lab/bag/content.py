@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from exo_gravity.core.params import Param, params_of
-from exo_gravity.lab.source import Source, source_of
+from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.source import source_of
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
+BRIDGE = "can_bridge"  # the node whose state is that of its arm
 # Of each arm, in its namespace
 STATES, COMMANDS, STEPS, ASSIST = "joint_states", "effort_commands", "wearer_step", "assist_efforts"
 WEARER = ("wearer_efforts", "wearer_efforts_std", "support_request")
@@ -59,12 +61,23 @@ def is_wanted(topic: str, msgtype: str) -> bool:
     return msgtype in (READ.get(topic), READ.get(leaf(topic)))
 
 
+class NodeStatus(NamedTuple):
+    """What a node reported on /diagnostics when its level or message changed."""
+
+    node: str  #: 'right/can_bridge'
+    level: int  #: of diagnostic_msgs/DiagnosticStatus; 0: OK
+    message: str  #: for people
+    fault: str  #: code of the latched fault of a bridge, 'none' without one
+    fault_text: str  #: for people; '' if the recording has none
+
+
 class Event(NamedTuple):
     """A marker, a fault, a warning or a changed parameter."""
 
     time: float  #: s since the start of the recording
-    text: str
+    text: str  #: for people
     setting: tuple[str, str, Any] | None = None  #: node, name and new value of a changed parameter
+    status: NodeStatus | None = None  #: of a fault or a warning, and of its end
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,24 @@ from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
+from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
-from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
+from exo_gravity.lab.bag.content import (
+    BRIDGE,
+    COMMANDS,
+    JOINT_STATE,
+    STATES,
+    STEPS,
+    Bag,
+    Event,
+    NodeStatus,
+    arm_of,
+    leaf,
+)
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.storage import Storage, StoredRows
-from exo_gravity.lab.source import Source
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
 
@@ -172,7 +183,7 @@ class _Contents:
         self.parameters: dict[str, str] = {}
         self.losses = ""
         self.session = Session()
-        self.events: list[tuple[Any, ...]] = []  # row, text and setting of faults and changed parameters
+        self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
         self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
@@ -308,20 +319,21 @@ class _Contents:
             self.parameters[node.strip()] = f"{node}:{text}"
 
     def _add_status(self, row: Row, status: Any) -> None:
-        level = int(status.level)
-        last = self._last.get(status.name, (0, ""))
+        level, values = int(status.level), {entry.key: entry.value for entry in status.values}
+        fault = values.get("fault", NONE), values.get("fault text", "")
+        last, found = self._last.get(status.name, (0, "")), NodeStatus(status.name, level, status.message, *fault)
         if level > 0 and (level, status.message) != last:
-            self.events.append((row, f"{status.name}: {status.message}"))
+            self.events.append((row, f"{status.name}: {status.message}", None, found))
         elif level == 0 and last[0] > 0:
-            self.events.append((row, f"{status.name}: OK, {status.message}"))
+            self.events.append((row, f"{status.name}: OK, {status.message}", None, found))
         self._last[status.name] = (level, status.message)
         for entry in status.values:
-            if entry.key == "state" and entry.value:
+            if entry.key == "state" and entry.value and leaf(status.name) == BRIDGE:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
-            elif entry.key == "source" and entry.value in KNOWN:
-                self.sources.setdefault(arm_of(status.name), Source(entry.value))
         if leaf(status.name) == "simulator":
             self.sources[arm_of(status.name)] = Source.SIMULATED
+        elif leaf(status.name) == BRIDGE and values.get("source") in KNOWN:
+            self.sources.setdefault(arm_of(status.name), Source(values["source"]))
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""

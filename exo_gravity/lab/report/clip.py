@@ -20,11 +20,12 @@ from rich.progress import track
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report.table import shown
-from exo_gravity.lab.source import Source, of_all
+from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view.scene import LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.lab.view.urdf import COLOURS as MATERIALS

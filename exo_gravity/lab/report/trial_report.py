@@ -11,10 +11,11 @@ from rich.console import Console
 from rich.markup import escape as marked
 
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag, Event
 from exo_gravity.lab.report import figures, html, table, wearer_share
 from exo_gravity.lab.report.verdict import EARLY, Conditions, Report
-from exo_gravity.lab.source import STATEMENTS, Source
+from exo_gravity.lab.source import STATEMENTS
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 
@@ -180,8 +181,8 @@ def _criteria_text(criteria: HoldCriteria) -> str:
 def _after_start(bag: Bag) -> list[Event]:
     """Return markers and events in order, of those before an arm was carried only the last of each node."""
     began = min((recording.carried[0][0] for recording in bag.recordings if recording.carried), default=-math.inf)
-    last = {event.text.partition(":")[0]: event for event in bag.events if event.time < began and not event.setting}
-    kept = [event for event in last.values() if ": OK, " not in event.text]
+    last = {event.status.node: event for event in bag.events if event.status and event.time < began}
+    kept = [event for event in last.values() if event.status and event.status.level]
     changed = [event for event in bag.events if event.time >= began or event.setting]
     markers = [Event(event.time, f"marker: {event.text}") for event in bag.markers]
     return sorted((*kept, *changed, *markers), key=lambda event: event.time)

@@ -15,10 +15,10 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, observed, share_of, while_between
-from exo_gravity.lab.source import Source
 from exo_gravity.lab.trial.recording import Recording
 
 

@@ -25,7 +25,7 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import Launcher, Stopping
-from exo_gravity.lab.trial.screen import LEAD, TrialScreen
+from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import TrialScript
 
@@ -55,6 +55,13 @@ Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in 
 def is_guided(params: Path) -> bool:
     """Return whether a person performs the script, because the parameter file has no simulator."""
     return not any(node.endswith("/simulator") for node in load(params))
+
+
+def check_bridges(params: Path) -> None:
+    """Raise ParameterError if no node of the parameter file carries an arm: a trial would wait for it in vain."""
+    if not stages(load(params))[0]:
+        expected = "a file with a can_bridge, which carries the arm: a trial begins once it is active"
+        raise ParameterError("params", str(params), expected)
 
 
 @dataclass(frozen=True)
@@ -165,6 +172,8 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
             return f"the recorder ended with exit code {code} before the trial was done"
         if screen.silence > RECORDER_TIMEOUT:
             return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
+        if screen.has_no_bridge:
+            return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
         if message := fault_of(screen.status)[1]:
             return message
         if screen.done:
