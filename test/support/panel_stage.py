@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 import time
@@ -60,6 +61,10 @@ class PlayedArms:
     limit: str = "0.068"  #: the largest support that it reports
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     reports: dict[str, dict[str, str]] = field(default_factory=dict)  #: further keys of the bridges, by arm
+    #: settings that the panel still shows of an arm, in place of those in force
+    shown: dict[str, dict[str, Any]] = field(default_factory=dict)
+    delay: float = 0.0  #: s until the settings are read
+    reads: int = 0  #: how often they were
     silent: set[str] = field(default_factory=set)  #: arms of which no joint states arrive
     #: what the simulators report
     simulator: dict[str, str] | None = field(
@@ -85,6 +90,8 @@ class PlayedArms:
         return self.others.get(arm, "")
 
     async def settings_of(self, arm: str) -> dict[str, Any]:
+        await asyncio.sleep(self.delay)
+        self.reads += 1
         if self.problem:
             raise ExoGravityError(self.problem)
         return {name: self.settings[arm][name] for name in SETTABLE}
@@ -217,7 +224,10 @@ class Stage:
         changes = LoadChanges()
         while not self._stopping.wait(PERIOD):
             nodes = {
-                arm: ({**self._bridge, "joint_names": settings["joint_names"]}, dict(settings))
+                arm: (
+                    {**self._bridge, "joint_names": settings["joint_names"]},
+                    dict(self.arms.shown.get(arm, settings)),
+                )
                 for arm, settings in self.arms.settings.items()
             }
             if nodes != shown:
