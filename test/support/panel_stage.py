@@ -54,6 +54,7 @@ class PlayedArms:
     errors: dict[str, Exception] = field(default_factory=dict)
     changing: str = "none"  #: the joint whose load a compensator reports to change
     weighing: dict[str, str] = field(default_factory=dict)  #: what it reports of a weighing
+    compensator: dict[str, str] = field(default_factory=dict)  #: further keys of it
     contact: dict[str, str] = field(default_factory=dict)  #: what `wearer` reports of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: dict[str, str] = field(default_factory=dict)  #: what it reports of a support that adapts
@@ -131,7 +132,13 @@ class PlayedArms:
         level = 2 if fault != "none" else 0
         bridge = {**values, "level": level, "message": sentence, **self.reports.get(name, {})}
         carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
-        carried |= {"changing load": self.changing, "reason": "none", "weighing": "none", **self.weighing}
+        carried |= {
+            "changing load": self.changing,
+            "reason": "none",
+            "weighing": "none",
+            **self.weighing,
+            **self.compensator,
+        }
         of_wearer = {"largest support": self.limit, "support adapts": "off", **self.adapts, **self.contact}
         of_wearer["share of the wearer (%)"], of_wearer["share band (%)"] = self.share
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
@@ -224,11 +231,8 @@ class Stage:
         changes = LoadChanges()
         while not self._stopping.wait(PERIOD):
             nodes = {
-                arm: (
-                    {**self._bridge, "joint_names": settings["joint_names"]},
-                    dict(self.arms.shown.get(arm, settings)),
-                )
-                for arm, settings in self.arms.settings.items()
+                arm: ({**self._bridge, "joint_names": settings["joint_names"]}, dict(settings))
+                for arm, settings in (self.arms.settings | self.arms.shown).items()
             }
             if nodes != shown:
                 shown = nodes
