@@ -519,11 +519,11 @@ def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, sta
     page.click(weigh)
     confirm(page, "relax within 4 s")
     wait_until(page, lambda: ("weigh", "right") in stage.arms.calls)
-    stage.arms.weighing = {"weighing": "sweeping", "weighing time (s)": "9"}
+    stage.arms.compensator = {"weighing": "sweeping", "weighing time (s)": "9"}
     page.wait_for_selector(of_arm(".weighing:has-text('Do not help it (9 s)')"))
     more = {"weighed mass (kg)": "1.050", "weighed band (kg)": "0.080"}
-    stage.arms.weighing = {"weighing": "done", **more}
-    stage.arms.weighing |= {"weighed payload (kg)": "0.990", "weighed payload band (kg)": "0.052"}
+    stage.arms.compensator = {"weighing": "done", **more}
+    stage.arms.compensator |= {"weighed payload (kg)": "0.990", "weighed payload band (kg)": "0.052"}
     touched = {"contacts": "1", "contact joint": "right_elbow_flexion"}
     stage.arms.contact = {**touched, "contact torque (Nm)": "4.0", "contact age (s)": "1"}
     page.wait_for_selector(carry, state="visible")

@@ -53,8 +53,7 @@ class PlayedArms:
     problem: str = ""
     errors: dict[str, Exception] = field(default_factory=dict)
     changing: str = "none"  #: the joint whose load a compensator reports to change
-    weighing: dict[str, str] = field(default_factory=dict)  #: what it reports of a weighing
-    compensator: dict[str, str] = field(default_factory=dict)  #: further keys of it
+    compensator: dict[str, str] = field(default_factory=dict)  #: further keys of a compensator
     contact: dict[str, str] = field(default_factory=dict)  #: what `wearer` reports of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: dict[str, str] = field(default_factory=dict)  #: what it reports of a support that adapts
@@ -132,13 +131,7 @@ class PlayedArms:
         level = 2 if fault != "none" else 0
         bridge = {**values, "level": level, "message": sentence, **self.reports.get(name, {})}
         carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
-        carried |= {
-            "changing load": self.changing,
-            "reason": "none",
-            "weighing": "none",
-            **self.weighing,
-            **self.compensator,
-        }
+        carried |= {"changing load": self.changing, "reason": "none", "weighing": "none", **self.compensator}
         of_wearer = {"largest support": self.limit, "support adapts": "off", **self.adapts, **self.contact}
         of_wearer["share of the wearer (%)"], of_wearer["share band (%)"] = self.share
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
