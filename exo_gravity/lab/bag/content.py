@@ -112,9 +112,9 @@ class Bag:
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
 
-        subject: the session's code; arm, joint; source: simulated, real or unknown; time_s since the start; step: of
-        the script from 1 on, and its action, 0 and '' outside of it; carried: whether the motors carried the arm;
-        position_rad, velocity_rad_per_s, torque_nm as measured, command_nm as requested, NaN where unknown.
+        subject: the session's code; arm, joint; time_s since the start; step: of the script from 1 on, and its action,
+        0 and '' outside of it; carried: whether the motors carried the arm; position_rad, velocity_rad_per_s,
+        torque_nm as measured, command_nm as requested, NaN where unknown; source: simulated, real or unknown.
         """
         arms = [_columns(recording, self.source(recording.name)) for recording in self.recordings]
         columns = {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
@@ -145,9 +145,9 @@ def _columns(recording: Recording, source: Source) -> dict[str, np.ndarray]:
     return {
         "arm": np.full(len(time) * joints, recording.name, object),
         "joint": np.tile(np.array(recording.joint_names, object), len(time)),
-        "source": np.full(len(time) * joints, str(source), object),
         **{name: np.repeat(column, joints) for name, column in shared.items()},
         **{name: np.ravel(column) for name, column in zip(names, values, strict=True)},
+        "source": np.full(len(time) * joints, source.value, object),
     }
 
 

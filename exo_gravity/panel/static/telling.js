@@ -39,8 +39,9 @@ export function tell(arm, name, state, moving, isSimulated) {
   const fault = faultOf(bridge, state, isSimulated);
   const unreached = bridge.motors === "unreached";
   const first = unreached ? [t("unreached")] : [];
-  const why = [...first, ...(fault?.why ?? []), sentence(arm, name, state, moving)];
-  const todo = [...(unreached ? [t("do.unreached")] : []), ...(fault?.todo ?? []), fault ? then(name, bridge) : ""];
+  const usual = usually(arm, name, state, moving);
+  const why = [...first, ...(fault?.why ?? []), usual.why];
+  const todo = [...(unreached ? [t("do.unreached")] : []), ...(fault?.todo ?? []), fault ? then(name, bridge) : usual.todo];
   return { why: join(why), todo: join(todo), action, engineer: ENGINEER.includes(bridge.fault) };
 }
 
@@ -59,18 +60,22 @@ function then(name, bridge) {
   return ENGINEER.includes(bridge.fault) ? "" : t("then.clear");
 }
 
-function sentence(arm, name, state, moving) {
+// What the state is and what to do, besides a fault.
+function usually(arm, name, state, moving) {
   const { bridge, compensator } = state;
-  if (poseAsked(bridge)) return t("sentence.pose");
-  if (moving) return t(changes(compensator) ? "sentence.changing" : `sentence.${moving}`);
+  if (poseAsked(bridge)) return texts("pose");
+  if (moving) return texts(changes(compensator) ? "changing" : moving);
   const [refusal] = list(bridge.refusal);
-  if (name === "disabled" && refusal) return waitText(arm, refusal, bridge, true);
+  if (name === "disabled" && refusal) return { why: waitText(arm, refusal, bridge, true), todo: t("then.enable") };
   const [wait] = list(bridge["waiting for"]);
-  if (wait && wait !== "pose") {
-    const reason = wait === "efforts" ? reasonText(compensator) : "";
-    return join([waitText(arm, wait, bridge, false), reason]);
-  }
-  return has(`sentence.${name}`) ? t(`sentence.${name}`) : "";
+  if (!wait || wait === "pose") return texts(name);
+  const reason = wait === "efforts" ? reasonText(compensator) : "";
+  return { why: join([waitText(arm, wait, bridge, false), reason]), todo: "" };
+}
+
+function texts(key) {
+  const of = (kind) => (has(`${kind}.${key}`) ? t(`${kind}.${key}`) : "");
+  return { why: of("sentence"), todo: of("todo") };
 }
 
 // What a start waits for, or waited for when it ended.
