@@ -144,7 +144,9 @@ def wearer(recording: Recording, part: WearerPart) -> Figure:
     rows = [*curve.torque.T, 100.0 * part.sliding.value]
     bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
     names = [f"{label} (Nm)" for label in joint_labels(recording)]
-    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*colours, INK], strict=True)
+    columns = zip(
+        axes, rows, bands, [*names, "Wearer's share of arm weight, over 1 s (%)"], [*colours, INK], strict=True
+    )
     for axis, values, band, name, colour in columns:
         axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
         axis.plot(curve.time, values, color=colour, lw=1.0)
