@@ -65,7 +65,7 @@ extras = {
         "threadpoolctl>=3.0",
     ],
     "urdf": ["pin>=2.7"],  # law: urdf
-    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
+    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4", "sphinx-copybutton>=0.5"],
     "test": [
         "axe-playwright-python>=0.1.4",
         "httpx>=0.27",

@@ -10,8 +10,8 @@ import ast
 import re
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,6 +21,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
+import states  # noqa: E402
 import tables  # noqa: E402
 
 from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
@@ -89,7 +90,7 @@ def links_and_paths() -> Iterator[str]:
 
 
 def generated_tables() -> Iterator[str]:
-    """Yield each table that differs from the code, or has no place in a document."""
+    """Yield each generated table, and the picture of the states, that differs from the code or has no place."""
     places: set[str] = set()
     for path in DOCUMENTS:
         document = text_of(path)
@@ -98,6 +99,8 @@ def generated_tables() -> Iterator[str]:
             yield f"{path.relative_to(ROOT)}: table {table} differs from the code; run {tables.COMMAND}"
     if missing := {*tables.PARAMETERS, "faults", "firmwares", "topics"} - places:
         yield f"no document has a place for the tables {', '.join(sorted(missing))}"
+    if text_of(states.PICTURE) != states.drawing():
+        yield "docs/states.svg differs from the transitions; run python docs/states.py"
 
 
 def commands_and_site() -> Iterator[str]:
@@ -108,6 +111,8 @@ def commands_and_site() -> Iterator[str]:
     with_run = {path.name for path in DOCUMENTS if "ros2 run exo_gravity" in text_of(path)}
     if with_run != {"README.md", "installation.md"}:  # the example of a workspace, and the rule
         yield f"`ros2 run exo_gravity` belongs before no command, see docs/installation.md: {', '.join(with_run)}"
+    unpublished = {path.name for path in DOCUMENTS if re.search(r"pip install '?exo_gravity\b(?!-)", text_of(path))}
+    yield from (f"{name}: nothing on PyPI is ours: name a wheel, or a folder" for name in unpublished)
     trees_of_site = re.findall(r"```{toctree}\n(.*?)```", text_of("docs/index.md"), re.DOTALL)
     listed = {line for tree in trees_of_site for line in tree.splitlines()}
     for path in sorted((ROOT / "docs").glob("*.md")):
@@ -116,13 +121,20 @@ def commands_and_site() -> Iterator[str]:
 
 
 def safety_case() -> Iterator[str]:
-    """Yield each difference between the rows of the fault matrix and those that the safety case names, once each."""
-    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety.md"))
+    """Yield each row of the fault matrix that the safety case does not name once, and each name that is no row's.
+
+    An asterisk in a name stands for any text.
+    """
+    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
     cells = (line.split(" | ")[-1] for table in found for line in table.splitlines())
-    named = Counter(name for cell in cells for name in re.findall(r"`([^`]+)`", cell))
-    played = Counter(case.name for case in CASES)
-    yield from (f"docs/safety.md does not name the row {row}" for row in played - named)
-    yield from (f"docs/safety.md names the row {row}, which is not played or is named before" for row in named - played)
+    names = [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
+    rows = [case.name for case in CASES]
+    for row in rows:
+        if (times := sum(fnmatchcase(row, name) for name in names)) != 1:
+            yield f"docs/safety_case.md must name the row {row} once, not {times} times"
+    for name in names:
+        if not any(fnmatchcase(row, name) for row in rows):
+            yield f"docs/safety_case.md: no row is called {name}"
 
 
 def troubleshooting() -> Iterator[str]:

@@ -32,7 +32,7 @@ NEEDED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog), POSE)
 CARRIED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
 WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's arm
-NONE = ["0.0"] * 4  # Nm
+NONE = ["0.0"] * len(PARTS)  # Nm
 
 
 class StillArm:

@@ -76,7 +76,8 @@ class PlayedArm:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
         values = [KeyValue(key="state", value="disabled"), KeyValue(key="fault", value="none")]
         values.append(KeyValue(key="control held by", value=self.holder))
-        status = DiagnosticStatus(name="right/can_bridge", message="disabled", values=values)
+        # The panel decides by keys alone: this is no sentence of ours.
+        status = DiagnosticStatus(name="right/can_bridge", message="zqx vw: kfj", values=values)
         self._statuses.publish(DiagnosticArray(status=[status]))
 
     def _on_control(self, message: KeyValue) -> None:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
@@ -366,6 +367,21 @@ def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it_unless_it_was
     unscripted = let_down(12.5, steps=())
     assert "let down" not in report_of(unscripted).verdict[0]
     assert "let down" in report_of(unscripted, fault_at(12.5)).verdict[0]
+
+
+@pytest.mark.parametrize(
+    ("fault", "fault_text", "named"),
+    [
+        ("over_speed", REASON, f" (over_speed: {REASON})"),
+        ("over_speed", "", f" (over_speed: {FaultCode.OVER_SPEED.meaning})"),  # a recording of an earlier version
+        ("new_fault", "", " (new_fault: a fault)"),  # of a later one
+        ("none", "", ""),
+    ],
+)
+def test_the_fault_that_a_report_names_comes_from_its_key_whatever_the_sentence_says(fault, fault_text, named):
+    said = "letting down: wrong_sign: zqx vw kfj"
+    report = report_of(let_down(12.5), reported(12.6, "right/can_bridge", 2, said, fault, fault_text))
+    assert report.verdict[0].startswith(f"Right: let down at 12.5 s{named}: ")
 
 
 def test_a_motion_after_a_change_of_load_names_the_change_but_not_one_to_the_same_value():

@@ -1,7 +1,7 @@
 """The limits of a worn arm, and which motor readings are a fault.
 
 `find_faults` checks a motor's reading; trust.py confirms what it finds. barrier.py keeps every drive within the limits.
-docs/safety.md compares the defaults with those of other systems.
+docs/safety_case.md compares the defaults with those of other systems.
 """
 
 from collections.abc import Mapping, Sequence
