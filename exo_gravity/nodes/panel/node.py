@@ -180,9 +180,10 @@ class Arms:
         node = f"/{arm}/{COMPENSATOR}"
         if node not in self._others.found:
             return {}
-        names = [name for name in SETTABLE if name in self._others.values(node)]
+        known = self._others.values(node)
+        names = [name for name in SETTABLE if name in known]  # an arm of a URDF has none of them
         answer = await answer_of(self.clients[arm].settings, GetParameters.Request(names=names))
-        if not names or len(answer.values) != len(names):
+        if not known or len(answer.values) != len(names):
             raise ExoGravityError(f"the parameters of {node} are not known yet")
         values = map(parameter_value_to_python, answer.values)
         return {name: plain(value) for name, value in zip(names, values, strict=True)}

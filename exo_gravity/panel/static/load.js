@@ -11,7 +11,7 @@ const inside = (percent) => Math.min(100, Math.max(0, percent));
 export function showShare(card, wearer, isCarried) {
   const value = finite(wearer?.["share of the wearer (%)"]);
   const band = finite(wearer?.["share band (%)"]);
-  const why = whyNoShare(card, value, band, isCarried);
+  const why = whyNoShare(card, wearer, value, band, isCarried);
   const bar = card.find(".bar");
   card.find(".carries").toggleAttribute("data-known", !why);
   write(card.find(".carries strong"), why ? "–" : `${number(value, 0)} %`);
@@ -24,9 +24,10 @@ export function showShare(card, wearer, isCarried) {
   card.find(".band").style.width = `${high - low}%`;
 }
 
-function whyNoShare(card, value, band, isCarried) {
+function whyNoShare(card, wearer, value, band, isCarried) {
   if (!isCarried) return t("share.idle");
   if (!card.hasWearer) return t("share.no_wearer");
+  if (!wearer) return t("share.silent");
   if (value === null || band === null) return t("share.none");
   return band > WIDEST ? t("share.wide", number(band, 0)) : "";
 }
