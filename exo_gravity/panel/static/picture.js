@@ -3,6 +3,7 @@
 // It is drawn at most ten times a second, and only when the browser is ready for a picture: drawing must never delay a
 // press. Without WebGL a sentence replaces it.
 
+import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
 import { t } from "./texts.js";
 
@@ -168,7 +169,7 @@ export class Picture {
       this.camera.aspect = width / height;
       this.camera.updateProjectionMatrix();
     }
-    this.scene.background = new this.three.Color(getComputedStyle(document.documentElement).getPropertyValue("--ground").trim());
+    this.scene.background = new this.three.Color(colour("--ground"));
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }

@@ -3,6 +3,7 @@
 // A figure without a curve says why. An arm that falls silent leaves a gap, so that no old curve looks like a new one.
 
 import { temperature } from "./arm.js";
+import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
 import { jointText } from "./telling.js";
 import { degrees, finite, t, write } from "./texts.js";
@@ -18,7 +19,6 @@ const KINDS = [
   ["temperature", "°C", temperature],
 ];
 const of = (list, n) => list[n % list.length]; // an arm may have more joints
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name);
 
 export class Plots {
   constructor(place) {
