@@ -22,7 +22,7 @@ from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
-from exo_gravity.core.vocabulary import NONE
+from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
 from exo_gravity.lab.bag.content import (
@@ -65,6 +65,7 @@ class Plausible:
 
 
 PLAUSIBLE = Plausible()
+KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
@@ -107,6 +108,7 @@ def read_bag(path: str | Path) -> Bag:
     return Bag(
         Path(path), start, recordings, events, contents.parameters, tuple(contents.notes), tuple(contents.problems),
         contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
+        contents.sources,
     )  # fmt: skip
 
 
@@ -183,6 +185,7 @@ class _Contents:
         self.session = Session()
         self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
+        self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
         self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
         self.notes: list[str] = []
@@ -327,6 +330,10 @@ class _Contents:
         for entry in status.values:
             if entry.key == "state" and entry.value and leaf(status.name) == BRIDGE:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
+        if leaf(status.name) == "simulator":
+            self.sources[arm_of(status.name)] = Source.SIMULATED
+        elif leaf(status.name) == BRIDGE and values.get("source") in KNOWN:
+            self.sources.setdefault(arm_of(status.name), Source(values["source"]))
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""

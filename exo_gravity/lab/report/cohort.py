@@ -36,8 +36,8 @@ SPEED_RATE = 50.0  # Hz, at which the speed of a movement is taken
 BLOCK = 2**22  # bytes that are hashed at once
 SPAWNED = get_context("spawn")  # the progress bar has a thread, which a forked process would lack
 COLUMNS = (
-    "recording", "date", "subject", "protocol", "arm", "mode", "support", "held", "verdict", "problem", "holds",
-    "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
+    "recording", "date", "subject", "protocol", "arm", "source", "mode", "support", "held", "verdict", "problem",
+    "holds", "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
     "range_of_motion_deg", "rms_torque_nm",
 )  # fmt: skip
 
@@ -75,8 +75,9 @@ def summary(path: str, criteria: HoldCriteria, min_hold: float) -> list[Row]:
         of_arm = {
             **shared,
             "arm": recording.name,
+            "source": report.bag.source(recording.name).value,
             "mode": settings.get("mode"),
-            "support": settings.get("support"),
+            "support": None if settings.get("mode") == "one_g" else settings.get("support"),
             "holds": len(analysis.holds),
             "held_s": sum(hold.duration for hold in analysis.holds),
             "wearer_share": part and float(part.whole.value),
@@ -261,13 +262,13 @@ def trends_of(trials: Iterable[Row]) -> Iterator[str]:
 
 
 def _condition(row: Row) -> list[str]:
-    return [str(row[key] or "") for key in ("subject", "mode", "support", "arm", "date")]
+    return [str(row[key] or "") for key in ("subject", "source", "mode", "support", "arm", "date")]
 
 
 def print_trials(trials: Sequence[Row], console: Console) -> None:
     """Print a table with a row for each trial, then the trends."""
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in ("Subject", "Condition", "Date", "Recording", "Arm"):
+    for heading in ("Subject", "Condition", "Date", "Recording", "Arm", "Source"):
         table.add_column(heading)
     for heading in ("Holds", "Drift\ndeg/min", "Within 10 s\ndeg", "Range\ndeg", "SPARC", "Share\n%"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -281,7 +282,7 @@ def print_trials(trials: Sequence[Row], console: Console) -> None:
         )  # fmt: skip
         texts = (
             row["subject"], f"{row['mode'] or ''}{support}", row["date"], "/".join(Path(row["recording"]).parts[-2:]),
-            row["arm"], row["holds"],
+            row["arm"], row["source"], row["holds"],
         )  # fmt: skip
         table.add_row(
             *("" if text is None else escape(str(text)) for text in texts),
