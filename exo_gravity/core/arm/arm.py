@@ -8,6 +8,7 @@ vertical, shoulder abduction, shoulder flexion, elbow flexion. At theta = (any, 
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields
+from typing import TypeVar
 
 import numpy as np
 
@@ -25,6 +26,8 @@ MAX_REACH = 0.5  # m of its centre of gravity from the hand
 MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
+
+Self = TypeVar("Self", bound="ArmModel")
 
 NO_PAYLOAD = (0.0, 0.0, 0.0, 0.0)
 NOT_KNOWN = np.full(JOINT_COUNT, np.nan)  # masses and centres of gravity of an arm given by its moments
@@ -84,13 +87,13 @@ class ArmModel:
 
     @classmethod
     def from_moments(
-        cls,
+        cls: type[Self],
         length: Vector,
         first_moment: Vector,
         off_axis: Vector = (0.0,) * JOINT_COUNT,
         gain: Vector = (1.0,) * JOINT_COUNT,
         gravity: float = STANDARD_GRAVITY,
-    ) -> "ArmModel":
+    ) -> Self:
         """Return the arm with links of `length` (4,) m that is given by its moments, (4,) kg m each.
 
         first_moment: M1..M4, 0..MAX_MOMENT. The other arguments are those of the constructor. Raises ParameterError.
@@ -124,7 +127,7 @@ class ArmModel:
         if any(self.off_axis):
             raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
 
-    def with_payload(self, mass: float, cog: Vector = (0.0, 0.0, 0.0)) -> "ArmModel":
+    def with_payload(self: Self, mass: float, cog: Vector = (0.0, 0.0, 0.0)) -> Self:
         """Return this arm with a load of `mass` kg in its hand, instead of any other.
 
         cog: (3,) m, its centre of gravity in frame 4 of Table 1: from the end of link 4, along link 4 (x_4), across it
@@ -139,7 +142,7 @@ class ArmModel:
         object.__setattr__(loaded, "payload", payload)
         return loaded
 
-    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> "ArmModel":
+    def with_wearer(self: Self, mass: Vector, cog: Vector, support: float = 1.0) -> Self:
         """Return this arm plus a share `support` (0..1) of the wearer's arm: 0 is One-G, 1 is full Zero-G.
 
         mass: (4,) kg and cog: (4,) m of the wearer's segments on each link. Masses add up, and so do first moments.
@@ -151,12 +154,12 @@ class ArmModel:
         bare, scale = self.with_payload(0.0), (self.gain, self.gravity)
         if self.by_moments:
             moment = np.add(bare.first_moment, moments_along(self.length, distance, carried))
-            worn = ArmModel.from_moments(self.length, moment, bare.off_axis, *scale)
+            worn = type(self).from_moments(self.length, moment, bare.off_axis, *scale)
         else:
             total = self.mass + carried
             moment = self.mass * self.cog + carried * distance
             combined = np.divide(moment, total, out=self.cog.copy(), where=total > 0)
-            worn = ArmModel(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
+            worn = type(self)(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
         return worn.with_payload(self.payload[0], self.payload[1:])
 
 

@@ -131,10 +131,15 @@ class LinkInertia(NamedTuple):
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
         return np.array([self.torque(theta, NO_TORQUE, row) for row in np.eye(JOINT_COUNT).tolist()])
 
+    @property
+    def least(self) -> tuple[float, ...]:
+        """The least inertia (4,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+        return least_inertia(self)
+
 
 @lru_cache(8)
 def least_inertia(links: LinkInertia) -> tuple[float, ...]:
-    """Return the least inertia (4,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+    """Return `LinkInertia.least`."""
     poses = itertools.product((0.0,), GRID, GRID, GRID)
     free = [1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses]
     return tuple(np.min(free, axis=0).tolist())

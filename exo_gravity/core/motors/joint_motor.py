@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
 from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
-from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import Param
 
 # In the format `mit` the first byte of a reply is the motor's ID. The position of our commands is 0, unless they hold a
@@ -27,7 +27,7 @@ TIMEOUT_BOUNDS = (0.15, 0.5)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
 BITRATE = 1_000_000  # bit/s, of AK motors as delivered
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
-# slow bus fewer, or four boards would fill it.
+# slow bus fewer, or the paper's four boards would fill it.
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
 SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
@@ -166,33 +166,33 @@ _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param
 
 
 def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
-    """Return the four motors that parameter values describe, or raise ParameterError."""
+    """Return the motors that parameter values describe, one per joint, or raise ParameterError."""
     ids = values["can_id"]
     if len(set(ids)) != len(ids):
-        raise ParameterError("can_id", ids, "4 different IDs")
+        raise ParameterError("can_id", ids, "different IDs, one per joint")
     return tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
 
 
-def channels_of(channel: str) -> list[str]:
-    """Return the channel of each motor (4,) that the value of `can.channel` names. Raises ParameterError."""
+def channels_of(channel: str, count: int) -> list[str]:
+    """Return the channel of each of `count` motors that the value of `can.channel` names. Raises ParameterError."""
     names = [name.strip() for name in channel.split(",")]
-    if len(names) not in (1, JOINT_COUNT) or not all(names):
-        expected = f"one channel for all motors, or {JOINT_COUNT} with commas between them, one for each motor"
+    if len(names) not in (1, count) or not all(names):
+        expected = f"one channel for all motors, or {count} with commas between them, one for each motor"
         raise ParameterError("can.channel", channel, expected)
-    return names * (JOINT_COUNT // len(names))
+    return names * (count // len(names))
 
 
-def buses_of(channel: str, options: Mapping[str, Any]) -> dict[str, tuple[list[int], dict[str, Any]]]:
-    """Return the motors (0..3) on each bus, by its channel, and its options for python-can. Raises ParameterError.
+def buses_of(channel: str, options: Mapping[str, Any], count: int) -> dict[str, tuple[list[int], dict[str, Any]]]:
+    """Return which of `count` motors, from 0 on, are on each bus, by its channel, and its options for python-can.
 
-    An option that is a list has an entry for each motor.
+    An option that is a list has an entry for each motor. Raises ParameterError.
     """
     buses: dict[str, tuple[list[int], dict[str, Any]]] = {}
-    for joint, name in enumerate(channels_of(channel)):
+    for joint, name in enumerate(channels_of(channel, count)):
         own = {}
         for key, value in options.items():
-            if isinstance(value, list) and len(value) != JOINT_COUNT:
-                raise ParameterError(f"{OPTIONS}.{key}", value, f"one value, or {JOINT_COUNT}, one for each motor")
+            if isinstance(value, list) and len(value) != count:
+                raise ParameterError(f"{OPTIONS}.{key}", value, f"one value, or {count}, one for each motor")
             own[key] = value[joint] if isinstance(value, list) else value
         motors, first = buses.setdefault(name, ([], own))
         if own != first:
@@ -287,12 +287,12 @@ class Traffic:
 
 
 def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Traffic]:
-    """Return the traffic on each bus of the four motors, by its channel; options: of python-can.
+    """Return the traffic on each bus of an arm's motors, by its channel; options: of python-can.
 
     Raises ParameterError.
     """
     traffic, interface = {}, values["can.interface"]
-    for name, (motors, own) in buses_of(values["can.channel"], options).items():
+    for name, (motors, own) in buses_of(values["can.channel"], options, len(values["can_id"])).items():
         bitrate = own.get("bitrate")
         if bitrate is None and interface in NEED_BITRATE:
             expected = f"set for {interface}, as on the motors, e.g. {BITRATE}"

@@ -6,7 +6,7 @@ docs/safety.md compares the defaults with those of other systems.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
@@ -19,7 +19,7 @@ from exo_gravity.core.motors.joint_motor import (
     channels_of,
 )
 from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, for_joints
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
@@ -74,7 +74,7 @@ WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming(
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all joints.
+    """The limits that the worn arm must never exceed: one entry per joint (n,), or one number for all joints.
 
     The fields with a description are parameters of `can_bridge`. Raises ParameterError that names the invalid value.
     """
@@ -111,29 +111,43 @@ class Limits:
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
     largest_moment: Sequence[float] = owned(
-        (0.0,) * 4,
+        (0.0,) * JOINT_COUNT,
         "M1 to M4, the largest first moments of robot plus wearer, as `budget` prints them: efforts that no load up to "
-        "these needs are a fault; zeros: not checked",
+        "these needs are a fault; zeros: not checked, as on any arm but the paper's",
         (0.0, MAX_MOMENT),
         "kg m",
     )
     largest_addition: Sequence[float] = owned(
-        (0.0,) * 4,
+        (0.0,) * JOINT_COUNT,
         "torque that efforts may add to gravity compensation when `largest_moment` is given: the sum of the bounds of "
         "assistance and terms in use, `inertial`, a calibration",
         (0.0, 10.0),
         "Nm",
     )
-    #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
+    home: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "angles of the arm while it hangs, where a start from unknown zeros begins",
+        (-3.15, 3.15),
+        "rad",
+    )
+    #: (n,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(MOTORS[name].home_tolerance for name in USUAL_MOTORS)
-    channels: Sequence[str] = ("",) * JOINT_COUNT  #: of the motors' buses
-    #: (4,) rad, the hanging arm, from which joint angles are measured
-    home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
+    channels: Sequence[str] = ()  #: of the motors' buses, (n,); () if that does not matter
 
     def __post_init__(self) -> None:
-        if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
-            raise ParameterError("joint_names", list(self.joint_names), "4 different names")
-        check_owned(self)
+        names = self.joint_names
+        if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS or not all(names):
+            raise ParameterError("joint_names", list(names), f"1 to {MAX_JOINTS} different names")
+        check_owned(self, len(names))
+        for name in ("max_velocity", "home_tolerance"):
+            object.__setattr__(self, name, for_joints(getattr(self, name), len(names)))
+        object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
+        if any(self.largest_moment) and len(names) != JOINT_COUNT:
+            raise ParameterError("largest_moment", list(self.largest_moment), "zeros for another arm than the paper's")
+        columns = zip(names, self.position_min, self.home, self.position_max, self.home_tolerance, strict=True)
+        for name, low, home, high, tolerance in columns:
+            if not low - tolerance <= home <= high + tolerance:
+                raise ParameterError(f"home of {name}", home, f"within its limits, {low:g} to {high:g} rad")
         if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
             expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
             raise ParameterError("position_max", list(self.position_max), expected)
@@ -182,7 +196,7 @@ CAN_BRIDGE = (
 def limits_of(values: Mapping[str, Any]) -> Limits:
     """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
-    given["channels"] = channels_of(values["can.channel"])
+    given["channels"] = channels_of(values["can.channel"], len(values["joint_names"]))
     given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
     shortest = READING.reply_timeout
     given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))

@@ -36,8 +36,7 @@ from exo_gravity.core.motors.wire_formats import (
     Frame,
     WireFormat,
 )
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import OFF, Drive, Send
+from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
 from exo_gravity.hardware.can.request_age import Requests
@@ -58,7 +57,7 @@ AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus
 class MotorBus:
     """The motors of one arm, with different IDs. Not thread-safe: one thread owns it.
 
-    bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
+    bus: of all motors; or the port of each (n,), None if it is not open: such a joint counts as at rest, without
         torque, and is sent nothing.
     note: called with each drive before its frames are sent.
     reopen: opens `bus` again after a failure.
@@ -73,15 +72,16 @@ class MotorBus:
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
+        count = len(motors)
         #: The newest reading of each joint, UNKNOWN before the first reply.
-        self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        self.samples: list[JointSample] = [UNKNOWN] * count
         self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
         self.foreign_commands = 0  #: count of commands to these motors from another sender
         self.foreign_command = ""  #: the last of them, in words
         self.boards = Boards(motors)  #: what keeps them from serving this arm
         self.clock = clock
         self._now = clock.monotonic
-        self._ports = [CanPort(bus, clock, reopen)] * JOINT_COUNT if isinstance(bus, can.BusABC) else list(bus)
+        self._ports = [CanPort(bus, clock, reopen)] * count if isinstance(bus, can.BusABC) else list(bus)
         self._buses = list(dict.fromkeys(port for port in self._ports if port))
         self._failed: dict[CanPort, BusError] = {}  # in this cycle
         self._motors = tuple(motors)
@@ -95,11 +95,11 @@ class MotorBus:
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
-        self._drive = OFF  # last sent
+        self._drive = Drive.off(count)  # last sent
         self._has_sent = False  # anything: another owner's motors are left alone
-        self._corrected = [-math.inf] * JOINT_COUNT  # s
-        self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
-        self._held = [math.nan] * JOINT_COUNT  # rad
+        self._corrected = [-math.inf] * count  # s
+        self._contested = [-math.inf] * count  # s of the last foreign command to the motor
+        self._held = [math.nan] * count  # rad
         self._note = note
         self._answered: set[int] = set()
         self._requests = [Requests() for _ in motors]
@@ -165,9 +165,9 @@ class MotorBus:
         for port in self._buses:
             if port not in self._failed:
                 port.confirm()
-        if count < JOINT_COUNT:
+        if count < len(self.samples):
             missing = AT_REST._replace(time=max(self.samples[joint].time for joint in self._joints))
-            self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(JOINT_COUNT))
+            self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(len(self.samples)))
         self._raise_failure()
         return len(self._answered) == count
 

@@ -69,7 +69,8 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     """
     node, interface = f"{arm.namespace}/can_bridge", arm.can_bridge["can.interface"]
     bus_options = can_options(load(options.params)[node])
-    own = {name: each for name, (_, each) in buses_of(arm.can_bridge["can.channel"], bus_options).items()}
+    buses = buses_of(arm.can_bridge["can.channel"], bus_options, len(arm.motors))
+    own = {name: each for name, (_, each) in buses.items()}
     with ArmScan((interface, name, each) for name, each in own.items()) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         search = MotorSearch(bus, arm, options.wait, say)

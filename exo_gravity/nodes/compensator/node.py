@@ -70,8 +70,7 @@ class CompensatorNode(Node):
         self._control = Compensator(settings, self._names)
         self._weighing: Weighing | None = None
         self._threads: list[PeriodicThread] = []
-        if self._control.terms:
-            self._serve_wearer(self._control.terms)
+        self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
@@ -101,7 +100,7 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add what only the exoskeleton's own arm has: assistance, support on request, weighing."""
+        """Add assistance, support on request, and weighing."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
         self._threads += [
@@ -208,7 +207,6 @@ class CompensatorNode(Node):
 
     def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         settings, terms, last = self._control.settings, self._control.terms, self._weighing
-        assert terms  # else there is no such service
         rate = self._rate.value
         weighing = Weighing(settings, self._names, rate, last.empty if last else None)
         with self._lock:
@@ -230,7 +228,7 @@ class CompensatorNode(Node):
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else "none",
             **report(self._control, answer, self._names),
-            **({"weighing": self._weighing.text if self._weighing else "none"} if self._control.terms else {}),
+            "weighing": self._weighing.text if self._weighing else "none",
             "last refused message": self._refusal,
         }
 
@@ -258,7 +256,7 @@ class CompensatorNode(Node):
         if answer.effort is None:
             return ERROR, f"withdrawn: {answer.reason}"
         warnings = [answer.held] if answer.held else []
-        problem = self._control.terms.problem if self._control.terms else ""
+        problem = self._control.terms.problem
         if answer.fallback:
             warnings.append(f"the exact law replaces {self._control.settings.law}: {answer.fallback}")
         elif problem:
