@@ -26,7 +26,7 @@ from exo_gravity.core.compensation.terms.terms import TermSettings, term_paramet
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, param_of, params_of
-from exo_gravity.core.safety.limits import MAX_COMMAND
+from exo_gravity.core.safety.limits import MAX_EFFORT
 
 MODES = ("one_g", "zero_g")
 URDF_LAW = "urdf"  # chosen at the start, because it is that of another arm
@@ -52,7 +52,7 @@ class Settings:
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = NO_TORQUE  #: (4,) kg, the wearer's segment on each link
     wearer_cog: Sequence[float] = NO_TORQUE  #: (4,) m from joint n, its centre of gravity
-    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
+    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True

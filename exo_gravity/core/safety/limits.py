@@ -10,6 +10,8 @@ from typing import Any, ClassVar
 
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import (
     MAX_STATUS_RATE,
     MOTOR_PARAMETERS,
@@ -18,12 +20,14 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
-MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
+# An effort command beyond these is wrong: no joint with small motors needs half of the first, in Nm; and a large motor
+# gives its peak torque at most.
+MAX_COMMAND, MAX_OF_PEAK = 40.0, 2.0
+MAX_EFFORT = 500.0  # Nm, of any motor that a person's arm may hang in
 CONFIRM, HANGING = START_POSES = ("confirm", "hanging")
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
@@ -87,7 +91,7 @@ class Limits:
     max_effort: Sequence[float] = owned(
         tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS),
         "torque limit, by default the motors' rated torque",
-        (0.0, max(spec.peak_torque for spec in MOTORS.values())),
+        (0.0, MAX_EFFORT),
         "Nm",
     )
     driven_speed: float = owned(
@@ -126,6 +130,8 @@ class Limits:
     )
     #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(MOTORS[name].home_tolerance for name in USUAL_MOTORS)
+    #: (4,) Nm beyond which an effort command is wrong; `limits_of` takes it from the motors
+    max_command: Sequence[float] = (MAX_COMMAND,) * JOINT_COUNT
     channels: Sequence[str] = ("",) * JOINT_COUNT  #: of the motors' buses
     #: (4,) rad, the hanging arm, from which joint angles are measured
     home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
@@ -148,8 +154,8 @@ class Limits:
         low, high = self.position_min[i], self.position_max[i]
         faults = []
         if joint.error:
-            text = error_text(joint.error)
-            faults.append(Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})"))
+            reason = f"{name}: the motor reports error {joint.error} ({joint.trouble})"
+            faults.append(Fault(FaultCode.MOTOR_ERROR, reason))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
             faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason))
@@ -184,6 +190,7 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
     given["channels"] = channels_of(values["can.channel"])
     given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
+    given["max_command"] = tuple(max(MAX_COMMAND, MAX_OF_PEAK * MOTORS[name].peak_torque) for name in values["motor"])
     shortest = READING.reply_timeout
     given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)

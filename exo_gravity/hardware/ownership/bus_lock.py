@@ -25,7 +25,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive
-from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -107,7 +107,7 @@ class BusLock:
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
-        if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
+        if not all(abs(value) <= MAX_EFFORT for value in self.notes.drive.effort + self.notes.drive.damping):
             self.problem = f"{path}: damaged"
         if self.problem:
             self.notes.note(UNKNOWN_DRIVE)

@@ -19,9 +19,10 @@ from typing import Any, NamedTuple
 import can
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import COMMAND, EXTENDED, REPLY, pack_command
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE
-from exo_gravity.core.motors.specs import MOTORS, pack_command
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import LISTEN_TIME

@@ -15,9 +15,8 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.motors.ak import MIT, error_text
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
-from exo_gravity.core.motors.specs import error_text
-from exo_gravity.core.motors.wire_formats import MIT
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
