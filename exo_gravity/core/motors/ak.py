@@ -9,8 +9,8 @@ own ID or the master's (0). Reply, 6, 7 or 8 bytes:
 Older firmware ends after the torque. The open drive, from which the AK firmware descends, sends its supply voltage as
 the seventh byte, and nothing after it. No reply says whether the motor is on.
 
-`mit_v3`, V3 boards (CubeMars driver manual V3.0.0): 29-bit IDs, control mode << 8 | motor ID. Command, control mode 8, 8
-bytes, a big-endian bit stream, ranges in V3_RANGES:
+`mit_v3`, V3 boards (CubeMars driver manual V3.0.0): 29-bit IDs, control mode << 8 | motor ID. Command, control mode 8,
+8 bytes, a big-endian bit stream, ranges in V3_RANGES:
 
     kp 12 | kd 12 | position 16 | velocity 12 | torque 12        tau = kp (p - p_motor) + kd (v - v_motor) + torque
 
@@ -78,7 +78,8 @@ MODE_CURRENT, MODE_MIT, LAST_MODE = 1, 8, 15  # control modes of V3 boards
 STATUS = 0x29
 NO_CURRENT = bytes(4)  # int32, mA
 V3_POSITION_RANGE = 12.56  # rad
-# rad/s and Nm, the wire ranges of V3 boards by motor (manual V3.0.0, table of force control mode); of others none are known.
+# rad/s and Nm, the wire ranges of V3 boards by motor (manual V3.0.0, table of force control mode); of others none are
+# known. Public drivers disagree about the AK10-9: 28 and 54, or 33 and 65.
 V3_RANGES = {"AK10-9": (28.0, 54.0), "AK60-6": (60.0, 12.0), "AK80-9": (65.0, 18.0)}
 POSITION_STEP = math.radians(0.1)  # rad
 SPEED_STEP = 10.0 * 2.0 * math.pi / 60.0  # electrical rad/s

@@ -22,8 +22,8 @@ class BoardCheck:
     recent: float = 1.0  #: s for which a malformed frame counts as the reason for a missing reply
     window: float = 0.5  #: s over which status frames are counted, so that a start knows before its calm second is over
     share: float = 0.9  #: of the control rate that status frames must reach: the rest is jitter of that count
-    #: s after which a board is asked for a setting again, and s for which its answer counts; a start takes 1 s at least:
-    #: a board that has restarted, or was written to by a tool, is found out before
+    #: s after which a board is asked for a setting again, and s for which its answer counts; a start takes 1 s at
+    #: least: a board that has restarted, or was written to by a tool, is found out before
     ask_again: float = 0.5
     valid: float = 1.0
     restart: float = 2.0  #: s without a reply after which a motor may have been switched off and on

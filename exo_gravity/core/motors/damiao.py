@@ -1,8 +1,8 @@
 """Damiao motors (OpenArm, i2rt's YAM): a record of each type, and their frames in MIT mode, on CAN and CAN FD.
 
 Commands are those of MIT mode (`frames`), with the motor's ID, 1 to 15, as an 11-bit arbitration ID; FF x 7 and FC
-switches a motor on, FD off, FE makes its present angle zero and FB clears an error. A motor replies to each, with the ID
-that its register MST_ID holds, commonly its own + 0x10 (DM-J4310-2EC manual V1.0; docs of python-damiao-driver):
+switches a motor on, FD off, FE makes its present angle zero and FB clears an error. A motor replies to each, with the
+ID that its register MST_ID holds, commonly its own + 0x10 (DM-J4310-2EC manual V1.0; docs of python-damiao-driver):
 
     state 4 | motor ID 4 | position 16 | velocity 12 | torque 12 | MOSFET degC 8 | coil degC 8
 
@@ -10,9 +10,9 @@ The state is 0 off, 1 on, or an error that has switched the motor off: so a repl
 stays until FB, and until then FC is ignored. D (communication lost) is one, too: a motor that gets no command for its
 TIMEOUT lets go. It is no defect, so ENTER is FB and FC, and D counts as a motor that is off.
 
-Registers are read with the arbitration ID 0x7FF: motor ID 16 | 33 | register 8 | 0 32, little-endian. The answer has the
-motor's reply ID and the same first bytes, then the value, a float or an integer. 55 writes one. A joint is never near
-the position whose code these bytes would be in a reply.
+Registers are read with the arbitration ID 0x7FF: motor ID 16 | 33 | register 8 | 0 32, little-endian. The answer has
+the motor's reply ID and the same first bytes, then the value, a float or an integer. 55 writes one, and CC asks for the
+state alone. A joint is never near the position whose code these bytes would be in a reply.
 
 A motor obeys every 11-bit ID with its own lowest 8 bits: bits 8 to 10 name a control mode, and special frames work in
 each (read in a disassembled DM-J4310 firmware). So no reply ID may end with another motor's ID.
@@ -279,8 +279,8 @@ class DamiaoFormat(WireFormat):
         return data[3], float(value)
 
     def questions(self, motor_id: int) -> tuple[Frame, ...]:
-        """Return the questions for the reply ID and the state, which a motor that is on answers, too."""
-        return (read(motor_id, MST_ID), (REGISTERS, bytes((motor_id, 0, REFRESH, 0, 0, 0, 0, 0))))
+        """Return the question for the state, which commands nothing."""
+        return ((REGISTERS, bytes((motor_id, 0, REFRESH, 0, 0, 0, 0, 0))),)
 
 
 def read(motor_id: int, register: int) -> Frame:

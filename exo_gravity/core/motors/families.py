@@ -50,8 +50,8 @@ class ByName(Mapping[str, Item]):
 
 def _joined(of: Callable[[Family], Mapping[str, Item]], families: tuple[Family, ...]) -> dict[str, Item]:
     items: dict[str, Item] = {}
-    for family in reversed(families):
-        items |= of(family)
+    for family in families:
+        items.update((name, item) for name, item in of(family).items() if name not in items)
     return items
 
 

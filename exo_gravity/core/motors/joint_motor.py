@@ -15,8 +15,9 @@ from exo_gravity.core.motors.frames import EXTENDED, Frame, MotorSpec, Setting, 
 from exo_gravity.core.numbers import JOINT_COUNT, one_float
 from exo_gravity.core.params import Param
 
-# In the format `mit` the first byte of an AK motor's reply is its ID. The position of our commands is 0, unless they hold
-# a joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like replies.
+# In the format `mit` the first byte of an AK motor's reply is its ID. The position of our commands is 0, unless they
+# hold a joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like
+# replies.
 MAX_CAN_ID = 126
 MAX_MASTER_ID = 0x7FE
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
@@ -168,7 +169,7 @@ MOTOR_PARAMETERS = (
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
           fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
-    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit_v3 for V3 boards of AK motors, mit for all "
+    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit_v3 for V3 boards of AK motors, mit for "
           "others", choices=FORMATS, fixed=True),
     Param("master_id", [0] * 4, "CAN ID of a Damiao motor's replies; 0: its can_id + 16", (0, MAX_MASTER_ID),
           fixed=True),
