@@ -18,7 +18,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of
+from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, is_fd
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.nodes.imu import message_of
@@ -75,8 +75,11 @@ class Simulator(Node):
         self.failure: Exception | None = None
         self._stopping = threading.Event()
         (interface, channel, options), count = bus_of(self, values), len(self._device.motors)
-        buses = {name: open_bus(interface, name, own) for name, (_, own) in buses_of(channel, options, count).items()}
-        self._buses = [buses[name] for name in channels_of(channel, count)]  # of each motor
+        of_bus = {name: own for name, (_, own) in buses_of(channel, options, count).items()}
+        buses = {name: open_bus(interface, name, own) for name, own in of_bus.items()}
+        channels = channels_of(channel, count)
+        self._buses = [buses[name] for name in channels]  # of each motor
+        self._device.is_fd = [is_fd(of_bus[name]) for name in channels]
         names = " and ".join(str(bus.channel_info) for bus in buses.values())
         self.get_logger().info(f"simulated {values['side']} arm on {names}")
         self._thread = threading.Thread(target=self._play, name="device", daemon=True)

@@ -20,7 +20,7 @@ from collections.abc import Callable, Collection, Sequence
 import can
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
+from exo_gravity.core.motors.frames import EXTENDED, Frame
 from exo_gravity.hardware.can.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
@@ -46,6 +46,7 @@ class SimulatedDevice:
             raise ParameterError("can_id", ids, f"{count} different IDs, one per joint")
         self.arm, self.motors, self.side = arm, tuple(motors), side
         self.pitch = self.roll = 0.0  #: rad, of the trunk
+        self.is_fd: Sequence[bool] = (False,) * len(motors)  #: whether each motor sends CAN FD frames
         self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
         self.cut_off: Sequence[bool] = (False,) * count  #: the same for each motor
         self.mute: Sequence[bool] = (False,) * count  #: whether a motor's replies are lost, while it obeys
@@ -182,13 +183,13 @@ class SimulatedDevice:
                 heapq.heappush(outbox, (now + delay, joint, reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 _, joint, reply = heapq.heappop(outbox)
-                _send(bus_of[joint], reply)
+                _send(bus_of[joint], reply, self.is_fd[joint])
             for joint, period in periods.items():
                 if reports[joint] <= last:
                     following = reports[joint] + period
                     reports[joint] = following if following > last else last + period  # missed ones are not made up
                     if frame := self.status(joint):
-                        _send(bus_of[joint], frame)
+                        _send(bus_of[joint], frame, self.is_fd[joint])
             if not outbox:
                 on_idle(last)
 
@@ -201,7 +202,7 @@ class SimulatedDevice:
             if error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
             return None, 0.0
-        if message is None or message.is_error_frame or message.is_fd:
+        if message is None or message.is_error_frame or (message.is_fd and not any(self.is_fd)):
             return None, 0.0
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if frame_id not in self._joints_of_id or list(message.data[:1]) == [frame_id]:
@@ -266,8 +267,8 @@ def _next(buses: list[can.BusABC], timeout: float) -> tuple[can.BusABC, float]:
     return (ready or buses)[0], 0.0
 
 
-def _send(bus: can.BusABC, frame: Frame) -> None:
+def _send(bus: can.BusABC, frame: Frame, is_fd: bool) -> None:
     try:
-        bus.send(message_of(frame))
+        bus.send(message_of(frame, is_fd))
     except can.CanError as error:
         raise BusError(f"sending on {bus.channel_info} failed: {error}") from error

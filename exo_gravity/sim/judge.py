@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s

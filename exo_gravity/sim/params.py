@@ -15,8 +15,9 @@ from exo_gravity.hardware.urdf_arm import read_urdf
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, JointConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
-from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware, usual_firmware
+from exo_gravity.sim.motors import class_of, simulated
+from exo_gravity.sim.motors.ak import Heat
+from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 from exo_gravity.sim.truth import TruthLog
 from exo_gravity.sim.urdf import UrdfConfig
 
@@ -44,7 +45,7 @@ FIRMWARE = (
     Param(
         "firmware.variant",
         [USUAL] * JOINT_COUNT,
-        "what the boards' firmware does, docs/motors.md; usual: ak, or v3",
+        "what the boards' firmware does, docs/motors.md; usual: ak, v3, or that of the motor's family",
         choices=(USUAL, *FIRMWARES),
         fixed=True,
     ),
@@ -128,7 +129,7 @@ def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     arm = SimulatedArm(_arm_of(values, rotors))
     heat = Heat(**{param.name: values[f"heat.{param.name}"] for param in params_of(Heat)})
     variants = zip(joints, values["firmware.variant"], strict=True)
-    motors = [SimulatedMotor(joint, firmware_of(joint, variant, values), heat) for joint, variant in variants]
+    motors = [simulated(joint, firmware_of(joint, variant, values), heat) for joint, variant in variants]
     device = SimulatedDevice(arm, motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
     if "home" in values:
@@ -158,7 +159,7 @@ def _arm_of(values: Mapping[str, Any], rotors: Sequence[float]) -> JointConfig:
 
 def firmware_of(joint: JointMotor, variant: str, values: Mapping[str, Any]) -> Firmware:
     """Return the firmware of a motor: that of a variant, as parameter values change it. Raises ParameterError."""
-    firmware = usual_firmware(joint.wire_format) if variant == USUAL else FIRMWARES[variant]
+    firmware = class_of(joint.spec.family).usual_firmware(joint) if variant == USUAL else FIRMWARES[variant]
     timeout = values["firmware.timeout"]
     return replace(
         firmware,

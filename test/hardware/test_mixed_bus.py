@@ -11,8 +11,8 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ENTER, EXIT, EXTENDED, ID_BITS, WireFormat
 from exo_gravity.core.safety.drive import OFF, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine

@@ -14,8 +14,8 @@ from collections import Counter
 import can
 import pytest
 
+from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.trust import Readings

@@ -13,8 +13,8 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import MotorReply
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ID_BITS, MotorReply
 from exo_gravity.core.safety.drive import OFF, Send
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus

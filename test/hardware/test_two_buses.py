@@ -14,8 +14,9 @@ import pytest
 
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ID_BITS, WireFormat
 from exo_gravity.core.motors.joint_motor import channels_of
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.power import Power

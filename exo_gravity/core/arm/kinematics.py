@@ -24,7 +24,8 @@ import numpy as np
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 ROTORS = tuple(MOTORS[name].rotor_inertia for name in USUAL_MOTORS)  # kg m^2, where the motors are not known

@@ -38,13 +38,13 @@ from exo_gravity.core.params import (
     params_of,
     table_for,
 )
-from exo_gravity.core.safety.limits import MAX_COMMAND
+from exo_gravity.core.safety.limits import MAX_EFFORT
 
 MODES = ("one_g", "zero_g")
 # Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
 MAX_SCALE = 20.0
 MAX_CARRIED = 10.0  # kg, robot and wearer's share: the arm of a 150 kg wearer has 8; more is probably in another unit
-MAX_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
+LARGEST_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
 
 
 class UrdfModel(Arm, Protocol):
@@ -81,7 +81,7 @@ class Settings:
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none
     wearer_cog: Sequence[float] = ()  #: (n,) m from joint n, its centre of gravity
-    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_EFFORT), "Nm")
+    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
@@ -202,7 +202,7 @@ COMPENSATOR = (
           (0.0, MAX_PAYLOAD), "kg"),
     Param("payload.cog", [0.0] * 3, "its centre of gravity in frame 4: from the end of link 4, along x_4, y_4, z_4",
           (-MAX_REACH, MAX_REACH), "m", vector=True),
-    replace(param_of(Settings, "max_effort"), bounds=(0.0, MAX_COMMAND)),
+    replace(param_of(Settings, "max_effort"), bounds=(0.0, MAX_EFFORT)),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "inertial"),
     param_of(Settings, "shoulder_from_imu"),
@@ -253,7 +253,7 @@ def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
                 "description": "urdf computes the torque of any serial arm from its URDF"},
         "joint_names": {"vector": False,
                         "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
-        "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
+        "max_effort": {"default": [0.0] * count, "bounds": (0.0, LARGEST_EFFORT),
                        "description": "torque limit per joint; 0: the URDF's"},
         "spring.pose": {"default": [0.0] * count},
         "payload.cog": {"description": "its centre of gravity in the frame of the link urdf.hand"},

@@ -113,7 +113,10 @@ class FaultCode(str, Enum):
     # The efforts
     COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`", RESUME
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics say why", RESUME
-    COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
+    COMMAND_IMPOSSIBLE = (
+        "command_impossible",
+        "an effort is NaN, beyond 40 Nm (large motors: twice their peak torque), misnamed or missing",
+    )
     UNEXPLAINED_TORQUE = (
         "unexplained_torque",
         "the efforts exceed what gravity needs of any load up to `largest_moment`, plus `largest_addition`",

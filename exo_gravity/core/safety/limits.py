@@ -10,6 +10,8 @@ from typing import Any
 
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import (
     MAX_STATUS_RATE,
     MOTOR_PARAMETERS,
@@ -18,12 +20,14 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
 from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, for_joints
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
-MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
+# An effort command beyond these is wrong: no joint with small motors needs half of the first, in Nm; and a large motor
+# gives its peak torque at most.
+MAX_COMMAND, MAX_OF_PEAK = 40.0, 2.0
+MAX_EFFORT = 500.0  # Nm, of any motor that a person's arm may hang in
 CONFIRM, HANGING = START_POSES = ("confirm", "hanging")
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
@@ -87,7 +91,7 @@ class Limits:
     max_effort: Sequence[float] = owned(
         tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS),
         "torque limit, by default the motors' rated torque",
-        (0.0, max(spec.peak_torque for spec in MOTORS.values())),
+        (0.0, MAX_EFFORT),
         "Nm",
     )
     driven_speed: float = owned(
@@ -132,6 +136,8 @@ class Limits:
     )
     #: (n,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(MOTORS[name].home_tolerance for name in USUAL_MOTORS)
+    #: (n,) Nm beyond which an effort command is wrong; `limits_of` takes it from the motors
+    max_command: Sequence[float] = (MAX_COMMAND,) * JOINT_COUNT
     channels: Sequence[str] = ()  #: of the motors' buses, (n,); () if that does not matter
 
     def __post_init__(self) -> None:
@@ -139,7 +145,7 @@ class Limits:
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS or not all(names):
             raise ParameterError("joint_names", list(names), f"1 to {MAX_JOINTS} different names")
         check_owned(self, len(names))
-        for name in ("max_velocity", "home_tolerance"):
+        for name in ("max_velocity", "home_tolerance", "max_command"):
             object.__setattr__(self, name, for_joints(getattr(self, name), len(names)))
         object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
         if any(self.largest_moment) and len(names) != JOINT_COUNT:
@@ -162,8 +168,8 @@ class Limits:
         low, high = self.position_min[i], self.position_max[i]
         faults = []
         if joint.error:
-            text = error_text(joint.error)
-            faults.append(Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})"))
+            reason = f"{name}: the motor reports error {joint.error} ({joint.trouble})"
+            faults.append(Fault(FaultCode.MOTOR_ERROR, reason))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
             faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason))
@@ -198,6 +204,7 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
     given["channels"] = channels_of(values["can.channel"], len(values["joint_names"]))
     given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
+    given["max_command"] = tuple(max(MAX_COMMAND, MAX_OF_PEAK * MOTORS[name].peak_torque) for name in values["motor"])
     shortest = READING.reply_timeout
     given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)

@@ -237,9 +237,20 @@ class SafetyMachine:
             self._attempts += 1
         if self._readings.fault:
             return self._readings.fault
+        if self.state in CARRIED and (found_off := self._found_off()):
+            return found_off
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
+
+    def _found_off(self) -> Fault | None:
+        """Return the fault of a motor that was switched on, and whose replies say that it is off."""
+        motors = zip(self.limits.joint_names, self.power, self._readings.joints, strict=True)
+        for name, power, joint in motors:
+            if power.state is Power.ON and power.is_told_off:
+                why = f": {joint.trouble}" if joint.trouble else ""
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, f"{name}: its motor says that it is off{why}")
+        return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
         if self.state in CARRIED:
@@ -363,7 +374,7 @@ class SafetyMachine:
         send = self._sends()
         for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
             asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
-            is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
+            is_off = power.is_told_off or (is_missing and abs(joint.effort) < POWER.off_share * abs(asked))
             if is_off and power.state is Power.ON and power.may_return and not joint.error:
                 power.may_return = False
                 self._readings.doubt()

@@ -19,7 +19,7 @@ from itertools import accumulate
 
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode
-from exo_gravity.core.safety.limits import MAX_COMMAND, Limits
+from exo_gravity.core.safety.limits import Limits
 
 GRAVITY = 9.81  # m/s^2
 ALONG_BASE = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
@@ -68,7 +68,8 @@ class MotionMonitor:
 
         age: s since the pose that the effort answers. An impossible effort is returned as it is.
         """
-        if not self._is_on or not all(abs(torque) <= MAX_COMMAND for torque in effort):
+        asked = zip(effort, self._limits.max_command, strict=True)
+        if not self._is_on or not all(abs(torque) <= most for torque, most in asked):
             return effort, None
         fastest = max([abs(joint.velocity) for joint in joints])
         lowest, highest = self.explained([joint.position for joint in joints])

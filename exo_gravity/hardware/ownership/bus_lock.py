@@ -24,7 +24,7 @@ from pathlib import Path
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.core.safety.drive import Drive, Send
-from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -76,7 +76,7 @@ class DriveNotes(ctypes.Structure):
     def is_damaged(self) -> bool:
         """Whether these are no notes: numbers that no drive has."""
         drive = self.drive
-        return self._count != len(drive.effort) or not all(abs(x) <= MAX_COMMAND for x in drive.effort + drive.damping)
+        return self._count != len(drive.effort) or not all(abs(x) <= MAX_EFFORT for x in drive.effort + drive.damping)
 
     @property
     def owner(self) -> str:
