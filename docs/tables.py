@@ -36,7 +36,7 @@ COMMAND = "python docs/tables.py"
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
-    "urdf_arm": urdf_table(1, ["command_interface"]),
+    "urdf_arm": urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"}),
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,

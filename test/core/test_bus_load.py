@@ -155,4 +155,4 @@ def test_each_bus_has_the_load_of_its_own_motors():
 )
 def test_channels_and_options_that_are_not_one_per_motor_are_refused(channel, options, problem):
     with pytest.raises(ParameterError, match=problem):
-        buses_of(channel, options)
+        buses_of(channel, options, 4)

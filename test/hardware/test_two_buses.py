@@ -70,7 +70,7 @@ class TwoBusRig(VirtualRig):
         near = HalfPlayed(self.first, self, (0, 1))
         self.halves = near, HalfPlayed(self.second, self, (2, 3), near)
         address: Address = ("wire", f"{FIRST},{FIRST},{SECOND},{SECOND}", {})
-        limits = replace(LIMITS, channels=channels_of(address[1]))
+        limits = replace(LIMITS, channels=channels_of(address[1], 4))
         self.arm = ArmOnWires(address, self.motors, limits, CYCLE, self.wires)
 
     @property

@@ -210,7 +210,7 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
     boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=400.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
     with ExitStack() as opened:
-        names = channels_of(channel)
+        names = channels_of(channel, 4)
         buses = {name: opened.enter_context(can.Bus(interface="virtual", channel=name)) for name in set(names)}
         hold = lambda now: device.arm.reset(arm.pose.tolist())  # noqa: E731
         thread = threading.Thread(target=device.run, args=([buses[name] for name in names], stop.is_set, hold))

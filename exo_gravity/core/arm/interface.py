@@ -1,6 +1,6 @@
 """What everything that carries an arm of n joints asks of it: gravity, inertia, and what it holds.
 
-`PaperArm` (core/arm/paper_arm.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm
+`ArmModel` (core/arm/arm.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm
 that a URDF describes.
 """
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import ArmData
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
 from exo_gravity.core.motors.ak import USUAL_MOTORS
@@ -147,7 +147,7 @@ def least_inertia(links: LinkInertia) -> tuple[float, ...]:
 
 
 @lru_cache(8)
-def links_of(arm: ArmModel) -> LinkInertia:
+def links_of(arm: ArmData) -> LinkInertia:
     """Return the inertia of `arm` with the usual rotors; approximate if it is given by its moments."""
     load, lever = arm.payload[0], float(arm.length[3]) + arm.payload[1]  # a point in the hand
     if arm.by_moments:
@@ -176,7 +176,7 @@ def _torque(links: Sequence[Frame], weights: Sequence[Sequence[float]], second: 
     return torque[::-1]
 
 
-def turning_torque(arm: ArmModel, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+def turning_torque(arm: ArmData, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
     """Return the torque (4,) in Nm that turns the `side` arm at `theta` (4,) rad along with its base.
 
     A trunk that turns faster and faster takes the arm along only if the motors accelerate it. What depends on speed is

@@ -16,11 +16,11 @@ from exo_gravity.core.arm.arm import (
     MAX_PAYLOAD,
     MAX_REACH,
     STANDARD_GRAVITY,
+    ArmModel,
     ModelError,
 )
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.paper_arm import PaperArm
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
@@ -273,7 +273,7 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         anfis = AnfisLaw.load(read(path)) if path and read else None
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    by_mass = PaperArm(values["link_length"], values["robot.cog"], values["robot.mass"])
+    by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
     return _settings_of(values, values["side"], robot_of(values), wearer_of(values), anfis=anfis, robot_by_mass=by_mass)
 
 
@@ -310,14 +310,14 @@ def _settings_of(
     )
 
 
-def robot_of(values: Mapping[str, Any]) -> PaperArm:
+def robot_of(values: Mapping[str, Any]) -> ArmModel:
     """Return the robot's arm, by its moments if robot.first_moment has any, or raise ParameterError."""
     length, along, across = (values[name] for name in ("link_length", "robot.first_moment", "robot.off_axis"))
     rest = values["gain"], values["gravity"]
     with named("robot."):
         if any(along):
-            return PaperArm.from_moments(length, along, across, *rest)
-        return PaperArm(length, values["robot.cog"], values["robot.mass"], *rest, across)
+            return ArmModel.from_moments(length, along, across, *rest)
+        return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, across)
 
 
 def wearer_of(

@@ -341,7 +341,7 @@ def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> dict[st
     Raises ParameterError.
     """
     traffic, interface = {}, values["can.interface"]
-    for name, (motors, own) in buses_of(values["can.channel"], options, len(values["can_id"])).items():
+    for name, (motors, own) in buses_of(values["can.channel"], options, len(values["wire_format"])).items():
         bitrate = own.get("bitrate")
         if bitrate is None and interface in NEED_BITRATE:
             expected = f"set for {interface}, as on the motors, e.g. {BITRATE}"
