@@ -2,8 +2,8 @@
 
 A laboratory's own motors need no fork: a distribution that names a `Family` under the entry point group GROUP in its
 pyproject.toml or setup.cfg is found here, e.g. `our_motors = our_lab.motors:FAMILY`. Its simulated twin is named in a
-second group (sim/motors/__init__.py). Entry points are looked up when a name is not one of ours, and listed from then on:
-an ordinary start does not pay for them.
+second group (sim/motors/__init__.py). Entry points are looked up when a name is not one of ours, and listed from then
+on: an ordinary start does not pay for them.
 """
 
 from collections.abc import Callable, Iterator, Mapping
