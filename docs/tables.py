@@ -16,8 +16,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
-from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.families import MOTORS, OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
