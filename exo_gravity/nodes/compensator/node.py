@@ -74,8 +74,7 @@ class CompensatorNode(Node):
         self._weighing: Weighing | None = None
         self._weighings, self._weighing_refusal = 0, NO_REASON
         self._threads: list[PeriodicThread] = []
-        if self._control.terms:
-            self._serve_wearer(self._control.terms)
+        self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
@@ -105,7 +104,7 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add what only the exoskeleton's own arm has: assistance, support on request, weighing."""
+        """Add assistance, support on request, and weighing."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
         self._threads += [
@@ -213,7 +212,6 @@ class CompensatorNode(Node):
 
     def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         settings, terms, last = self._control.settings, self._control.terms, self._weighing
-        assert terms  # else there is no such service
         rate = self._rate.value
         weighing = Weighing(settings, self._names, rate, last.empty if last else None)
         with self._lock:
@@ -241,7 +239,7 @@ class CompensatorNode(Node):
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else NONE,
             **report(self._control, answer, self._names),
-            **(weighing if self._control.terms else {}),
+            **weighing,
             "refused message": self._refused_topic,
             "refused message text": self._refusal,
         }
