@@ -244,7 +244,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
         low, high = own / WIRE_RANGE_FACTOR, own * WIRE_RANGE_FACTOR
         if given[name] and not low <= given[name] <= high:
-            expected = f"0, the usual one, or from {low:g} to {high:g} for an {plain.name}"
+            expected = f"0, the usual one, or from {low:g} to {high:g} for motor = {plain.name}"
             raise ParameterError(name, given[name], expected)
     if given["torque_per_ampere"] and board.replies:
         expected = f"0 with wire_format = {board.name}, whose replies carry the torque itself"
