@@ -269,7 +269,7 @@ COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and
 V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
 # Of CAN FD frames with 11-bit IDs and 8 bytes: at the bit rate of arbitration, and at that of data.
 FD_BITS = FrameBits(32, 34)
-FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(100, 113)
+FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(99, 113)
 
 
 @dataclass(frozen=True)
