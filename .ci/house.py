@@ -97,7 +97,7 @@ def generated_tables() -> Iterator[str]:
         places |= {found[2] for found in tables.TABLE.finditer(document)}
         for table in tables.stale_tables(document):
             yield f"{path.relative_to(ROOT)}: table {table} differs from the code; run {tables.COMMAND}"
-    if missing := {*tables.PARAMETERS, "faults", "firmwares", "topics"} - places:
+    if missing := {*tables.PARAMETERS, "faults", "firmwares", "motors", "topics"} - places:
         yield f"no document has a place for the tables {', '.join(sorted(missing))}"
     if text_of(states.PICTURE) != states.drawing():
         yield "docs/states.svg differs from the transitions; run python docs/states.py"

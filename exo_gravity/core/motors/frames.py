@@ -146,7 +146,8 @@ class Setting(NamedTuple):
     question: Frame  #: which the board answers with the value
     low: float  #: the least value that is right
     high: float  #: and the largest
-    must: str  #: what is right, and where else than on the board it could be changed
+    parameter: str  #: of the file that states it, '' for none
+    unit: float  #: of that parameter, that 1 on the board means
 
 
 def is_special(data: bytes | bytearray) -> bool:

@@ -254,7 +254,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
         low, high = own / WIRE_RANGE_FACTOR, own * WIRE_RANGE_FACTOR
         if given[name] and not low <= given[name] <= high:
-            expected = f"0, the usual one, or from {low:g} to {high:g} for an {plain.name}"
+            expected = f"0, the usual one, or from {low:g} to {high:g} for motor = {plain.name}"
             raise ParameterError(name, given[name], expected)
     if given["torque_per_ampere"] and board.replies:
         expected = f"0 with wire_format = {board.name}, whose replies carry the torque itself"
@@ -279,7 +279,7 @@ COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and
 V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
 # Of CAN FD frames with 11-bit IDs and 8 bytes: at the bit rate of arbitration, and at that of data.
 FD_BITS = FrameBits(32, 34)
-FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(100, 113)
+FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(99, 113)
 
 
 @dataclass(frozen=True)
