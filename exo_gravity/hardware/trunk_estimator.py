@@ -24,7 +24,6 @@ from exo_gravity.core.arm.rotation import (
     Quaternion,
     plus,
     product,
-    three_floats,
     unit_quaternion,
     up_in_body,
 )
