@@ -2,21 +2,17 @@
 
 A URDF gives each link's mass and centre of gravity and each joint's place and axis. With the joint velocities and
 accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`). Gravity
-comes as a vector in the root link's axes, so that the base may tilt.
+comes as a vector in the root link's axes, so that the base may tilt. `urdf_checks` judges what the URDF leaves out.
 """
 
-import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from exo_gravity.core.errors import ParameterError
-
-TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
+from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 
 
 class UrdfArm:
-    """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
+    """The arm that `joint_names` (n,) move in the URDF `text`.
 
     A `GravityModel` of `core.compensation.laws`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where
     it has none; mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its
@@ -28,35 +24,33 @@ class UrdfArm:
             import pinocchio as pin
         except ImportError:
             raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
-        try:
-            self._model = pin.buildModelFromXML(text)
-        except (RuntimeError, ValueError) as error:
-            expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
-            raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
-        self._data = self._model.createData()
-        self._pin, self._neutral = pin, pin.neutral(self._model)
-        numbers = dict(zip(self._model.names, range(self._model.njoints), strict=True))
-        turning = [name for name, n in numbers.items() if n and self._model.joints[n].shortname().startswith(TURNING)]
-        for name in joint_names:
-            if name not in turning:
-                expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
-                raise ParameterError("joint_names", name, expected)
-        self._order = [self._model.joints[numbers[name]].idx_v for name in joint_names]
-        limits = (float(self._model.effortLimit[index]) for index in self._order)
-        self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
-        pin.computeSubtreeMasses(self._model, self._data)
-        self.mass = max(self._data.mass[numbers[name]] for name in joint_names)
+        self.joints = joints = UrdfJoints(pin, text, joint_names)
+        pin.computeSubtreeMasses(joints.model, joints.data)
+        self.mass = max(joints.data.mass[joints.model.getJointId(name)] for name in joint_names)
         if not self.mass > 0.0:
             raise ParameterError("mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements")
+        self.max_effort, unused = usable_efforts(joints)
+        #: sentences on what is doubtful in the URDF, for the log
+        self.notes = (*check_masses(joints), *unused)
+        if joints.others:
+            names = ", ".join(other.name for other in joints.others)
+            note = f"{names} change the torque and are not in joint_names: at 0, unless the joint states have them"
+            self.notes += (note,)
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> tuple[float, ...]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
 
         gravity: (3,) m/s^2 in the axes of the URDF's root link.
+
+        Raises ParameterError while a joint on which it depends is not known (`follow`).
         """
-        moved = np.zeros(self._model.nv)
-        moved[self._order] = theta
-        q = self._pin.integrate(self._model, self._neutral, moved)
-        self._model.gravity.linear = np.array(gravity)
-        torque = self._pin.computeGeneralizedGravity(self._model, self._data, q)
-        return tuple(float(torque[index]) for index in self._order)
+        return tuple(self.joints.torque(theta, gravity).tolist())
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """The joints on which the torque depends, and which are taken to be at 0 because none is reported."""
+        return self.joints.fixed
+
+    def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take the positions (m,) of all joints that are reported, by their names (m,); see `UrdfJoints.follow`."""
+        self.joints.follow(names, positions)

@@ -36,6 +36,15 @@ class GravityModel(Protocol):
     max_effort: tuple[float, ...]  #: the joints' own limits, (n,) Nm; 0 if not known
     mass: float  #: kg that the joints carry
 
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """Other joints on which the torque depends, and which are taken to be at 0."""
+        ...
+
+    def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take the positions (m,) of all joints that are reported, by name; raises ParameterError if one is missing."""
+        ...
+
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root link's axes."""
         ...

@@ -209,7 +209,7 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
                 "description": "urdf computes the torque of any serial arm from its URDF"},
         "joint_names": {"default": [f"joint{n + 1}" for n in range(count)],
-                        "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
+                        "description": "in the order of the commands; other joints are where the joint states say, or at 0"},
         "gain": {"default": [1.0] * count, "description": "scales the torque of each joint"},
         "gravity": {},
         "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
@@ -259,7 +259,9 @@ def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> Settings
     limits = []
     for name, given, own in zip(values["joint_names"], values["max_effort"], model.max_effort, strict=True):
         if not (given or own):
-            raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
+            raise ParameterError(
+                f"max_effort of {name}", given, "greater than 0, because the URDF has no usable effort limit"
+            )
         limits.append(given or own)
     law = UrdfLaw(model, values["gain"], values["gravity"])
     others = {name: values[name] for name in ("max_effort_rate", "tilt_timeout", "use_imu")}

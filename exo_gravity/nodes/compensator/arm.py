@@ -50,6 +50,10 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
     model = UrdfArm(_description(node, values), values["joint_names"])
+    for note in model.notes:
+        node.get_logger().warning(note)
+    if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
+        model.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
     return table, values, lambda values: settings.urdf_settings_of(values, model)
 
 
@@ -79,6 +83,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
     values["mass carried (kg)"] = f"{s.mass:.3f}"
     if s.urdf:
         values["gain"] = row(s.urdf.gain)
+        values["joints taken to be at 0"] = ", ".join(s.urdf.model.fixed) or "none"
     if s.robot:
         values |= {
             "mode": s.mode,

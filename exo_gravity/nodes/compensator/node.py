@@ -154,6 +154,8 @@ class CompensatorNode(Node):
         now = time.monotonic()
         try:
             theta, velocity = self._interface.read(message)
+            if self._control.settings.urdf:
+                self._control.settings.urdf.model.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
                 answer = Compensation.withdrawn(self._interface.problem)
             else:
