@@ -108,7 +108,7 @@ def test_a_link_with_a_shape_and_no_mass_is_refused_where_a_joint_of_the_arm_mov
 
 
 def test_equal_masses_in_the_joints_are_placeholders_and_refused_unless_they_hardly_matter() -> None:
-    with pytest.raises(ParameterError, match="mass of link_1, .* link_6 .* make 100% of the torque"):
+    with pytest.raises(ParameterError, match=r"mass of link_1, .* link_6 .* make 100% of the torque"):
         UrdfArm(KR16, [f"joint_a{n}" for n in range(1, 7)])
     two = (link("l2", 0.02, 0.0), link("l3", 0.02, 0.0))
     (note,) = UrdfArm(chain(link("l1"), *two, *THREE[3:]), ["j1", "j2", "j3"]).notes

@@ -209,7 +209,7 @@ def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
                 "description": "urdf computes the torque of any serial arm from its URDF"},
         "joint_names": {"default": [f"joint{n + 1}" for n in range(count)],
-                        "description": "in the order of the commands; other joints are where the joint states say, or at 0"},
+                        "description": "in the order of the commands; other joints: from the joint states, or at 0"},
         "gain": {"default": [1.0] * count, "description": "scales the torque of each joint"},
         "gravity": {},
         "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
