@@ -225,13 +225,49 @@ class ReportedTurns:
             self._agreed += dt
 
 
+@dataclass(frozen=True)
+class ConstantLimits:
+    """When an orientation without a gyroscope beside it is taken for one that is filled in."""
+
+    same: float = math.radians(0.05)  #: rad, within which it stays; a person sways more, and a filter has noise
+    time: float = 0.5  #: s for which it stays there,
+    turn: float = math.radians(3.0)  #: rad by which gravity has meanwhile turned by the accelerometer,
+    near_gravity: float = 0.05  #: share of 1 g within which it shows gravity
+    smooth_time: float = 0.15  #: s over which it is averaged
+
+
+class ConstantOrientation:
+    """An orientation that stays exactly the same while gravity turns by the accelerometer is filled in."""
+
+    limits = ConstantLimits()
+    _up = ZERO  # since it last changed
+    _force = _first = UPWARD  # the acceleration now and when it last changed
+    _since = 0.0  # s
+
+    def check(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
+        """Take the orientation at the end of the next `dt` s; the rest is as for `Agreement`. Raises Contradiction."""
+        limits, change = self.limits, plus(acceleration, self._force, -1.0)
+        self._force = plus(self._force, change, min(1.0, dt / limits.smooth_time))
+        if math.dist(up, self._up) > limits.same:
+            self._up, self._first, self._since = up, self._force, 0.0
+            return
+        self._since += dt
+        length = math.hypot(*self._force)
+        cosine = dot(self._force, self._first) / (length * math.hypot(*self._first))
+        has_turned = cosine < math.cos(limits.turn) and abs(length - 1.0) < limits.near_gravity
+        if has_turned and self._since > limits.time:
+            expected = "different after gravity has turned by linear_acceleration: does the driver fill it in?"
+            raise Contradiction("orientation", [round(component, 3) for component in up], expected)
+
+
 class Agreement:
     """All of these checks on one estimate from its start. Every method raises Contradiction."""
 
     def __init__(self, is_suspect: bool = False) -> None:
         #: whether the samples must agree on a turn, or the trunk rest, before the estimate is used
         self.is_suspect = is_suspect
-        self._mean, self._turns, self._reported = MeanAcceleration(), Turns(), ReportedTurns()
+        self._mean, self._turns = MeanAcceleration(), Turns()
+        self._reported, self._constant = ReportedTurns(), ConstantOrientation()
 
     @property
     def has_seen_gravity(self) -> bool:
@@ -267,6 +303,7 @@ class Agreement:
         """
         self._mean.check(dt, rotated(quaternion, acceleration))
         if turn is None:
+            self._constant.check(dt, up_in_body(quaternion), acceleration)
             self.is_suspect = self.is_suspect and self._mean.age < self._turns.limits.quiet_time
             return
         self._reported.check(dt, up_in_body(quaternion), turn, jolt)

@@ -81,7 +81,8 @@ def check_unit(acceleration: Floats3, last: Floats3 | None) -> None:
         if max(map(abs, acceleration)) < SAMPLE.dead:
             expected = "9.8 m/s^2 upward at rest: the accelerometer is dead, or its driver removes gravity"
             raise ParameterError("linear_acceleration", acceleration, expected)
-        if last and math.dist(plus(ZERO, acceleration, STANDARD_GRAVITY), last) < SAMPLE.same * STANDARD_GRAVITY:
+        converted = plus(ZERO, acceleration, STANDARD_GRAVITY)
+        if last and math.dist(last, converted) < SAMPLE.same * STANDARD_GRAVITY < math.dist(last, acceleration):
             raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
 
 
