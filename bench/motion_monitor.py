@@ -29,8 +29,8 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import Limits

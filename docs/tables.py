@@ -15,8 +15,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import MIT_V3
+from exo_gravity.core.motors.ak import MIT_V3
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
@@ -36,7 +36,7 @@ COMMAND = "python docs/tables.py"
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
-    "urdf_arm": urdf_table(1, ["command_interface"]),
+    "urdf_arm": urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"}),
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,

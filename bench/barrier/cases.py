@@ -18,8 +18,9 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits

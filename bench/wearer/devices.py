@@ -25,8 +25,8 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.tours import moments_from, wearer_from

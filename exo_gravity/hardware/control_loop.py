@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
-from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, OFF, Drive, Efforts, FaultCode, Send, State
+from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Drive, Efforts, FaultCode, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.monitors import RestTracker
@@ -119,7 +119,7 @@ class ControlLoop:
             safety.probe(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
-        self._drive = OFF  # last decided
+        self._drive = Drive.off(len(bus.samples))  # last decided
         self._foreign_commands = 0  # so far
         self._suspended = bus.clock.suspended()  # s, so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
@@ -295,4 +295,4 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             confirmed = [was or sample.time >= now for was, sample in samples]
         clock.sleep(max(0.0, now + period - clock.monotonic()))
     with contextlib.suppress(Exception):
-        bus.exchange(OFF, clock.monotonic() + period)
+        bus.exchange(Drive.off(len(effort)), clock.monotonic() + period)

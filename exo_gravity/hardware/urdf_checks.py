@@ -21,7 +21,10 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 
 Pinocchio = Any  # the module, and its models: it has no type hints
+TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
 SHAPES = ("visual", "collision")
+LARGEST = 1e3  # rad or m, of a limit that is none
+TINY = 1e-12  # Nm
 
 
 @dataclass(frozen=True)
@@ -54,67 +57,72 @@ class Other(NamedTuple):
     upper: float
 
     @property
-    def is_fixed_at_zero(self) -> bool:
-        """Whether it can be at 0, where it is taken to be as long as no position is reported."""
+    def can_be_at_zero(self) -> bool:
+        """Whether 0 is within its limits: there it is taken to be as long as no position is reported."""
         return self.lower <= 0.0 <= self.upper
 
 
 class UrdfJoints:
-    """How the joints of a model move: the arm's by themselves, mimic joints with them, others as is reported.
+    """How the joints of a URDF move: the arm's by themselves, mimic joints with them, others as is reported.
 
     pin: the module pinocchio. text: of the URDF. joint_names: (n,) of the arm. Raises ParameterError if the text is not
     a URDF, or if a joint is not in it, does not turn, or follows another one.
+
+    model: of Pinocchio, with the joints alone that move. Its velocities (nv,) follow from the arm's (n,) by `spread`,
+    and torques (n,) of the arm from those of its joints by `folded`.
     """
 
     def __init__(self, pin: Pinocchio, text: str, joint_names: Sequence[str]) -> None:
         try:
-            model = pin.buildModelFromXML(text)
+            self.model = pin.buildModelFromXML(text)
         except (RuntimeError, ValueError) as error:
             expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
             raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
-        self._pin, self.model, self.data = pin, model, model.createData()
+        self._pin = pin
         self.root = ElementTree.fromstring(text)  #: the `robot` element
         self.names = tuple(joint_names)
-        self._neutral = pin.neutral(model)
         self._mimics = dict(_mimics(self.root))
-        movable = {model.names[n]: model.joints[n] for n in range(1, model.njoints) if model.joints[n].nv == 1}
-        turning = [name for name, joint in movable.items() if joint.shortname().startswith("JointModelR")]
+        movable = {self.model.names[n]: joint for n, joint in enumerate(self.model.joints) if n and joint.nv == 1}
+        turning = [name for name, joint in movable.items() if joint.shortname().startswith(TURNING)]
         for name in self.names:
             if name in self._mimics:
                 raise ParameterError("joint_names", name, f"{self._mimics[name].joint}, which that joint follows")
             if name not in turning:
                 expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
                 raise ParameterError("joint_names", name, expected)
-        leaders = {name: self._leader(name) for name in movable}
-        free = sorted({leader.joint for leader in leaders.values() if leader.joint in movable} - set(self.names))
-        self._free = [self._other(name, movable[name]) for name in free]
-        order = [*self.names, *free]
-        #: (nv, n + free): how far each joint of the model moves with those that move by themselves
-        self._coupling, self._offset = np.zeros((model.nv, len(order))), np.zeros(model.nv)
-        for name, (leader, multiplier, offset) in leaders.items():
-            self._offset[movable[name].idx_v] = offset
-            if leader in order:
-                self._coupling[movable[name].idx_v, order.index(leader)] = multiplier
+        self._leaders = {name: self._leader(name) for name in movable}
+        free = sorted({leader.joint for leader in self._leaders.values() if leader.joint in movable} - set(self.names))
         self._reported: dict[str, float] = {}
-        self._at = np.array([min(max(0.0, other.lower), other.upper) for other in self._free])
-        self.index = [movable[name].idx_v for name in self.names]  #: of the arm's joints, in the model's velocity
+        self.others = [self._limits(name) for name in free]  #: joints that are not the arm's and change its torque
+        self._couple()
         self.peak, effects = self._tried()  #: (n,) Nm, the largest torque that gravity needs in any pose and tilt
-        #: the joints that are not the arm's and change its torque
-        self.others = tuple(other for other, effect in zip(self._free, effects, strict=True) if effect > LIMITS.share)
+        self._lock([other for other, effect in zip(self.others, effects, strict=True) if effect > LIMITS.share])
 
     def of(self, text: str) -> "UrdfJoints":
         """Return the same joints in the URDF `text`."""
         return UrdfJoints(self._pin, text, self.names)
 
-    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; gravity: (3,) m/s^2, root link's axes.
+    def configuration(self, theta: Sequence[float]) -> np.ndarray:
+        """Return Pinocchio's configuration (nq,) for the angles `theta` (n,) in rad.
 
         Raises ParameterError while a joint that cannot be at 0 is not reported.
         """
         for other in self.others:
-            if not other.is_fixed_at_zero and other.name not in self._reported:
+            if not other.can_be_at_zero and other.name not in self._reported:
                 raise _missing(other)
-        return self._torque(np.concatenate((theta, self._at)), gravity)
+        return self._placed(np.asarray(theta, dtype=float), self._at)
+
+    def spread(self, values: Sequence[float]) -> np.ndarray:
+        """Return the velocities or accelerations (nv,) of the model for the arm's (n,)."""
+        return np.asarray(self._own @ np.asarray(values))
+
+    def folded(self, torque: np.ndarray) -> np.ndarray:
+        """Return the torque (n,) in Nm of the arm's joints for that of all joints of the model, (nv,)."""
+        return np.asarray(self._own.T @ torque)
+
+    def folded_matrix(self, matrix: np.ndarray) -> np.ndarray:
+        """Return the mass matrix (n, n) of the arm for that of the model, (nv, nv)."""
+        return np.asarray(self._own.T @ matrix @ self._own)
 
     def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take the positions (m,) of all joints that are reported, by their names (m,).
@@ -124,38 +132,73 @@ class UrdfJoints:
         """
         for other in self.others:
             if other.name not in names:
-                if other.name in self._reported or not other.is_fixed_at_zero:
+                if other.name in self._reported or not other.can_be_at_zero:
                     raise _missing(other)
                 continue
             position = float(positions[list(names).index(other.name)])
             if not math.isfinite(position):
                 raise ParameterError(f"position of {other.name}", position, "finite: the arm's torque depends on it")
-            self._reported[other.name] = self._at[self._free.index(other)] = position
+            self._reported[other.name] = self._at[self.others.index(other)] = position
 
     @property
     def fixed(self) -> tuple[str, ...]:
         """The other joints that are taken to be at 0, because none is reported."""
         return tuple(other.name for other in self.others if other.name not in self._reported)
 
-    def _torque(self, positions: np.ndarray, gravity: Sequence[float]) -> np.ndarray:
-        q = self._pin.integrate(self.model, self._neutral, self._coupling @ positions + self._offset)
-        self.model.gravity.linear = np.array(gravity)
-        torque = self._pin.computeGeneralizedGravity(self.model, self.data, q)
-        return np.asarray(self._coupling[:, : len(self.names)].T @ torque)
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence on the other joints, for the log."""
+        if not self.others:
+            return ()
+        names = ", ".join(other.name for other in self.others)
+        return (f"{names} change the torque and are not in joint_names: at 0, unless the joint states have them",)
+
+    def _couple(self) -> None:
+        """Find how the joints of the model follow the arm's and the others."""
+        model, order = self.model, [*self.names, *(other.name for other in self.others)]
+        coupling, self._offset = np.zeros((model.nv, len(order))), np.zeros(model.nv)
+        for number, name in enumerate(model.names):
+            if number and name in self._leaders:
+                leader, multiplier, self._offset[model.joints[number].idx_v] = self._leaders[name]
+                if leader in order:
+                    coupling[model.joints[number].idx_v, order.index(leader)] = multiplier
+        self._coupling, self._own = coupling, coupling[:, : len(self.names)]
+        self._neutral, self._data = self._pin.neutral(model), model.createData()
+        self._at = np.array([min(max(0.0, other.lower), other.upper) for other in self.others])
+
+    def _lock(self, others: list[Other]) -> None:
+        """Keep the arm's joints, `others`, and what follows them; lock all other joints of the model."""
+        kept = {*self.names, *(other.name for other in others)}
+        names = enumerate(self.model.names)
+        locked = [n for n, name in names if n and (name not in self._leaders or self._leaders[name].joint not in kept)]
+        self.model = self._pin.buildReducedModel(self.model, locked, self._placed(np.zeros(len(self.names)), self._at))
+        self.others = others
+        self._couple()
+
+    def _placed(self, positions: np.ndarray, at: Sequence[float] | np.ndarray = ()) -> np.ndarray:
+        """Return the configuration for the positions of the arm's joints and, `at`, of the others."""
+        moved = self._coupling @ np.concatenate((positions, at)) + self._offset
+        return np.asarray(self._pin.integrate(self.model, self._neutral, moved))
+
+    def _torque(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        self.model.gravity.linear = gravity
+        at = self._placed(positions)
+        return self.folded(self._pin.computeGeneralizedGravity(self.model, self._data, at))
 
     def _tried(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the largest torque (n,) in Nm in random poses, and each free joint's effect as a share of it."""
-        arm = [self._other(name, self.model.joints[self.model.getJointId(name)]) for name in self.names]
-        low, high = np.array([(other.lower, other.upper) for other in (*arm, *self._free)]).T
-        peak, effects = np.zeros(len(self.names)), np.zeros(len(self._free))
+        """Return the largest torque (n,) in Nm in random poses, and each other joint's effect as a share of it."""
+        count = len(self.names)
+        ranges = [*map(self._limits, self.names), *self.others]
+        low, high = np.array([(each.lower, each.upper) for each in ranges]).T
+        peak, effects = np.zeros(count), np.zeros(len(self.others))
         for positions, gravity in random_poses(low, high):
             torque = self._torque(positions, gravity)
             peak = np.maximum(peak, np.abs(torque))
-            for k in range(len(self._free)):
+            for k, position in enumerate(self._at.tolist()):
                 moved = positions.copy()
-                moved[len(self.names) + k] = self._at[k]
+                moved[count + k] = position
                 effects[k] = max(effects[k], np.abs(self._torque(moved, gravity) - torque).max())
-        return peak, effects / max(peak.max(), 1e-12)
+        return peak, effects / max(peak.max(), TINY)
 
     def _leader(self, name: str) -> Mimic:
         """Return how a joint follows the one that moves by itself; raises ParameterError if they go in a circle."""
@@ -168,14 +211,14 @@ class UrdfJoints:
             leader = Mimic(joint, leader.multiplier * multiplier, leader.multiplier * offset + leader.offset)
         return leader
 
-    def _other(self, name: str, joint: Pinocchio) -> Other:
+    def _limits(self, name: str) -> Other:
         """Return a joint of the model with its limits; a continuous one may be anywhere."""
+        joint = self.model.joints[self.model.getJointId(name)]
         if joint.nq != 1:
             return Other(name, -math.pi, math.pi)
-        lower, upper = (
-            float(limit[joint.idx_q]) for limit in (self.model.lowerPositionLimit, self.model.upperPositionLimit)
-        )
-        return Other(name, max(lower, -1e3), min(upper, 1e3))
+        limits = self.model.lowerPositionLimit, self.model.upperPositionLimit
+        lower, upper = (float(limit[joint.idx_q]) for limit in limits)
+        return Other(name, max(lower, -LARGEST), min(upper, LARGEST))
 
 
 def random_poses(low: np.ndarray, high: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -192,8 +235,9 @@ def usable_efforts(joints: UrdfJoints) -> tuple[tuple[float, ...], tuple[str, ..
     And a sentence for each placeholder: a limit far above what gravity needs, or far below.
     """
     efforts, notes = [], []
-    for name, index, peak in zip(joints.names, joints.index, joints.peak.tolist(), strict=True):
-        effort = float(joints.model.effortLimit[index])
+    for name, peak in zip(joints.names, joints.peak.tolist(), strict=True):
+        joint = joints.model.joints[joints.model.getJointId(name)]
+        effort = float(joints.model.effortLimit[joint.idx_v])
         if not 0.0 < effort < math.inf:
             effort = 0.0
         elif effort > LIMITS.strong * joints.peak.max() or effort < LIMITS.weak * peak:
@@ -268,7 +312,7 @@ def _share_of(links: Sequence[str], joints: UrdfJoints) -> float:
 
 
 def _missing(other: Other) -> ParameterError:
-    cannot = "" if other.is_fixed_at_zero else f", and it cannot be at 0 (limits {other.lower:g} to {other.upper:g})"
+    cannot = "" if other.can_be_at_zero else f", and it cannot be at 0 (limits {other.lower:g} to {other.upper:g})"
     return ParameterError(
         f"position of {other.name}", None, f"in the joint states: it moves what the arm holds{cannot}"
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)

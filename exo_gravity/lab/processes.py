@@ -26,7 +26,7 @@ from subprocess import PIPE, STDOUT
 
 import yaml
 
-from exo_gravity.core.compensation.settings import URDF_LAW
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
@@ -162,7 +163,7 @@ def _gained_while(records: np.ndarray, is_free: np.ndarray) -> np.ndarray:
 
 def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:
     """Return the time in s until the last of the reached motors is off or applies damping."""
-    reached = [joint for joint in range(4) if joint not in unreached]
+    reached = [joint for joint in range(records["on"].shape[1]) if joint not in unreached]
     if not reached:
         return None
     safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & (since >= 0.0)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.boards import Boards
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import MALFORMED, SERVO
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import MALFORMED, MIT, MIT_V3, SERVO
 
 RATE = 400.0  # Hz of the control loop
 

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT_V3, pack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ID_BITS, MotorReply, pack_command
 from exo_gravity.core.motors.joint_motor import (
     BITRATE,
     COMMAND_BITS,
@@ -18,8 +21,6 @@ from exo_gravity.core.motors.joint_motor import (
     buses_of,
     traffic_of,
 )
-from exo_gravity.core.motors.specs import MOTORS, MotorReply, pack_command, pack_reply
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT_V3
 
 AK60 = MOTORS["AK60-6"]
 V3 = MIT_V3.ranged(AK60)
@@ -154,4 +155,4 @@ def test_each_bus_has_the_load_of_its_own_motors():
 )
 def test_channels_and_options_that_are_not_one_per_motor_are_refused(channel, options, problem):
     with pytest.raises(ParameterError, match=problem):
-        buses_of(channel, options)
+        buses_of(channel, options, 4)

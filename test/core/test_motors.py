@@ -16,32 +16,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
-from exo_gravity.core.motors.specs import (
-    ENTER,
-    EXIT,
-    MOTORS,
-    SET_ZERO,
-    MotorReply,
-    error_text,
-    is_special,
-    pack_command,
-    pack_reply,
-    unpack_command,
-    unpack_reply,
-)
-from exo_gravity.core.motors.wire_formats import (
+from exo_gravity.core.motors.ak import MIT, MIT_V3, error_text, pack_reply, unpack_reply
+from exo_gravity.core.motors.families import FORMATS, MOTORS
+from exo_gravity.core.motors.frames import (
     BROADCAST_ID,
     COMMAND,
+    ENTER,
+    EXIT,
     EXTENDED,
-    FORMATS,
     MALFORMED,
-    MIT,
-    MIT_V3,
     OTHER,
     REPLY,
     SERVO,
+    SET_ZERO,
+    MotorReply,
+    is_special,
+    pack_command,
+    unpack_command,
 )
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 

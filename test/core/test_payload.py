@@ -17,8 +17,8 @@ from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.limits import Limits

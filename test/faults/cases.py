@@ -10,7 +10,7 @@ import numpy as np
 from geometry_msgs.msg import Vector3Stamped
 from sensor_msgs.msg import Imu, JointState
 
-from exo_gravity.core.motors.specs import EXIT, SET_ZERO
+from exo_gravity.core.motors.frames import EXIT, SET_ZERO
 
 from .actions import (
     CONNECT,

@@ -11,9 +11,9 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.ak import MIT, USUAL_MOTORS
+from exo_gravity.core.motors.families import FORMATS, MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
-from exo_gravity.core.motors.wire_formats import FORMATS, MIT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import CanPort

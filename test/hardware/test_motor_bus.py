@@ -11,16 +11,18 @@ from can.interfaces.socketcan import SocketcanBus
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import pack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, MotorCommand, unpack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.safety.drive import OFF, Send
+from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import drive_of, frame, sending
+from ..support.simulated_device import OFF, drive_of, frame, sending
 from .wires import wire_for_test
 
 AK60 = MOTORS["AK60-6"]

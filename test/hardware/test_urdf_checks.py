@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rtbdata
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
 
@@ -16,7 +17,8 @@ from ..support.urdf_oracle import MujocoArm
 PANDA = (Path(__file__).parents[1] / "data" / "arms" / "panda.urdf").read_text(encoding="utf-8")
 KR16 = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf").read_text(encoding="utf-8")
 WHOLE = [f"panda_joint{n}" for n in range(1, 8)]
-GRAVITY = (1.2, -2.3, -9.4)
+GRAVITY = 9.80665 * np.array((0.12, -0.35, -0.929)) / np.linalg.norm((0.12, -0.35, -0.929))  # m/s^2, in the root link
+TILT = Tilt.of_gravity("left", GRAVITY / 9.80665)
 BALL = 0.01 * np.array((1.0, 1.0, 1.0, 0.0, 0.0, 0.0))  # kg m^2: ixx, iyy, izz, ixy, ixz, iyz
 SHAPE = "<visual><geometry><box size='0.1 0.1 0.1'/></geometry></visual>"
 DEPENDS = "<mimic joint='j1' multiplier='-0.7' offset='0.2'/>"
@@ -53,9 +55,9 @@ def test_positions_of_other_joints_that_are_reported_give_the_torque_of_the_whol
         arm.follow([*WHOLE[::-1], "gripper"], [*theta[::-1], np.nan])
         expected = whole.torque(theta, GRAVITY)[:3]
         # Of the other joints only the last does not change the torque by more than 3 %: it is left at 0.
-        assert np.allclose(arm.torque(theta[:3], GRAVITY), expected, rtol=0.0, atol=0.03 * 50.0)
+        assert np.allclose(arm.torque(theta[:3], TILT), expected, rtol=0.0, atol=0.03 * 50.0)
         whole_but_last = whole.torque((*theta[:6], 0.0), GRAVITY)[:3]
-        assert np.allclose(arm.torque(theta[:3], GRAVITY), whole_but_last, rtol=0.0, atol=1e-9)
+        assert np.allclose(arm.torque(theta[:3], TILT), whole_but_last, rtol=0.0, atol=1e-9)
     assert arm.fixed == ()
 
 
@@ -63,7 +65,7 @@ def test_a_joint_that_cannot_be_at_0_must_be_reported_and_one_that_was_must_stay
     arm = UrdfArm(PANDA, WHOLE[:3])
     assert arm.fixed == ("panda_joint4", "panda_joint5", "panda_joint6") and "panda_joint5" in arm.notes[-1]
     with pytest.raises(ParameterError, match=r"position of panda_joint4 .* limits -3\.0718 to -0\.0698"):
-        arm.torque((0.0, 0.6, 0.0), GRAVITY)
+        arm.torque((0.0, 0.6, 0.0), TILT)
     with pytest.raises(ParameterError, match="position of panda_joint4"):
         arm.follow(WHOLE[:3], (0.0,) * 3)
     arm.follow(WHOLE[3:5], (-1.0, 0.3))
@@ -87,7 +89,7 @@ def test_a_mimic_joint_carries_its_share_to_the_joint_that_it_follows() -> None:
             (energy(first + small, last) - energy(first - small, last)) / (2.0 * small),
             (energy(first, last + small) - energy(first, last - small)) / (2.0 * small),
         )
-        assert arm.torque((first, last), GRAVITY) == pytest.approx(expected, abs=1e-8)
+        assert arm.torque((first, last), TILT) == pytest.approx(expected, abs=1e-8)
     with pytest.raises(ParameterError, match="joint_names = 'j2': must be j1, which that joint follows"):
         UrdfArm(text, ["j1", "j2", "j3"])
 

@@ -97,7 +97,13 @@ def simulated(seconds, torque_of, base=None):
     TrunkState.
     """
     arm = SimulatedArm(
-        ArmConfig(DEFAULT_LINKS, LOAD.mass, LOAD.cog, coulomb_friction=COULOMB, viscous_friction=VISCOUS)
+        ArmConfig(
+            DEFAULT_LINKS,
+            wearer_mass=LOAD.mass,
+            wearer_cog=LOAD.cog,
+            coulomb_friction=COULOMB,
+            viscous_friction=VISCOUS,
+        )
     )
     arm.reset(POSE)
     for n in range(round(seconds / PERIOD)):

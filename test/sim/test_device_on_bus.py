@@ -13,7 +13,8 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT, unpack_reply
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.sim import Firmware
 from exo_gravity.sim import device as device_module
 

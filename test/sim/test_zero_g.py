@@ -11,8 +11,8 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor

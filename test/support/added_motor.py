@@ -14,8 +14,17 @@ from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.motors import wire_formats
-from exo_gravity.core.motors.specs import MOTORS, MotorCommand, MotorSpec, pack_fields, unpack_fields
-from exo_gravity.core.motors.wire_formats import COMMAND, OTHER, REPLY, WireFormat
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import (
+    COMMAND,
+    OTHER,
+    REPLY,
+    MotorCommand,
+    MotorSpec,
+    WireFormat,
+    pack_fields,
+    unpack_fields,
+)
 
 # Figures for this test: who adds the motor takes them from its manual.
 AK70 = MotorSpec(

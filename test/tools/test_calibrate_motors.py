@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
 from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
@@ -222,7 +222,7 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
     boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=400.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
     with ExitStack() as opened:
-        names = channels_of(channel)
+        names = channels_of(channel, 4)
         buses = {name: opened.enter_context(can.Bus(interface="virtual", channel=name)) for name in set(names)}
         hold = lambda now: device.arm.reset(arm.pose.tolist())  # noqa: E731
         thread = threading.Thread(target=device.run, args=([buses[name] for name in names], stop.is_set, hold))

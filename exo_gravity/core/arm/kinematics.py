@@ -21,10 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import ArmData
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, cross, dot, plus
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 
 ROTORS = tuple(MOTORS[name].rotor_inertia for name in USUAL_MOTORS)  # kg m^2, where the motors are not known
@@ -131,17 +132,22 @@ class LinkInertia(NamedTuple):
         """Return the mass matrix (4, 4) in kg m^2 at `theta` (4,) rad."""
         return np.array([self.torque(theta, NO_TORQUE, row) for row in np.eye(JOINT_COUNT).tolist()])
 
+    @property
+    def least(self) -> tuple[float, ...]:
+        """The least inertia (4,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+        return least_inertia(self)
+
 
 @lru_cache(8)
 def least_inertia(links: LinkInertia) -> tuple[float, ...]:
-    """Return the least inertia (4,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+    """Return `LinkInertia.least`."""
     poses = itertools.product((0.0,), GRID, GRID, GRID)
     free = [1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses]
     return tuple(np.min(free, axis=0).tolist())
 
 
 @lru_cache(8)
-def links_of(arm: ArmModel) -> LinkInertia:
+def links_of(arm: ArmData) -> LinkInertia:
     """Return the inertia of `arm` with the usual rotors; approximate if it is given by its moments."""
     load, lever = arm.payload[0], float(arm.length[3]) + arm.payload[1]  # a point in the hand
     if arm.by_moments:
@@ -170,7 +176,7 @@ def _torque(links: Sequence[Frame], weights: Sequence[Sequence[float]], second: 
     return torque[::-1]
 
 
-def turning_torque(arm: ArmModel, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+def turning_torque(arm: ArmData, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
     """Return the torque (4,) in Nm that turns the `side` arm at `theta` (4,) rad along with its base.
 
     A trunk that turns faster and faster takes the arm along only if the motors accelerate it. What depends on speed is

@@ -15,6 +15,7 @@ import yaml
 from exo_gravity import packaged
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
+from exo_gravity.core.params import joint_count
 
 FORM = "/namespace/executable: {ros__parameters: {...}}"
 MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's reader takes minutes for 200,000
@@ -97,7 +98,7 @@ def check_buses(nodes: Nodes) -> None:
     for node in stages(nodes)[0]:
         given = nodes[node]
         with named(f"{node} "):
-            buses = buses_of(str(given.get("can.channel", node)), can_options(given))
+            buses = buses_of(str(given.get("can.channel", node)), can_options(given), joint_count(given))
         for name, (_, own) in buses.items():
             options = {f"{OPTIONS}.{option}": value for option, value in own.items()}
             what = {"can.channel": name, "can.interface": given.get("can.interface"), **options}

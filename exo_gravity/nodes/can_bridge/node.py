@@ -245,7 +245,7 @@ class CanBridge(LifecycleNode):
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
     """Declare the parameters; return their values, and the arm that they describe. Raises ParameterError."""
     values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-    serials = serials_of(values["can.serial"], values["can.channel"])
+    serials = serials_of(values["can.serial"], values["can.channel"], len(values["joint_names"]))
     address, motors, limits = bus_of(node, values), motors_of(values), limits_of(values)
     return values, ArmOnBus(address, motors, limits, 1.0 / values["rate"], serials=serials)
 

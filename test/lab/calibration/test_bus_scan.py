@@ -9,8 +9,8 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_command
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ENTER, SET_ZERO, unpack_command
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration.bus_scan import DAMPED, BusScan
