@@ -100,6 +100,15 @@ def test_the_orientation_that_imu_will_use_is_judged(
     assert re.search(problem, capsys.readouterr().err)
 
 
+def test_an_imu_that_reports_its_orientation_and_no_rate_is_calibrated(tmp_path: Path) -> None:
+    samples = reporting(record(MOUNTED), "true")
+    bag = bag_of(tmp_path / "bag", samples._replace(angular_velocity=np.zeros_like(samples.angular_velocity)))
+    assert calibrate(tmp_path, "--bag", str(bag)) == 0
+    found = rotation_matrix(load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"])
+    error = found @ rotation_matrix(MOUNTED).T
+    assert all(angle_between(axis, column) < math.radians(1.5) for axis, column in zip(np.eye(3), error, strict=True))
+
+
 def test_samples_that_imu_would_find_too_slow_are_not_calibrated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,7 +10,7 @@ one lean of the stand the rotation that moves gravity, from two leans the headin
 import argparse
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
@@ -76,6 +76,14 @@ class ImuRecord(NamedTuple):
     acceleration: np.ndarray  #: (n, 3) m/s^2
     orientation: np.ndarray | None = None  #: (n, 4), x, y, z, w, world from IMU; None if there is none
 
+    def with_turns(self) -> "ImuRecord":
+        """Return the record with the turns of the orientation where the IMU has no gyroscope, as a BNO085."""
+        if self.orientation is None or (np.isfinite(self.angular_velocity).all() and self.angular_velocity.any()):
+            return self
+        world_from_imu = Rotation.from_quat(self.orientation)
+        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.diff(self.time)[:, None]
+        return self._replace(angular_velocity=np.vstack((turns, turns[-1:])))
+
 
 class Phase(NamedTuple):
     """A second or more in which the IMU neither turned nor accelerated."""
@@ -102,8 +110,9 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     values = node_values(load(options.params), NODE, IMU)
     topic = values["input_topic"]
     record = read_imu(options.bag or _record(options, say), topic)
-    found = mounting(record)
-    check_as_imu(record, found, values)
+    turning = record.with_turns()
+    found = mounting(turning)
+    check_as_imu(record, still_phases(turning), found, values)
     quaternion = found.quaternion.round(6).tolist()
     error = " ".join(f"{angle:.1f}" for angle in np.degrees(found.error))
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
@@ -221,16 +230,18 @@ def mounting(record: ImuRecord) -> Mounting:
     return Mounting(rotation.as_quat(canonical=True), np.array((level, level, heading)), bow, len(bows))
 
 
-def check_as_imu(record: ImuRecord, found: Mounting, values: Mapping[str, Any]) -> None:
+def check_as_imu(record: ImuRecord, phases: Sequence[Phase], found: Mounting, values: Mapping[str, Any]) -> None:
     """Raise DataError unless `imu` gives the tilt that each still phase of `record` shows.
 
     found: the mounting. values: of `imu`'s parameters.
     """
     settings = (values[name] for name in ("rate", "gyroscope_range", "accelerometer_range"))
     estimator = TrunkEstimator(found.quaternion.tolist(), *settings)
-    columns = [record.angular_velocity.tolist(), record.acceleration.tolist()]
-    columns.append([None] * len(record.time) if record.orientation is None else record.orientation.tolist())
-    ends = {phase.samples.stop - 1: phase for phase in still_phases(record)}
+    measured = (record.angular_velocity, record.acceleration, record.orientation)
+    columns = [[None] * len(record.time) if values is None else values.tolist() for values in measured]
+    if not np.isfinite(record.angular_velocity).any():
+        columns[0] = [None] * len(record.time)
+    ends = {phase.samples.stop - 1: phase for phase in phases}
     problem = ""
     for k, row in enumerate(zip(record.time.tolist(), *columns, strict=True)):
         answer = None
