@@ -81,7 +81,7 @@ class ImuRecord(NamedTuple):
         if self.orientation is None or (np.isfinite(self.angular_velocity).all() and self.angular_velocity.any()):
             return self
         world_from_imu = Rotation.from_quat(self.orientation)
-        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.diff(self.time)[:, None]
+        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.maximum(np.diff(self.time), 1e-6)[:, None]
         return self._replace(angular_velocity=np.vstack((turns, turns[-1:])))
 
 
