@@ -216,7 +216,8 @@ class SwitchOnCheck:
                 if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
                     reason = (
                         f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied; "
-                        "a V3 board ignores commands while its configuration cable is plugged in"
+                        "a V3 board ignores commands while its configuration cable is plugged in, a V1 or V2 board "
+                        "while it is in servo mode (set MIT mode with the vendor's tool)"
                     )
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
             self._products, self._squares = [0.0] * len(self._names), [0.0] * len(self._names)

@@ -38,20 +38,25 @@ JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) 
 Read = Callable[[dict[str, Any]], Settings]
 
 
-def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
+def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm | None]:
     """Declare the parameters of the node's arm. Raises ParameterError.
 
-    Returns their table, their values, and a function that returns the settings that such values describe.
+    Returns their table, their values, a function that returns the settings that such values describe, and the arm from
+    a URDF, to which the positions of its other joints are told; None for the paper's arm.
     """
     given = given_to(node)
     if given.get("law") != URDF_LAW:
         table = settings.compensator_table(given)
-        return table, declare(node, table), lambda values: settings.settings_of(values, _text)
+        return table, declare(node, table), lambda values: settings.settings_of(values, _text), None
     table = settings.urdf_table(given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
     arm = UrdfArm(_description(node, values), values["joint_names"], values["urdf.hand"])
-    return table, values, lambda values: settings.urdf_settings_of(values, arm)
+    for note in arm.notes:
+        node.get_logger().warning(note)
+    if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
+        arm.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
+    return table, values, lambda values: settings.urdf_settings_of(values, arm), arm
 
 
 def check_side(namespace: str, side: str) -> None:

@@ -66,7 +66,7 @@ class CompensatorNode(Node):
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("compensator", context=context, automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
-        table, values, read = declared(self)
+        table, values, read, self._urdf = declared(self)
         check_side(self.get_namespace(), values.get("side", ""))
         self._names = values["joint_names"]
         settings = read(values)
@@ -157,6 +157,8 @@ class CompensatorNode(Node):
         now = time.monotonic()
         try:
             theta, velocity = self._interface.read(message)
+            if self._urdf:
+                self._urdf.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
                 answer = Compensation.withdrawn(Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
@@ -230,6 +232,7 @@ class CompensatorNode(Node):
             "reason text": answer.reason,
             "warnings": words(*warnings_of(self._control, answer, self._names)),
             **self._interface.values,
+            **({"joints taken to be at 0": words(*self._urdf.fixed)} if self._urdf else {}),
             "limits acting": words(*[f"max_effort ({self._names[joint]})" for joint in answer.clamped]),
             "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
             "age of joint states (ms)": milliseconds(now - self._last_answer),
