@@ -34,18 +34,21 @@ PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 ROSDEP = {
     "can": "python3-can",
     "hypothesis": "python3-hypothesis",
+    "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
     "pytest": "python3-pytest",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
     "serial": "python3-serial",
     "yaml": "python3-yaml",
 }
 # Needed although no module imports them: by python-can's udp_multicast, the launch files.
-INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
+INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
-    "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "lz4", "matplotlib", "mcap", "mcap_ros2",
-    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "rich", "roboticstoolbox", "rosbags", "rtbdata",
-    "scipy", "sklearn",
+    "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "lz4", "mcap", "mcap_ros2",
+    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "roboticstoolbox", "rosbags", "rtbdata",
+    "sklearn",
     "adafruit_extended_bus", "adafruit_icm20x", "adafruit_lsm6ds", "adafruit_mpu6050", "spatialmath", "starlette",
     "threadpoolctl", "uvicorn", "vqf", "websockets", "zstandard",
 }  # fmt: skip

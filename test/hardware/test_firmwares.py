@@ -59,7 +59,7 @@ class FirmwareArm(DirectController, VirtualArm):
         for joint in joints if remembered else ():  # what another tool left in their memory
             for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
                 device.exchange(*frame)
-        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", max_effort=PEAK, use_imu=False,
+        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", support=1.0, max_effort=PEAK, use_imu=False,
                             wearer_mass=WORN_MASS, wearer_cog=WORN_COG)  # fmt: skip
         limits = Limits(JOINTS, max_effort=PEAK)
         DirectController.__init__(self, Compensator(settings, JOINTS), limits)

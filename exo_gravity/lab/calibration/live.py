@@ -94,7 +94,7 @@ class LiveTour:
 def tour_parameters(
     params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Return the nodes of a parameter file in which `calibrator` replaces the compensator of `arm`, by their parameters.
+    """Return the nodes of a file in which `calibrator` replaces the compensator of `arm`, each with its parameters.
 
     changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m as far as known, by default those
     of the robot alone. Raises ParameterError.
