@@ -173,10 +173,10 @@ class Launcher:
     ) -> None:
         nodes, names, asking = planned(params, only, more)
         self._namespace, self._log_level = namespace, log_level
-        # A copy, as the tools have read the file: nothing depends on two readers that agree.
-        self._path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), Path(params).name)
+        #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
+        self.params = Path(tempfile.mkdtemp(prefix="exo_gravity_"), Path(params).name)
         content = text_of({f"{namespace}{node}": values for node, values in nodes.items()})
-        self._path.write_text(content, encoding="utf-8")
+        self.params.write_text(content, encoding="utf-8")
         pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
         # The compensator that shares the process of its can_bridge
         self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}
@@ -237,6 +237,7 @@ class Launcher:
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
         self._terminate(recorders, STOP_TIMEOUT)
+        shutil.rmtree(self.params.parent, ignore_errors=True)
 
     def _terminate(self, nodes: list[str], timeout: float) -> None:
         """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""
@@ -283,7 +284,6 @@ class Launcher:
             return None
         finally:
             self.stop()
-            shutil.rmtree(self._path.parent, ignore_errors=True)
 
     def _command(self, node: str) -> list[str]:
         if guest := self._guests.get(node):
@@ -291,7 +291,7 @@ class Launcher:
         return [*command_of(node), *self._words(node)]
 
     def _words(self, node: str) -> list[str]:
-        return node_arguments(f"{self._namespace}{node}", self._path, self._namespace, self._log_level)
+        return node_arguments(f"{self._namespace}{node}", self.params, self._namespace, self._log_level)
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         names = (node, self._guests[node]) if node in self._guests else ()
