@@ -29,6 +29,7 @@ from test.support.document_commands import DOCUMENTS, ROS2, commands_of  # noqa:
 
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|lab|panel|nodes|tools|.ci|.github"
 CORE_ENTRIES = 12  # at most, in the first floor of core
+COPYRIGHT = "# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0"
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 # Keys of rosdep's python.yaml that install Ubuntu's packages, each with the module it provides.
 ROSDEP = {
@@ -157,6 +158,16 @@ def modules() -> Iterator[str]:
         yield f"exo_gravity/core has more than {CORE_ENTRIES} entries"
 
 
+def copyright_lines() -> Iterator[str]:
+    """Yield each source file without the copyright line near its top."""
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for path in filter(lambda path: (ROOT / path).is_file(), tracked.splitlines()):
+        with (ROOT / path).open("rb") as file:
+            first = [next(file, b"").decode(errors="replace").rstrip() for _ in range(2)]
+        if (path.endswith(".py") or re.match(r"#!.*\b(ba|da)?sh\b", first[0])) and COPYRIGHT not in first:
+            yield f"{path}: no copyright line; run .ci/headers"
+
+
 def package_xml() -> Iterator[str]:
     """Yield each dependency that package.xml misses, or names without need."""
 
@@ -221,6 +232,7 @@ RULES = (
     safety_case,
     troubleshooting,
     modules,
+    copyright_lines,
     package_xml,
     release_files,
 )

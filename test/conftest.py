@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out a test file, or a folder's conftest.py with the folder, that needs a missing package; and the linters."""
+    """Leave out a test file, or a folder's conftest.py with the folder, that needs a missing package."""
     file = collection_path / "conftest.py" if collection_path.is_dir() else collection_path
     if file.name == LINTERS and not UNDER_COLCON:
         return True

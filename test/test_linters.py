@@ -8,9 +8,9 @@ from ament_pep257.main import main as pep257
 
 from .support import ROOT
 
-# Not D104: an empty __init__.py needs no docstring. D105, D107: the class's docstring covers its operators and __init__.
-# D401: ament_pep257 wants the imperative of properties too; ruff exempts them. D402 takes `torque (4,)`, a shape, for the
-# signature of torque().
+# Not D104: an empty __init__.py needs no docstring. D105, D107: the class's docstring covers its operators and
+# __init__. D401: ament_pep257 wants the imperative of properties too; ruff exempts them. D402 takes `torque (4,)`, a
+# shape, for the signature of torque().
 IN_CODE = ("D104", "D105", "D107", "D401", "D402")
 IN_TESTS = ("D100", "D101", "D102", "D103", "D104", "D105", "D107", "D401")  # a test's name is its sentence
 FOLDERS = {

@@ -64,10 +64,10 @@ def main(args: Sequence[str] | None = None) -> None:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
+        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)
-        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
             dead = launcher.run(stopping)
     except ExoGravityError as error:

@@ -25,9 +25,10 @@ keep_to_this_machine()
 WRITTEN = (  # what people write, and what PyYAML and rcl read differently
     "5e-1", "5e3", "1E5", ".5", "5.", "+.5", "-0", "+7", "010", "08", "0x1F", "-0x10", "0x1p-2", "0o17", "1_000",
     "1:30", "y", "Y", "yes", "on", "On", "off", "n", "NO", "True", "TRUE", "tRUE", "~", "null", "Null", "2024-01-01",
-    "=", "<<", ".inf", "-.inf", "+.INF", ".nan", "-.nan", "inf", "-Infinity", "nan", "NAN(1)", "1e400", "1e-400", "0e-400",
-    "9223372036854775807", "-9223372036854775808", "9223372036854775808", "0xFFFFFFFFFFFFFFFFFF", "0x", "1e", "e5", "+",
-    "'5'", '"yes"', "'~'", "!!str 5", "!!float 1", "!!bool '1'", "can0", "AK60-6", "a b", "'a: b'", '"\\u00e9"',
+    "=", "<<", ".inf", "-.inf", "+.INF", ".nan", "-.nan", "inf", "-Infinity", "nan", "NAN(1)", "1e400", "1e-400",
+    "0e-400", "9223372036854775807", "-9223372036854775808", "9223372036854775808", "0xFFFFFFFFFFFFFFFFFF", "0x", "1e",
+    "e5", "+", "'5'", '"yes"', "'~'", "!!str 5", "!!float 1", "!!bool '1'", "can0", "AK60-6", "a b", "'a: b'",
+    '"\\u00e9"',
 )  # fmt: skip
 LETTERS = "0123456789+-.eExXpaAfFnNiIyYoOsStTrRuUlL_:~"
 

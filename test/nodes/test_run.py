@@ -127,9 +127,12 @@ def test_a_node_whose_clock_nobody_publishes_says_so_until_it_is_published(waiti
     wait_until(lambda: heard, spin)
     assert [(status.name, status.message) for status in heard] == [("right/waiting", running.NO_CLOCK)]
     publisher = node.create_publisher(Clock, "/clock", 10)
-    wait_until(
-        lambda: node.get_clock().now().nanoseconds, lambda: (publisher.publish(Clock(clock=Time(sec=5))), spin())
-    )
+
+    def publish() -> None:
+        publisher.publish(Clock(clock=Time(sec=5)))
+        spin()
+
+    wait_until(lambda: node.get_clock().now().nanoseconds, publish)
     watch.look()
     wait_until(lambda: heard[-1].message == "/clock is published", spin)
     for now[0] in (10.0, 20.0):  # a clock that its publisher has stopped, as a simulation that waits

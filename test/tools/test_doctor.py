@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -260,7 +261,7 @@ def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
 
 BUS = {"interface": "udp_multicast", "channel": "239.74.163.2"}
 INTERFACES = {  # the case, changes of `can`, what is found, and what is to be done
-    "misspelt": ({"interface": "socket_can", "channel": "can0"}, "python-can has no interface socket_can", "socketcand"),
+    "misspelt": ({"interface": "socket_can", "channel": "can0"}, "no interface socket_can", "one of canalystii, "),
     "no driver": (
         {"interface": "canalystii", "channel": "0", "options": {"bitrate": 1_000_000}},
         "no driver: ", "pip install 'python-can[canalystii]'",
@@ -275,7 +276,7 @@ def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, tmp_
     options = {"port": next(PORTS), "hop_limit": 0} if can["interface"] == BUS["interface"] else {}
     path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can={"options": options, **can})
     code, text = run("--params", path)
-    row, advice = text.splitlines()[text.splitlines().index(next(r for r in text.splitlines() if ": opens" in r)) :][:2]
+    row, advice = next(pair for pair in pairwise(text.splitlines()) if ": opens" in pair[0])
     assert code == 2 and row.startswith("fault") and found in row and remedy in advice
 
 

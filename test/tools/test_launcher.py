@@ -287,16 +287,13 @@ def test_every_tool_refuses_what_ros_would_read_otherwise_with_its_line(tool, ad
     path = tmp_path / "params.yaml"
     before = SIM.read_text()
     path.write_text(before + added)
+    line = len(before.splitlines()) + 1
     try:
         code = importlib.import_module(f"exo_gravity.tools.{tool}").main([*TOOLS[tool], str(path)])
     except SystemExit as ended:
         code = ended.code
     error = capsys.readouterr().err
-    assert (
-        code == 2
-        and error.startswith(f"{tool}: ")
-        and f"params.yaml, line {len(before.splitlines()) + 1} = {said}" in error
-    ), error
+    assert code == 2 and error.startswith(f"{tool}: ") and f"params.yaml, line {line} = {said}" in error, error
 
 
 def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
