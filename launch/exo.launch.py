@@ -13,7 +13,7 @@ import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
+from exo_gravity.hardware.network import RANGE
 from exo_gravity.lab.inputs.parameter_file import packaged_config, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import (
@@ -64,7 +65,7 @@ ARGUMENTS = (  # name, default, description
 )
 
 
-class Recovery(Action):  # type: ignore[misc]
+class Recovery(Action):
     """Lets down an arm that a dead bridge and its dead watchdog left, as the launcher does; then calls `done`.
 
     It also runs while `launch` shuts down, which starts no process any more.
@@ -96,12 +97,14 @@ class Recovery(Action):  # type: ignore[misc]
 
 
 class Stopping:
-    """The nodes that run, in the order in which they stop.
+    """Ends the nodes in their order.
 
+    params: the parameter file of each node by its name in the file.
+    namespace: '/lab' in front of every node.
     problem: why this launch fails, '' while it does not.
     """
 
-    def __init__(self, params: dict[str, Path], namespace: str, log_level: str) -> None:
+    def __init__(self, params: Mapping[str, Path], namespace: str, log_level: str) -> None:
         self.problem = ""
         self._params, self._namespace, self._log_level = params, namespace, log_level
         self._running: dict[str, Action] = {}
@@ -163,8 +166,8 @@ class Stopping:
         ]
 
     def _finish(self) -> None:
-        for path in self._params.values():
-            shutil.rmtree(path.parent, ignore_errors=True)
+        for folder in {path.parent for path in self._params.values()}:
+            shutil.rmtree(folder, ignore_errors=True)
         if self.problem:
             raise RuntimeError(self.problem)  # which makes the exit code of `ros2 launch` 1
 
@@ -230,7 +233,10 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                 **how,
             )
         entities += [*stopping.follow(node, process), process]
-    return [*entities, *(LogInfo(msg=CONFIRMING.format(f"{namespace}{bridge}")) for bridge in asking)]
+    said = [CONFIRMING.format(f"{namespace}{bridge}") for bridge in asking]
+    if not os.environ.get(RANGE):
+        said.insert(0, f"other computers do not see these nodes; {RANGE}=SUBNET admits them")
+    return [*entities, *(LogInfo(msg=sentence) for sentence in said)]
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -44,5 +44,5 @@ def extras(executable: str, extra: str) -> Iterator[None]:
     except ModuleNotFoundError as error:
         if not error.name or error.name.startswith("exo_gravity"):
             raise  # not a package that an extra installs
-        print(f"{executable}: {missing(error.name, extra)}", file=sys.stderr)
+        sys.stderr.write(f"{executable}: {missing(error.name, extra)}\n")
         raise SystemExit(2) from None

@@ -52,7 +52,7 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     """
     executable = os.path.basename(sys.argv[0])
     if {"-h", "--help"}.intersection(sys.argv[1:]):
-        print((inspect.getdoc(inspect.getmodule(make_node)) or "") + HELP.format(name=executable), end="")
+        sys.stdout.write((inspect.getdoc(inspect.getmodule(make_node)) or "") + HELP.format(name=executable))
         return 0
     keep_to_this_machine()
     ending: list[int] = []
