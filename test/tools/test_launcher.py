@@ -20,7 +20,7 @@ from exo_gravity.lab import packages
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
-from exo_gravity.tools.launcher import main, stop_with_owner
+from exo_gravity.tools.launcher import main
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -55,27 +55,6 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
     assert stopping.wait(10.0)
-
-
-def test_the_end_of_ros2_launch_stops_its_launcher_and_no_program_below_it(monkeypatch):
-    monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")
-    reading, writing = os.pipe()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    handlers = [signal.getsignal(number) for number in numbers]
-    try:
-        with open(reading) as held:
-            monkeypatch.setattr(sys, "stdin", held)
-            trial, stopping = stop_on_signals(), threading.Event()
-            owner = threading.Thread(target=stop_with_owner, args=(stopping,))
-            owner.start()
-            assert not stopping.wait(0.1)
-            os.close(writing)
-            owner.join(10.0)
-            assert stopping.is_set()
-            assert not trial.is_set()  # the page starts it with a standard input that has ended
-    finally:
-        for number, handler in zip(numbers, handlers, strict=True):
-            signal.signal(number, handler)
 
 
 def test_the_node_names_are_the_modules_with_an_entry_point():
