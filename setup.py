@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
-here = Path(__file__).parent
+here = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.

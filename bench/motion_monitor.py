@@ -269,7 +269,8 @@ class Lively(Compensator):
 def settings_of(body_mass: float = 0.0, **changes: Any) -> Settings:
     """Return the compensator's settings: One-G, or Zero-G for a wearer of `body_mass` kg."""
     load = Wearer(body_mass or BODY_MASS).on_links(LENGTH)
-    worn = {"mode": "zero_g", "wearer_mass": tuple(load.mass), "wearer_cog": tuple(load.cog)} if body_mass else {}
+    load_of_wearer = {"wearer_mass": tuple(load.mass), "wearer_cog": tuple(load.cog)}
+    worn = {"mode": "zero_g", "support": 1.0, **load_of_wearer} if body_mass else {}
     return replace(Settings("right", ROBOT), **{**worn, **changes})
 
 

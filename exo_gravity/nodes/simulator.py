@@ -22,16 +22,19 @@ from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, 
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.vocabulary import NodeState, SimulatorWarning, words
 from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.lab.packages import extras
 from exo_gravity.nodes.imu import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED
-from exo_gravity.sim import SimulatedImu, VirtualWearer
-from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
-from exo_gravity.sim.script import IDLE, Step, TrialScript
-from exo_gravity.sim.trunk_motion import TrunkState
+
+with extras("simulator", "sim"):
+    from exo_gravity.sim import SimulatedImu, VirtualWearer
+    from exo_gravity.sim.device import MAX_CATCH_UP
+    from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
+    from exo_gravity.sim.script import IDLE, Step, TrialScript
+    from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
 

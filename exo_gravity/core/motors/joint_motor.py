@@ -40,8 +40,12 @@ MAX_DATA_BITRATE = 8_000_000  # bit/s, of CAN FD
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
 SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
-# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
-NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
+# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one, or at the one
+# that their adapter had last. test/hardware/test_bit_rates.py compares them with python-can's sources.
+NEED_BITRATE = (
+    "canalystii", "cantact", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi", "nican", "nixnet", "pcan",
+    "robotell", "seeedstudio", "slcan", "systec", "usb2can", "vector",
+)  # fmt: skip
 
 
 class JointSample(NamedTuple):

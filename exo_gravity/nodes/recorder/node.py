@@ -32,13 +32,16 @@ from exo_gravity import version
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import PARAMETERS, STATES, arm_of, leaf
-from exo_gravity.lab.bag.writer import BagWriter, offered_qos
+from exo_gravity.lab.packages import extras
 from exo_gravity.lab.source import source_of
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, PolledSubscription, Publishers
+
+with extras("recorder", "bag"):
+    from exo_gravity.lab.bag.writer import BagWriter, offered_qos
 
 TYPES = {  # of each topic that is recorded, or of its last part in an arm's namespace
     STATES: JointState, content.COMMANDS: JointState, content.ASSIST: JointState, content.STEPS: String,
