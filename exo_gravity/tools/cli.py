@@ -26,6 +26,17 @@ def non_negative(text: str) -> float:
     return number
 
 
+def positive(text: str) -> int:
+    """Return the whole number that `text` spells, 1 or more; raise ArgumentTypeError otherwise."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 1 or more")
+    return number
+
+
 @contextmanager
 def extras(tool: str, extra: str) -> Iterator[None]:
     """End `tool` with exit code 2 and one line if an import inside the context finds a package missing."""
