@@ -44,8 +44,8 @@ INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
     "PIL", "axe_playwright_python", "distributed", "httpx", "imageio", "imufusion", "lz4", "matplotlib", "mcap",
-    "mcap_ros2", "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "rich", "roboticstoolbox", "rosbags", "rtbdata",
-    "scipy", "sklearn",
+    "mcap_ros2", "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "rich", "roboticstoolbox", "rosbags",
+    "rtbdata", "scipy", "sklearn",
     "adafruit_extended_bus", "adafruit_icm20x", "adafruit_lsm6ds", "adafruit_mpu6050", "spatialmath", "starlette",
     "threadpoolctl", "uvicorn", "vqf", "websockets", "zstandard",
 }  # fmt: skip
