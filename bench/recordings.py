@@ -15,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from exo_gravity.lab.bag.content import JOINT_STATE, SESSION, STRING
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.parallel import in_processes
@@ -23,7 +24,6 @@ from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 
 from .table import Row, seconds_in_turns
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
 RATE = 500  # Hz of the recordings
 FORMS = {
     "MCAP": (StoragePlugin.MCAP, None),
@@ -38,7 +38,7 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for number, (form, (plugin, compression)) in enumerate(FORMS.items()):
-            bag = _recording(folder / f"form_{number}", seconds, plugin, compression)
+            bag = write_recording(folder / f"form_{number}", seconds, plugin=plugin, compression=compression)
             peers: dict[str, Callable[[], object]] = {"rosbags": partial(_read_by_rosbags, bag)}
             if plugin is StoragePlugin.MCAP:
                 peers["mcap's own reader"] = partial(_read_by_mcap, bag)
@@ -47,7 +47,7 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
         whole = partial(_report, bag, folder / "report")
         alone = {"rosbags reading the messages alone": partial(_read_by_rosbags, bag)}
         yield from _speeds("report, whole", _size(bag), whole, alone, repeats)
-        bags = [_recording(folder / "many" / str(n), seconds // 2) for n in range(8)]
+        bags = [write_recording(folder / "many" / str(n), seconds // 2) for n in range(8)]
         judging = cohort.Judging(HoldCriteria(), MIN_HOLD, 1)
         work = partial(cohort.summary, judging=judging)
         paths = [str(bag) for bag in bags]
@@ -71,10 +71,19 @@ def _size(bag: Path) -> float:
         return sum(len(data) for _, _, data in reader.messages()) / 1e6
 
 
-def _recording(
-    path: Path, seconds: int, plugin: StoragePlugin = StoragePlugin.MCAP, compression: CompressionMode | None = None
+def write_recording(
+    path: Path,
+    seconds: int,
+    rate: int = RATE,
+    begin: int = 1_700_000_000,
+    session: str = "",
+    plugin: StoragePlugin = StoragePlugin.MCAP,
+    compression: CompressionMode | None = None,
 ) -> Path:
-    """Write a rosbag2 with joint states and efforts of an arm that moves from pose to pose."""
+    """Write a rosbag2 with joint states and efforts of an arm that moves to a pose and holds it, four times a minute.
+
+    rate: Hz. begin: s since 1970. session: JSON of a Session.
+    """
     store = get_typestore(Stores.ROS2_JAZZY)
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     names = yaml.safe_load(packaged_config("sim.yaml").read_text())["/right/compensator"]["ros__parameters"]
@@ -87,10 +96,13 @@ def _recording(
             writer.add_connection(f"/right/{topic}", JOINT_STATE, typestore=store)
             for topic in ("joint_states", "effort_commands")
         )
-        for index in range(seconds * RATE):
-            at = 1_700_000_000_000_000_000 + index * 1_000_000_000 // RATE
-            when = header(stamp(at // 10**9, at % 10**9), "")
-            moving = 0.3 * np.sin(min(index / RATE % 15.0, 3.0) * np.ones(4)) + 1e-4 * rng.standard_normal(4)
+        if session:
+            data = bytes(store.serialize_cdr(store.types[STRING](session), STRING))
+            writer.write(writer.add_connection(SESSION, STRING, typestore=store), begin * 10**9, data)
+        for index in range(seconds * rate):
+            at = begin * 10**9 + index * 10**9 // rate
+            when = header(stamp(*divmod(at, 10**9)), "")
+            moving = 0.3 * np.sin(min(index / rate % 15.0, 3.0) * np.ones(4)) + 1e-4 * rng.standard_normal(4)
             for connection, arrays in ((states, (moving, np.zeros(4), moving)), (commands, ([], [], moving))):
                 message = store.types[JOINT_STATE](when, names["joint_names"], *map(np.asarray, arrays))
                 writer.write(connection, at, bytes(store.serialize_cdr(message, JOINT_STATE)))
