@@ -54,7 +54,9 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     text = " ".join(capsys.readouterr().out.split())
     assert "Not reported: " in text and "text.mcap: not an MCAP file" in text
     assert "4 of 4 trials held; recordings not read, or not completely: 1; 0 recordings had not changed" in text
-    trend = re.search(r"P01, right, unknown mode: over 3 sessions, each changes drift by (\S+) ± \S+ deg/min", text)
+    trend = re.search(
+        r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg", text
+    )
     assert float(trend[1]) == pytest.approx(1.0, abs=0.4)
     page = (tmp_path / "out" / "cohort.html").read_text(encoding="utf-8")
     assert "text.mcap: not an MCAP file" in page and trend[0] in page and page.count("<img ") == 1

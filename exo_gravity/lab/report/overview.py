@@ -64,10 +64,10 @@ class Trend(NamedTuple):
     def sentence(self) -> str:
         """The trend in words."""
         changes = ", ".join(
-            f"{one.name} by {change:+.{one.digits}f} ± {error:.{one.digits}f}{one.unit}"
+            f"{one.name} {change:+.{one.digits}f} ± {error:.{one.digits}f}{one.unit}"
             for one, change, error in self.changes
         )
-        return f"{self.condition}: over {self.sessions} sessions, each changes {changes}"
+        return f"{self.condition}: change from one of {self.sessions} sessions to the next: {changes}"
 
 
 def trials_of(rows: Iterable[Row]) -> list[Row]:
@@ -84,7 +84,7 @@ def trials_of(rows: Iterable[Row]) -> list[Row]:
 
 
 def _condition(row: Row) -> tuple[str, ...]:
-    return tuple(str(row[key] or "") for key in ("subject", "mode", "support", "arm"))
+    return tuple("" if row[key] is None else str(row[key]) for key in ("subject", "mode", "support", "arm"))
 
 
 def conditions_of(trials: Iterable[Row]) -> Iterator[tuple[str, list[Row]]]:
