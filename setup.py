@@ -56,6 +56,7 @@ extras = {
         "zstandard>=0.22",
     ],
     "analysis": ["pandas>=2.1"],  # Bag.to_frame
+    "cluster": ["dask[distributed]>=2024.5"],  # report --scheduler
     "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
         "imufusion>=1.3",

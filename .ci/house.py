@@ -48,7 +48,7 @@ ROSDEP = {
 INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
-    "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "lz4", "mcap", "mcap_ros2",
+    "PIL", "axe_playwright_python", "distributed", "httpx", "imageio", "imufusion", "lz4", "mcap", "mcap_ros2",
     "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "roboticstoolbox", "rosbags", "rtbdata",
     "sklearn",
     "adafruit_extended_bus", "adafruit_icm20x", "adafruit_lsm6ds", "adafruit_mpu6050", "spatialmath", "starlette",

@@ -25,6 +25,17 @@ def non_negative(text: str) -> float:
     return number
 
 
+def positive(text: str) -> int:
+    """Return the whole number that `text` spells, 1 or more; raise ArgumentTypeError otherwise."""
+    try:
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 1 or more")
+    return number
+
+
 def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
     """Return the exit code of `work`; where that raises an error, print it as one line and return 2."""
     try:

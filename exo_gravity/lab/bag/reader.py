@@ -71,12 +71,14 @@ LISTED_STEPS = 3  # of the clock, a note each
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
 
 
-def read_bag(path: str | Path) -> Bag:
+def read_bag(path: str | Path, every: int = 1) -> Bag:
     """Read a recording: a rosbag2 folder, or an .mcap or .db3 file, complete or cut short.
+
+    every: of each arm's samples, the first of so many is kept. Each has the command that was in force.
 
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
-    storage, contents = Storage(path), _Contents()
+    storage, contents = Storage(path), _Contents(every)
     for rows in storage.rows(content.is_wanted):
         contents.add(rows)
     contents.conclude(storage)
@@ -176,9 +178,10 @@ def _pitch_and_roll(tilt: np.ndarray) -> np.ndarray:
 
 
 class _Contents:
-    """Collects the messages of a recording, topic by topic."""
+    """Collects the messages of a recording, topic by topic. every: see `read_bag`."""
 
-    def __init__(self) -> None:
+    def __init__(self, every: int) -> None:
+        self.every = every
         self.joints: dict[str, JointArrays] = {}
         self.parameters: dict[str, str] = {}
         self.losses = ""
@@ -206,7 +209,8 @@ class _Contents:
             ordinals = self._count + chosen
             if msgtype == JOINT_STATE:
                 if topic not in self.joints:
-                    self.joints[topic] = JointArrays(topic, FIELDS if leaf(topic) == STATES else ("effort",))
+                    kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
+                    self.joints[topic] = JointArrays(topic, *kept)
                 self.joints[topic].add(ordinals, batch)
             elif topic in (content.IMU, content.TILT_TOPIC):
                 (self.trunk if topic == content.IMU else self.tilt).add(ordinals, batch)
