@@ -106,7 +106,7 @@ class FaultCode(str, Enum):
     IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start"
     TORQUE_WHILE_HANGING = (
         "torque_while_hanging",
-        "at the first start, more than 1.5 Nm are asked for on a joint of an arm that hangs",
+        "at the first start, an arm that hangs is asked for more than 1.5 Nm, or a third of `max_effort`",
     )
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
     SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"

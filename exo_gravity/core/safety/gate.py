@@ -59,6 +59,9 @@ class HangingArm:
     #: Nm asked for on a joint: gravity of a few degrees, the whole arm of a wearer of 75 kg included. Hanging, friction
     #: alone holds it. A trunk's IMU that is mounted otherwise than it is set asks for more
     torque: float = 1.5
+    #: of `max_effort`, where that is more: a worn arm of 75 kg lies against a trunk that leans by 0.12 rad, and 2.1 Nm
+    #: are asked for at its abduction
+    share: float = 1.0 / 3.0
     moved: float = 0.06  #: rad that a joint may turn after it was confirmed: a wearer breathes, and hangs on
     valid: float = 10.0  #: s for which the confirmation holds
     patience: float = 60.0  #: s, longer than `enable_timeout`, that a start waits for it
@@ -107,8 +110,9 @@ def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | Non
 
     What assistance and terms may add, `largest_addition`, they may add here too.
     """
-    for name, torque, addition in zip(limits.joint_names, effort, limits.largest_addition, strict=True):
-        most = HANGING_ARM.torque + addition
+    columns = zip(limits.joint_names, effort, limits.max_effort, limits.largest_addition, strict=True)
+    for name, torque, permitted, addition in columns:
+        most = max(HANGING_ARM.torque, HANGING_ARM.share * permitted) + addition
         if not abs(torque) <= most:
             reason = (
                 f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
