@@ -109,7 +109,7 @@ def test_typical_bits_are_the_mean_of_a_carried_arm_and_the_most_those_of_the_sp
 def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
     """The bits of a CAN FD frame at the bit rates of arbitration and of data, with its stuff bits before the CRC.
 
-    After the data: stuff count 4, CRC 17, 6 fixed stuff bits; then, slowly, delimiter, acknowledgement, end, space.
+    After the data: stuff count 4, CRC 17, 6 fixed stuff bits; then, slowly again, 13 bits to the next frame.
     """
     head = [0, *bits_of(can_id, 11), 0, 0, 1, 0, 1]
     rest = [0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]

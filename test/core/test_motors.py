@@ -19,6 +19,7 @@ from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.ak import MIT, MIT_V3, error_text, pack_reply, unpack_reply
 from exo_gravity.core.motors.families import FORMATS, MOTORS
 from exo_gravity.core.motors.frames import (
+    ALIAS,
     BROADCAST_ID,
     COMMAND,
     ENTER,
@@ -185,7 +186,7 @@ def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(
 def test_any_frame_is_a_reply_that_can_be_read_or_a_command_or_neither(board, frame_id, data, is_remote):
     wire_format, spec = board
     kind, can_id = wire_format.classify(frame_id, data, IDS, is_remote)
-    assert (kind, can_id) == (OTHER, 0) or kind in (REPLY, COMMAND, MALFORMED, SERVO)
+    assert (kind, can_id) == (OTHER, 0) or kind in (REPLY, COMMAND, ALIAS, MALFORMED, SERVO)
     assert can_id in IDS or kind == OTHER or (kind, can_id) == (COMMAND, BROADCAST_ID)
     if kind == REPLY:
         assert all(map(math.isfinite, wire_format.unpack_reply(spec, can_id, data)[1:4]))
@@ -271,7 +272,8 @@ def test_every_frame_that_some_firmware_takes_for_another_is_special():
     [(3, 6, False), (3, 1, False), (3, 0, False), (3, 0, True), (0x83, 8, False), (0x703, 1, False), (0x103, 0, True)],
 )
 def test_a_motor_may_obey_short_and_remote_frames_and_ids_whose_lowest_7_bits_are_its_own(frame_id, length, is_remote):
-    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (COMMAND, 3)
+    kind = COMMAND if frame_id == 3 else ALIAS
+    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (kind, 3)
     assert MIT.classify(frame_id + 1, b"\xff" * length, IDS, is_remote) == (OTHER, 0)
 
 

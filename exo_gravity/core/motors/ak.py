@@ -24,8 +24,8 @@ torque. No frame switches a motor on: its first command does. The current 0 A (c
 command without gains and torque comes before it (`MotorBus`), but is not enough: no 12-bit code is exactly 0 Nm.
 
 A motor also obeys frames that are not addressed to it as ours are, and shorter ones, so that these count as commands of
-another sender. The open drive compares the lowest 7 bits of an ID alone. Some firmware obeys short and remote frames,
-and completes them with bytes of an earlier frame. V3.2 boards obey the ID 0xFF.
+another sender. The open drive, whose replies have 7 bytes, compares the lowest 7 bits of an ID alone. Some firmware
+obeys short and remote frames, and completes them with bytes of an earlier frame. V3.2 boards obey the ID 0xFF.
 """
 
 import math
@@ -35,6 +35,7 @@ from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.frames import (
+    ALIAS,
     BROADCAST_ID,
     COMMAND,
     EXTENDED,
@@ -60,6 +61,7 @@ MASTER_ID = 0  # the arbitration ID of replies from some firmware versions of V1
 REPLY_LENGTHS = (6, 7, 8)  # bytes
 TEMPERATURE_OFFSET = 40  # of the byte, degC
 OPEN_DRIVE_BITS = 0x7F  # of an ID that the open drive compares
+OPEN_DRIVE_LENGTH = 7  # bytes of its reply, which no other board is known to send
 # What the error byte means in the manuals' table. One vendor's MIT firmware sends a bit mask instead: the whole byte is
 # 2 above 81 degC and 6 above 120 degC, where it shuts off.
 MOTOR_ERRORS = {
@@ -246,7 +248,7 @@ class MitFormat(WireFormat):
     """The frames of V1 and V2 boards; the methods are those of `WireFormat`."""
 
     reply_lengths: tuple[int, ...] = REPLY_LENGTHS
-    open_length: int = 7
+    alias_length: int = OPEN_DRIVE_LENGTH
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the data of a reply. Raises ParameterError."""
@@ -271,7 +273,9 @@ class MitFormat(WireFormat):
             return OTHER, 0
         if length and data[0] in reply_ids and frame_id in (MASTER_ID, data[0]) and not is_remote:
             return (REPLY if length in self.reply_lengths else MALFORMED), data[0]
-        return (COMMAND, own) if own in reply_ids else (OTHER, 0)
+        if own not in reply_ids:
+            return OTHER, 0
+        return (COMMAND if frame_id == own else ALIAS), own
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,10 @@ ID_BITS = 0x1FFFFFFF  # of an arbitration ID
 Frame = tuple[int, bytes]  # arbitration ID and data
 # What a frame is. MALFORMED is a reply of a wrong length; SERVO the status frame of a motor that does not speak `mit`:
 # a V1 or V2 board in servo mode, or a V3 board; SETTING a board's answer to the question for one of its settings;
-# ELSEWHERE a reply that a motor sends with another ID than the file says.
+# ELSEWHERE a reply that a motor sends with another ID than the file says; ALIAS a command that only boards obey whose
+# replies have `alias_length`.
 REPLY, COMMAND, MALFORMED, SERVO, OTHER = "reply", "command", "malformed reply", "servo mode", "other"
-SETTING, ELSEWHERE = "setting", "reply with another ID"
+SETTING, ELSEWHERE, ALIAS = "setting", "reply with another ID", "command with another ID"
 BROADCAST_ID = 0xFF  # stands for all motors of a bus whose boards obey it
 HANGING_TOLERANCE = 0.5  # rad from zero, at most, of an arm that hangs, where its encoders leave no doubt
 
@@ -226,9 +227,7 @@ class WireFormat(ABC):
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
     stops: frozenset[bytes] = frozenset((EXIT,))  #: data of all commands that switch a motor off
     reply_lengths: tuple[int, ...] = (8,)  #: bytes of a reply or status frame
-    open_length: int = (
-        0  #: of them, that of a board that obeys other IDs, too, because it compares a part of them; 0: none
-    )
+    alias_length: int = 0  #: bytes of a reply that shows a board which obeys other IDs than its own, too; 0: none does
     needs_timeout: bool = False  #: whether a motor's own time-out must be set
     #: codes of errors that say no more than that the motor has switched itself off, and can be switched on again
     let_go: frozenset[int] = frozenset()

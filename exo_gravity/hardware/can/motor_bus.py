@@ -27,6 +27,7 @@ import can
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.frames import (
+    ALIAS,
     BROADCAST_ID,
     COMMAND,
     ELSEWHERE,
@@ -98,7 +99,7 @@ class MotorBus:
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
-        self._open_drives: set[int] = set()  # IDs of motors whose board obeys other IDs, too: it compares 7 bits
+        self._aliased: set[int] = set()  # IDs of motors whose board obeys other IDs, too
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
         self._drive = Drive.off(count)  # last sent
@@ -250,10 +251,10 @@ class MotorBus:
             if own is not port:
                 continue
             kind, can_id = board.classify(frame_id, message.data, reply_ids, message.is_remote_frame)
-            if kind == COMMAND:
+            if kind in (COMMAND, ALIAS):
                 if port.is_echo(message):
                     return "echo", 0
-                is_obeyed = message.is_extended_id or frame_id == can_id or can_id in self._open_drives
+                is_obeyed = kind == COMMAND or can_id in self._aliased
                 return (FOREIGN_COMMAND, can_id) if is_obeyed else ("foreign frame", 0)
             if kind != OTHER:
                 return kind, can_id
@@ -274,8 +275,8 @@ class MotorBus:
                 self.boards.heard(self._joint_of[can_id], kind, frame, self._now())
             return
         joint, now = self._joint_of[can_id], self._now()
-        if len(message.data) == self._motors[joint].wire_format.open_length:
-            self._open_drives.add(can_id)
+        if len(message.data) == self._motors[joint].wire_format.alias_length:
+            self._aliased.add(can_id)
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
