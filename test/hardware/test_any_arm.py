@@ -78,15 +78,8 @@ class CarriedChain(VirtualArm):
     """An arm at random of `count` joints with AK80-9, carried by a compensator, and raised from where it hangs."""
 
     def __init__(self, count: int, home: Sequence[float] | None = None) -> None:
-        text, self.names = random_chain(count, seed=count)
-        config = UrdfConfig(
-            text=text,
-            joint_names=self.names,
-            hand="hand",
-            coulomb_friction=(0.1,) * count,
-            rotor_inertia=(0.005,) * count,
-        )
-        self.home = hanging(config)
+        config, self.home = hanging_chain(count)
+        text, self.names = config.text, config.joint_names
         self.oracle = MujocoArm(text, self.names)
         joints = [JointMotor(SPEC, 1 + n, wire_format=MIT) for n in range(count)]
         device = SimulatedDevice(SimulatedArm(config), [simulated(joint) for joint in joints])

@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation import guidance
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety import guidance as guided
@@ -30,7 +31,7 @@ keep_to_this_machine()
 URDF = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
 NAMES = [f"joint_a{n}" for n in range(1, 7)]
 POSE = (0.3, -0.8, 1.1, 0.4, -0.6, 0.2)
-EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, (0.0, 0.0, -9.80665))
+EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, Tilt.of("left"))
 PARAMETERS = {
     "law": "urdf",
     "joint_names": f"[{','.join(NAMES)}]",
