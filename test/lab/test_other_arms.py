@@ -1,4 +1,4 @@
-"""The files of other arms than the paper's that come with the package: carried without ROS, and judged by the device."""
+"""The files of other arms that come with the package: carried without ROS, and judged by the device."""
 
 from __future__ import annotations
 
