@@ -5,6 +5,7 @@ MuJoCo's model of the same URDF says what gravity needs, and the simulated devic
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import math
 from collections.abc import Sequence
@@ -23,8 +24,10 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import unpack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.drive import Drive, FaultCode, Send, State
+from exo_gravity.core.safety.limits import DAMPING, Limits
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
+from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
@@ -37,6 +40,7 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.chains import random_chain
 from ..support.urdf_oracle import MujocoArm
+from .rig import SAFE_SPEED, ArmOnWires
 
 COUNTS = (1, 2, 3, 5, 6, 7, 9)
 SPEC = MOTORS["AK80-9"]
@@ -75,9 +79,14 @@ def hanging(config: UrdfConfig) -> list[float]:
 
 
 class CarriedChain(VirtualArm):
-    """An arm at random of `count` joints with AK80-9, carried by a compensator, and raised from where it hangs."""
+    """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it.
+
+    notes: what its bridge has noted. fastest: rad/s, the largest true speed of a joint so far.
+    """
 
     def __init__(self, count: int, home: Sequence[float] | None = None) -> None:
+        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        self.fastest = 0.0
         config, self.home = hanging_chain(count)
         text, self.names = config.text, config.joint_names
         self.oracle = MujocoArm(text, self.names)
@@ -95,7 +104,26 @@ class CarriedChain(VirtualArm):
         )
         settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count)
         self.controller = DirectController(Compensator(settings, self.names), limits)
-        super().__init__(device, self.controller, joints, limits, RATE)
+        super().__init__(device, self.controller, joints, limits, RATE, look=self._look, note=self.notes.note)
+        self.notes.clock = self.clock
+        self.on_wire = ArmOnWires(("wire", "any arm", {}), joints, limits, 1.0 / RATE, {"any arm": self.wire})
+
+    def carry(self) -> None:
+        """Start the arm."""
+        self.enable()
+        assert self.run_until(lambda: self.safety.state is State.ACTIVE or self.safety.fault, 90.0)
+        assert self.safety.state is State.ACTIVE, self.safety.fault
+
+    def raise_it(self) -> None:
+        """Let the wearer raise the arm, and let go."""
+        goal = [angle - math.copysign(LIFT, angle) for angle in self.home]  # away from the stops
+        self.device.start(VirtualWearer(TrialScript.parse({"name": "raise", "steps": [{"move": goal, "over": 2.0}]})))
+        self.run(2.0 + HOLD)
+        self.check_controller()
+        assert self.safety.state is State.ACTIVE, self.safety.fault
+
+    def _look(self) -> None:
+        self.fastest = max(self.fastest, *map(abs, self.device.arm.velocities))
 
     def needed(self) -> np.ndarray:
         """What gravity needs where the device is, (n,) Nm."""
@@ -122,20 +150,34 @@ def test_the_efforts_are_gravitys_torque_and_their_frames_within_half_a_code(cou
 @pytest.mark.parametrize("count", COUNTS)
 def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int) -> None:
     arm = CarriedChain(count)
-    arm.enable()
-    assert arm.run_until(lambda: arm.safety.state is State.ACTIVE or arm.safety.fault, 90.0), arm.safety.waiting_for
-    assert arm.safety.state is State.ACTIVE, arm.safety.fault
-    goal = [angle - math.copysign(LIFT, angle) for angle in arm.home]  # away from the stops
-    arm.device.start(VirtualWearer(TrialScript.parse({"name": "raise", "steps": [{"move": goal, "over": 2.0}]})))
-    arm.run(2.0 + HOLD)
-    arm.check_controller()
-    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    arm.carry()
+    arm.raise_it()
     assert np.abs(arm.device.arm.velocities).max() < 0.02
     torque = [motor.torque(0.0, 0.0) for motor in arm.device.motors]
     assert np.abs(torque - arm.needed()).max() < 0.5 * CODE + 0.02  # the arm is where a code of its angle says
     arm.safety.disable(arm.now)
     assert arm.run_until(lambda: arm.loop.is_off, 60.0)
     assert not arm.device.powered
+
+
+def test_an_arm_that_a_dead_bridge_left_is_let_down_from_its_notes() -> None:
+    arm = CarriedChain(3)
+    arm.carry()
+    arm.raise_it()
+    arm.fastest = 0.0
+    assert let_down(arm.on_wire, ArmNotes([arm.notes] * 3), print, lambda: False)
+    assert not arm.device.powered
+    arm.clock.sleep(0.5)
+    arm.catch_up()
+    assert arm.fastest < SAFE_SPEED
+
+
+def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:
+    notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+    assert not ArmNotes([notes] * 2).drive.powered
+    notes.note(Drive((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
+    assert ArmNotes([notes] * 3).drive == notes.drive
+    assert ArmNotes([notes] * 2).drive == Drive((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
 
 
 def test_an_arm_that_does_not_hang_where_home_says_is_not_started() -> None:
