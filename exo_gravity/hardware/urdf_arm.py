@@ -36,9 +36,9 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
+from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 
 PACKAGE = "package://"
-TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 POSES = 500  # at random, for the least inertia
 
@@ -63,47 +63,40 @@ def _located(path: str) -> Path:
 
 
 class UrdfArm:
-    """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
+    """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
     It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm. hand: the link that holds a load,
     '' if there is none. Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing,
-    the hand is no link, or a joint is missing or does not turn.
+    the hand is no link, a joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
 
-    max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none.
+    max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
+    notes: sentences on what is doubtful in the URDF, for the log.
     length: (n,) m from each joint to the next one, and from the last one to the hand; 0 if there is no hand.
     """
 
     def __init__(self, text: str, joint_names: Sequence[str], hand: str = "") -> None:
-        self._pin, whole = _pinocchio(), _model_of(text)
-        names = list(joint_names)
+        self._pin, names = _pinocchio(), list(joint_names)
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
             raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
-        turning = [
-            name for name, joint in zip(whole.names, whole.joints, strict=True) if joint.shortname().startswith(TURNING)
-        ]
-        for name in names:
-            if name not in turning:
-                expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
-                raise ParameterError("joint_names", name, expected)
-        if hand and not whole.existBodyName(hand):
-            links = ", ".join(frame.name for frame in whole.frames if frame.type == self._pin.FrameType.BODY)
+        self._moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
+        self._model = self._moves.model
+        if hand and not self._model.existBodyName(hand):
+            links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
             raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
-        locked = [number for number, name in enumerate(whole.names) if number and name not in names]
-        self._model = self._pin.buildReducedModel(whole, locked, self._pin.neutral(whole))
         self._joints = [self._model.getJointId(name) for name in names]
-        self._order = [self._model.joints[joint].idx_v for joint in self._joints]
-        limits = (float(self._model.effortLimit[index]) for index in self._order)
-        self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self.payload = NO_PAYLOAD
         self._hand = hand
         self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
         self._identity = text, tuple(names)
         self._bare = self._model  # without load and wearer
-        self._own_mass = sum(inertia.mass for inertia in list(self._model.inertias)[1:])
+        self._data = self._model.createData()
+        self._pin.computeSubtreeMasses(self._model, self._data)
+        self._own_mass = max(self._data.mass[joint] for joint in self._joints)
         if not self._own_mass > 0.0:
             raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
-        self._data = self._model.createData()
+        self.max_effort, unused = usable_efforts(self._moves)
+        self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
         self._along = self._ways()
         self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
@@ -145,10 +138,25 @@ class UrdfArm:
     @cached_property
     def links(self) -> UrdfLinks:
         """The inertia, without rotors."""
-        return UrdfLinks(self._pin, self._model, self._order)
+        return UrdfLinks(self._pin, self._model, self._moves)
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """The joints that are not the arm's, change its torque, and are taken to be at 0: none is reported."""
+        return self._moves.fixed
+
+    def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take the positions (m,) of all joints that are reported, by their names (m,), for all copies of this arm.
+
+        Raises ParameterError if one that changes the torque is missing or not finite.
+        """
+        self._moves.follow(names, positions)
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
+
+        Raises ParameterError while a joint on which it depends is not known (`follow`).
+        """
         felt = self.gravity * tilt.magnitude
         return self._holding(theta, [felt * component for component in tilt.gravity_in_trunk], ZERO)
 
@@ -235,9 +243,8 @@ class UrdfArm:
         """
         model = self._model
         model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
-        at = configuration(self._pin, model, self._order, theta)
-        torque = self._pin.computeGeneralizedGravity(model, self._data, at)
-        return tuple((self.gain * torque[self._order]).tolist())
+        torque = self._pin.computeGeneralizedGravity(model, self._data, self._moves.configuration(theta))
+        return tuple((self.gain * self._moves.folded(torque)).tolist())
 
     def _ways(self) -> list[np.ndarray]:
         """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
@@ -260,19 +267,19 @@ class UrdfArm:
 class UrdfLinks:
     """The inertia of an arm by Pinocchio: `Links` of core/arm/interface.py.
 
-    order: of its joints among Pinocchio's velocities, (n,).
+    moves: how the joints of `model` move.
     """
 
-    def __init__(self, pin: Any, model: Any, order: Sequence[int]) -> None:
-        self._pin, self._order = pin, list(order)
+    def __init__(self, pin: Any, model: Any, moves: UrdfJoints) -> None:
+        self._pin, self._moves = pin, moves
         self._model, self._data = model, model.createData()
 
     def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
         self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
-        rates = (self._placed(values) for values in (velocity, acceleration))
-        torque = self._pin.rnea(self._model, self._data, self._at(theta), *rates)
-        return tuple(torque[self._order].tolist())
+        rates = (self._moves.spread(values) for values in (velocity, acceleration))
+        torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
+        return tuple(self._moves.folded(torque).tolist())
 
     def momentum(
         self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
@@ -281,38 +288,21 @@ class UrdfLinks:
 
         turning: angular velocity of the base, (3,) rad/s, whose part is neglected.
         """
-        speed, at = self._placed(velocity), self._at(theta)
+        speed, at = self._moves.spread(velocity), self._moves.configuration(theta)
         momentum = self.matrix(theta) @ np.asarray(velocity)
         coriolis = self._pin.computeCoriolisMatrix(self._model, self._data, at, speed)
-        return tuple(momentum.tolist()), tuple((coriolis.T @ speed)[self._order].tolist())
+        return tuple(momentum.tolist()), tuple(self._moves.folded(coriolis.T @ speed).tolist())
 
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
-        upper = np.triu(self._pin.crba(self._model, self._data, self._at(theta)))
-        return np.asarray((upper + np.triu(upper, 1).T)[np.ix_(self._order, self._order)])
+        upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
+        return self._moves.folded_matrix(upper + np.triu(upper, 1).T)
 
     @cached_property
     def least(self) -> tuple[float, ...]:
         """The least inertia (n,) in kg m^2 that each joint feels, the other joints being free, in poses at random."""
-        poses = np.random.default_rng(0).uniform(-math.pi, math.pi, (POSES, len(self._order)))
+        poses = np.random.default_rng(0).uniform(-math.pi, math.pi, (POSES, len(self._moves.names)))
         return tuple(np.min([1.0 / np.diag(np.linalg.inv(self.matrix(pose))) for pose in poses], axis=0).tolist())
-
-    def _at(self, theta: Sequence[float]) -> np.ndarray:
-        return configuration(self._pin, self._model, self._order, theta)
-
-    def _placed(self, values: Sequence[float]) -> np.ndarray:
-        placed = np.zeros(self._model.nv)
-        placed[self._order] = values
-        return placed
-
-
-def configuration(pin: Any, model: Any, order: Sequence[int], theta: Sequence[float]) -> np.ndarray:
-    """Return Pinocchio's configuration for the angles `theta` (n,) in rad; a continuous joint has two numbers of it."""
-    moved = np.zeros(model.nv)
-    moved[order] = theta
-    if model.nq == model.nv:
-        return moved
-    return np.asarray(pin.integrate(model, pin.neutral(model), moved))
 
 
 def _pinocchio() -> Any:
@@ -321,12 +311,3 @@ def _pinocchio() -> Any:
     except ImportError:
         raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
     return pinocchio
-
-
-def _model_of(text: str) -> Any:
-    """Return Pinocchio's model of a URDF. Raises ParameterError."""
-    try:
-        return _pinocchio().buildModelFromXML(text)
-    except (RuntimeError, ValueError) as error:
-        expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
-        raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None

@@ -207,6 +207,7 @@ def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
     arm.enable().cycle(1.6)
     assert arm.fault_code == "torque_not_delivered"
     assert "d: the motor did not switch on: 0 % of the commanded torque replied" in arm.machine.fault.reason
+    assert "in servo mode" in arm.machine.fault.reason
 
 
 def test_a_motor_that_missed_its_enter_gets_another_one():

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rtbdata
 
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
@@ -17,14 +16,12 @@ from exo_gravity.tools.urdf import urdf_of
 from ..support.urdf_oracle import MujocoArm
 
 PUBLISHED = Path(__file__).parents[1] / "data" / "arms"
-KUKA = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
 ARMS = {
     # The UR5 as a table arm; the Panda with two prismatic fingers, which stay at 0; the Kinova with continuous joints.
     "ur5": (PUBLISHED / "ur5.urdf",
             [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]),
     "panda": (PUBLISHED / "panda.urdf", [f"panda_joint{n}" for n in range(1, 8)]),
     "kinova": (PUBLISHED / "kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
-    "kr16": (KUKA, [f"joint_a{n}" for n in range(1, 7)]),
 }  # fmt: skip
 POSES = 200
 ONE_LINK = """<robot name="one">

@@ -67,6 +67,7 @@ class Arm(BusScan):
         self.power_up: Iterable[float] | None = None
         self.shaking = 0.0
         self.silent: set[int] = set()
+        self.wire_format = MIT.name
         self.problems: tuple[str, ...] = ()
         self.requests: list[str] = []
         self.said: list[object] = []
@@ -82,7 +83,9 @@ class Arm(BusScan):
         self._now += CYCLE
         shaken = self.pose + np.array((0.0, 0.0, 0.0, self.shaking * math.sin(20.0 * self._now)))
         angles = dict(zip(self.ids, self.zeros + np.array(self.directions) * shaken, strict=True))
-        return {i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0) for i in can_ids if i not in self.silent}
+        return {
+            i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0, self.wire_format) for i in can_ids if i not in self.silent
+        }
 
     def _move(self, target: Iterable[float], watch: Callable[[], object]) -> None:
         start, end = self.pose, np.array(list(target))
@@ -150,6 +153,15 @@ def test_a_silent_motor_and_a_problem_of_the_bus_are_reported_before_anything_is
     with pytest.raises(DataError, match=f"ID 3: several replies to one command; {missing}"):
         arm.calibrate(tmp_path)
     assert arm.requests == []
+
+
+def test_a_board_in_servo_mode_cannot_be_told_from_a_v3_board_and_the_person_is_told_so(tmp_path: Path) -> None:
+    for wire_format, is_told in ((MIT.name, False), (MIT_V3.name, True)):
+        arm = Arm(6)
+        arm.wire_format = wire_format
+        result = arm.calibrate(tmp_path)
+        assert value(result, "wire_format") == [wire_format] * 4
+        assert (motors.SERVO_MODE in arm.said) is is_told
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ class Settings:
     robot: Arm  #: the arm alone
     law: str = owned("exact", "law that computes the gravity torque", choices=LAWS)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
-    support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
+    support: float = owned(0.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none
@@ -252,7 +252,7 @@ def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
                 "description": "urdf computes the torque of any serial arm from its URDF"},
         "joint_names": {"vector": False,
-                        "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
+                        "description": "in the order of the commands; other joints: from the joint states, or at 0"},
         "max_effort": {"default": [0.0] * count, "bounds": (0.0, LARGEST_EFFORT),
                        "description": "torque limit per joint; 0: the URDF's"},
         "spring.pose": {"default": [0.0] * count},
@@ -282,7 +282,9 @@ def urdf_settings_of(values: Mapping[str, Any], robot: UrdfModel) -> Settings:
     limits = []
     for name, given, own in zip(values["joint_names"], values["max_effort"], robot.max_effort, strict=True):
         if not (given or own):
-            raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
+            raise ParameterError(
+                f"max_effort of {name}", given, "greater than 0, because the URDF has no usable effort limit"
+            )
         limits.append(given or own)
     values = {**values, "max_effort": tuple(limits)}
     wearer = wearer_of(values, robot.length, values["wearer.links"])

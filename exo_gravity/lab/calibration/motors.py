@@ -15,7 +15,7 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.motors.ak import FAMILY, MIT
+from exo_gravity.core.motors.ak import FAMILY, MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
@@ -35,6 +35,11 @@ MOTIONS = (
     "bend the elbow",
 )
 UNCHECKED = "not checked after a power-up"
+SERVO_MODE = (
+    "A V1 or V2 board in servo mode sends the same frames as a V3 board, and obeys none of our commands: read the "
+    "labels of the boards that are shown as mit_v3. Set V1 and V2 boards to MIT mode with the vendor's tool, and begin "
+    "again."
+)
 STORE_ZERO = "store a zero with the vendor's tool while the arm hangs, switch the power off and on, and begin again"
 
 
@@ -149,6 +154,8 @@ class MotorSearch:
         answers, problems = self._bus.scan()
         self._last = {answer.can_id: answer for answer in answers}
         self._say(self._table())
+        if any(answer.wire_format == MIT_V3.name for answer in answers):
+            self._say(SERVO_MODE)
         if len(answers) < JOINT_COUNT:
             listed = ", ".join(map(str, self._last)) or "none"
             count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"

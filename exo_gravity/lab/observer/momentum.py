@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
-from exo_gravity.core.arm.kinematics import ROTORS, LinkInertia, links_of
+from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -73,9 +73,7 @@ class MomentumObserver:
         self._error = s.model_error
         self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
         self._wearer = ArmModel(s.loaded.length, s.wearer_cog, s.wearer_mass, s.loaded.gain, s.loaded.gravity)
-        own, worn = links_of(s.loaded), links_of(self._wearer)
-        rows = zip(own.weights, worn.weights, strict=True)
-        self._links = LinkInertia(tuple([tuple(map(operator.add, *row)) for row in rows]), ROTORS)
+        self._links = links_of(s.loaded).beside(links_of(self._wearer))
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
         self._coulomb = tuple(friction.coulomb) if self._is_known else tuple(tuning.typical_coulomb)
