@@ -70,8 +70,8 @@ class UrdfArm:
     hand: the link that holds a load, '' if there is none.
     rotors: inertia of the motors' rotors at the joints, (n,) kg m^2, which a URDF does not state; () for none.
 
-    Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing, the hand is no link, a
-    joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
+    Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing, the hand is no link,
+    a joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
 
     max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
     notes: sentences on what is doubtful in the URDF, for the log.

@@ -249,7 +249,9 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
     text, names = random_chain(count, seed=5)
     arm = UrdfArm(text, names, "hand", (rotor,) * count)
     worn = {"wearer_mass": (0.0, 0.8, 0.6), "wearer_cog": (0.0, 0.5 * arm.length[1], 0.6 * arm.length[2])}
-    settings = Settings("left", arm, "urdf", mode="zero_g", max_effort=(100.0,) * count, use_imu=False, **worn)
+    settings = Settings(
+        "left", arm, "urdf", mode="zero_g", support=1.0, max_effort=(100.0,) * count, use_imu=False, **worn
+    )
     friction = dict.fromkeys(("coulomb_friction", "viscous_friction"), (0.0,) * count)
     device = SimulatedArm(
         UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(rotor,) * count, **worn, **friction)
