@@ -256,12 +256,13 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
     device = SimulatedArm(
         UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(rotor,) * count, **worn, **friction)
     )
-    device.reset((0.3, -0.4, 0.5))
+    start = np.array((0.3, -0.4, 0.5))
+    device.reset(start)
     observer, tilt, given = MomentumObserver(settings), Tilt.of("left"), np.array((0.6, -0.4, 0.3))
     errors, speeds = [], []
     for n in range(3000):
         now, theta = n * 0.001, device.positions
-        swing = np.cos(3.0 * now + np.arange(count))  # Nm, which moves the arm
+        swing = 2.0 * np.cos(3.0 * now + np.arange(count)) - 5.0 * (theta - start)  # Nm, which moves the arm to and fro
         motors = np.array(settings.torque(theta, tilt)[0]) + swing - 0.4 * np.array(device.velocities)
         device.step(motors + given)
         if n % 10 == 0:
