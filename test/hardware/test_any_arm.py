@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
@@ -35,7 +35,7 @@ from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.urdf import UrdfConfig
-from exo_gravity.sim.virtual_arm import VirtualArm
+from exo_gravity.sim.virtual_arm import VirtualArm, resting
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.chains import random_chain
@@ -49,6 +49,7 @@ RATE = 250.0  # Hz
 LIFT = 0.35  # rad, by which the wearer moves each joint
 HOLD = 3.0  # s after that
 FREE = 2.5  # rad from zero, so that the stops are far
+UPRIGHT, TILTED = TrunkState(), TrunkState(0.4, -0.3)
 
 
 def settings_of(text: str, names: Sequence[str], **given: object) -> Settings:
@@ -56,23 +57,23 @@ def settings_of(text: str, names: Sequence[str], **given: object) -> Settings:
     return urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
 
 
-def hanging_chain(count: int) -> tuple[UrdfConfig, list[float]]:
-    """Return an arm at random with `count` joints that hangs off its stops, and its angles there."""
+def hanging_chain(count: int, trunk: TrunkState) -> tuple[UrdfConfig, list[float]]:
+    """Return an arm at random with `count` joints that hangs off its stops on `trunk`, and its angles there."""
     for seed in itertools.count(count):
         text, names = random_chain(count, seed)
         mechanics = {"coulomb_friction": (0.1,) * count, "rotor_inertia": (0.005,) * count}
         config = UrdfConfig(text=text, joint_names=names, hand="hand", **mechanics)
-        angles = hanging(config)
+        angles = hanging(config, trunk)
         if max(map(abs, angles)) < FREE:
             return config, angles
     raise AssertionError
 
 
-def hanging(config: UrdfConfig) -> list[float]:
+def hanging(config: UrdfConfig, trunk: TrunkState) -> list[float]:
     """Return the angles at which the arm comes to rest when it falls under damping."""
     model, _ = config.models()
     model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.2
-    model.opt.gravity = config.felt("left", TrunkState())[0]
+    model.opt.gravity = config.felt("left", trunk)[0]
     data = mujoco.MjData(model)
     mujoco.mj_step(model, data, 20_000)
     return list(data.qpos.tolist()) if np.abs(data.qvel).max() < 1e-4 else [math.inf] * model.njnt
@@ -84,15 +85,16 @@ class CarriedChain(VirtualArm):
     notes: what its bridge has noted. fastest: rad/s, the largest true speed of a joint so far.
     """
 
-    def __init__(self, count: int, home: Sequence[float] | None = None) -> None:
+    def __init__(self, count: int, home: Sequence[float] | None = None, trunk: TrunkState = UPRIGHT) -> None:
         self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
         self.fastest = 0.0
-        config, self.home = hanging_chain(count)
+        config, self.home = hanging_chain(count, trunk)
         text, self.names = config.text, config.joint_names
         self.oracle = MujocoArm(text, self.names)
         joints = [JointMotor(SPEC, 1 + n, wire_format=MIT) for n in range(count)]
         device = SimulatedDevice(SimulatedArm(config), [simulated(joint) for joint in joints])
         device.arm.reset(self.home)
+        device.pitch, device.roll = trunk.pitch, trunk.roll
         span = [(max(-3.1, angle - 1.0), min(3.1, angle + 1.0)) for angle in self.home]
         low, high = zip(*span, strict=True)
         limits = Limits(
@@ -102,9 +104,11 @@ class CarriedChain(VirtualArm):
             max_effort=(SPEC.peak_torque,) * count,
             home=tuple(self.home if home is None else home),
         )
-        settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count)
+        settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
         self.controller = DirectController(Compensator(settings, self.names), limits)
         super().__init__(device, self.controller, joints, limits, RATE, look=self._look, note=self.notes.note)
+        if trunk is not UPRIGHT:
+            self.add_imu(resting(trunk.pitch, trunk.roll), self.controller.compensator, 0.01)
         self.notes.clock = self.clock
         self.on_wire = ArmOnWires(("wire", "any arm", {}), joints, limits, 1.0 / RATE, {"any arm": self.wire})
 
@@ -127,7 +131,8 @@ class CarriedChain(VirtualArm):
 
     def needed(self) -> np.ndarray:
         """What gravity needs where the device is, (n,) Nm."""
-        return self.oracle.torque(self.device.arm.positions, (0.0, 0.0, -9.80665))
+        gravity = 9.80665 * gravity_in_trunk(self.device.pitch, self.device.roll)
+        return self.oracle.torque(self.device.arm.positions, gravity)
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -147,9 +152,9 @@ def test_the_efforts_are_gravitys_torque_and_their_frames_within_half_a_code(cou
             assert abs(sent - torque) <= 0.5 * CODE + 1e-12
 
 
-@pytest.mark.parametrize("count", COUNTS)
-def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int) -> None:
-    arm = CarriedChain(count)
+@pytest.mark.parametrize(("count", "trunk"), [*((count, UPRIGHT) for count in COUNTS), (3, TILTED)])
+def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int, trunk: TrunkState) -> None:
+    arm = CarriedChain(count, trunk=trunk)
     arm.carry()
     arm.raise_it()
     assert np.abs(arm.device.arm.velocities).max() < 0.02
