@@ -181,7 +181,8 @@ class UrdfArm:
         arm = copy.copy(self)
         arm.gain = floats("gain", gain, len(self.gain), 0.0, MAX_GAIN)
         arm.gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
-        return arm._anew()
+        arm._anew().__dict__["links"] = self.links  # what takes long to compute, the least inertia, is computed once
+        return arm
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
