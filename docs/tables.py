@@ -39,10 +39,12 @@ POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it w
 TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
+OF_URDF = urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"})
+OF_PAPER = [param.for_joints(1) for param in COMPENSATOR]
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
-    "urdf_arm": urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"}),
+    "urdf_arm": [param for param in OF_URDF if param not in OF_PAPER],
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,

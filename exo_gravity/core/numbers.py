@@ -9,7 +9,7 @@ from exo_gravity.core.errors import ParameterError
 
 Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the components of a vector
 
-JOINT_COUNT = 4
+JOINT_COUNT = 4  # of the paper's arm, whose values are the defaults
 MAX_JOINTS = 32  # of one arm
 COVER = 1.96  # standard deviations of a 95 % band
 

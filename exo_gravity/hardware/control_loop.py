@@ -278,7 +278,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     before it hangs. No motor is switched on. No exception ends this.
     """
     clock, start, exits = bus.clock, bus.clock.monotonic(), 0
-    rest = RestTracker()
+    rest = RestTracker(len(bus.samples))
     confirmed = [False] * len(drive.effort)
     while not all(confirmed):
         now, joints = clock.monotonic(), tuple(bus.samples)

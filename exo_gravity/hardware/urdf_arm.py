@@ -3,7 +3,7 @@
 A URDF gives each link's mass, centre of gravity and inertia, and each joint's place and axis. With the joint velocities
 and accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`).
 Gravity comes as a vector in the root link's axes, so that the base may tilt. The root link has the trunk's axes
-(REP-103). Inertia is without rotors, of which a URDF says nothing.
+(REP-103).
 
 What the arm holds, a load or a wearer, are points of mass on its links. A wearer's segment lies on the line from its
 link's joint to the next joint, or from the last joint to the hand.
@@ -65,16 +65,20 @@ def _located(path: str) -> Path:
 class UrdfArm:
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
-    It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm. hand: the link that holds a load,
-    '' if there is none. Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing,
-    the hand is no link, a joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
+    It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm.
+
+    hand: the link that holds a load, '' if there is none.
+    rotors: inertia of the motors' rotors at the joints, (n,) kg m^2, which a URDF does not state; () for none.
+
+    Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing, the hand is no link,
+    a joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
 
     max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
     notes: sentences on what is doubtful in the URDF, for the log.
     length: (n,) m from each joint to the next one, and from the last one to the hand; 0 if there is no hand.
     """
 
-    def __init__(self, text: str, joint_names: Sequence[str], hand: str = "") -> None:
+    def __init__(self, text: str, joint_names: Sequence[str], hand: str = "", rotors: Sequence[float] = ()) -> None:
         self._pin, names = _pinocchio(), list(joint_names)
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
             raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
@@ -87,6 +91,7 @@ class UrdfArm:
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self.payload = NO_PAYLOAD
         self._hand = hand
+        self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
         self._identity = text, tuple(names)
         self._bare = self._model  # without load and wearer
@@ -108,7 +113,7 @@ class UrdfArm:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        return (*self._identity, self._hand, self.scale, self.payload, self._worn, self._own_mass)
+        return (*self._identity, self._hand, self._rotors, self.scale, self.payload, self._worn, self._own_mass)
 
     @cached_property
     def scale(self) -> tuple[float, ...]:
@@ -137,8 +142,12 @@ class UrdfArm:
 
     @cached_property
     def links(self) -> UrdfLinks:
-        """The inertia, without rotors."""
-        return UrdfLinks(self._pin, self._model, self._moves)
+        """The inertia of links, load, wearer and rotors."""
+        return UrdfLinks(self._pin, self._model, self._moves, self._rotors)
+
+    def worn_links(self, mass: Vector, cog: Vector) -> UrdfLinks:
+        """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
+        return self.with_wearer(mass, cog).links
 
     @property
     def fixed(self) -> tuple[str, ...]:
@@ -172,7 +181,8 @@ class UrdfArm:
         arm = copy.copy(self)
         arm.gain = floats("gain", gain, len(self.gain), 0.0, MAX_GAIN)
         arm.gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
-        return arm._anew()
+        arm._anew().__dict__["links"] = self.links  # what takes long to compute, the least inertia, is computed once
+        return arm
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
@@ -268,10 +278,11 @@ class UrdfLinks:
     """The inertia of an arm by Pinocchio: `Links` of core/arm/interface.py.
 
     moves: how the joints of `model` move.
+    rotors: (n,) kg m^2 at the joints.
     """
 
-    def __init__(self, pin: Any, model: Any, moves: UrdfJoints) -> None:
-        self._pin, self._moves = pin, moves
+    def __init__(self, pin: Any, model: Any, moves: UrdfJoints, rotors: Sequence[float]) -> None:
+        self._pin, self._moves, self._rotors = pin, moves, np.array(rotors)
         self._model, self._data = model, model.createData()
 
     def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
@@ -279,7 +290,7 @@ class UrdfLinks:
         self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
         rates = (self._moves.spread(values) for values in (velocity, acceleration))
         torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
-        return tuple(self._moves.folded(torque).tolist())
+        return tuple((self._moves.folded(torque) + self._rotors * acceleration).tolist())
 
     def momentum(
         self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
@@ -296,7 +307,7 @@ class UrdfLinks:
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
         upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
-        return self._moves.folded_matrix(upper + np.triu(upper, 1).T)
+        return np.asarray(self._moves.folded_matrix(upper + np.triu(upper, 1).T) + np.diag(self._rotors))
 
     @cached_property
     def least(self) -> tuple[float, ...]:

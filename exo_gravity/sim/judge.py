@@ -17,6 +17,7 @@ import numpy as np
 
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.numbers import for_joints
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
@@ -28,8 +29,9 @@ COAST = 0.02  # s for which a motor may stop driving within a stretch: a light a
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
-PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in USUAL_MOTORS])
-RATED_TORQUE = np.array([MOTORS[name].rated_torque for name in USUAL_MOTORS])
+# Nm, of the paper's arm; of another arm the least of them
+PEAK_TORQUE = tuple(MOTORS[name].peak_torque for name in USUAL_MOTORS)
+RATED_TORQUE = tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS)
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
 
 
@@ -64,11 +66,12 @@ def driven(records: np.ndarray) -> Driven:
     energy = done - np.maximum.accumulate(np.where(in_stretch, 0.0, done), axis=0)
     speed = np.where(energy > LITTLE, _gained_in(in_stretch, gained), 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
+    rated = for_joints(RATED_TORQUE, speed.shape[1])
     return Driven(
         speed=float(speed[when, joint]),
         energy=float(energy.max()),
         power=float(power[is_moved].max(initial=0.0)),
-        damping=float(np.abs(records["damping"] * records["velocity"] / RATED_TORQUE).max()),
+        damping=float(np.abs(records["damping"] * records["velocity"] / rated).max()),
         joint=int(joint) + 1,
         time=float(records["time"][when]),
     )
@@ -194,7 +197,8 @@ def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     torque = records["torque"]
     effort = torque + records["damping"] * records["velocity"]  # the part that damping does not explain
     step = np.minimum(np.abs(np.diff(effort, axis=0)), np.abs(np.diff(torque, axis=0)))
-    at_peak = np.abs(torque) > PEAK_TORQUE - RESOLUTION  # there, damping explains less than its share
+    peak = np.array(for_joints(PEAK_TORQUE, torque.shape[1]))
+    at_peak = np.abs(torque) > peak - RESOLUTION  # there, damping explains less than its share
     step[at_peak[1:] | at_peak[:-1]] = 0.0
     on = records["on"]
     switched_off = on[:-1] & ~on[1:]

@@ -18,6 +18,7 @@ from exo_gravity.core.arm.arm_data import (
 )
 from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
+from exo_gravity.core.numbers import Vector
 
 __all__ = [
     "MAX_GAIN",
@@ -55,6 +56,10 @@ class ArmModel(ArmData):
     def links(self) -> LinkInertia:
         """The inertia, with the usual rotors; approximate if the arm is given by its moments."""
         return links_of(self)
+
+    def worn_links(self, mass: Vector, cog: Vector) -> LinkInertia:
+        """Return the inertia with the wearer's segments, (4,) kg at (4,) m along their links, as rods of their own."""
+        return self.links.beside(links_of(ArmModel(self.length, cog, mass)))
 
     @property
     def facts(self) -> Mapping[str, Sequence[float] | None]:

@@ -91,6 +91,10 @@ class Arm(Protocol):
         """What is known of the arm itself, by name and unit, for /diagnostics; None for what is not known."""
         ...
 
+    def worn_links(self, mass: Vector, cog: Vector) -> Links:
+        """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
+        ...
+
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
         ...

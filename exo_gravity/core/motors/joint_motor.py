@@ -200,7 +200,7 @@ def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
     """Return the motors that parameter values describe, one per joint, or raise ParameterError."""
     ids = values["can_id"]
     if len(set(ids)) != len(ids):
-        raise ParameterError("can_id", ids, "different IDs, one per joint")
+        raise ParameterError("can_id", ids, f"{len(ids)} different IDs")
     motors = tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
     for motor in motors:
         if motor.reply_id != motor.command_id and motor.reply_id < EXTENDED and motor.reply_id & 0xFF in ids:

@@ -103,7 +103,7 @@ class FaultCode(str, Enum):
         "a motor's angle has turned otherwise than its velocity says: wrong `velocity_range`, or a slipping encoder",
     )
     # The start gate
-    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start"
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from `home` at the first start"
     TORQUE_WHILE_HANGING = (
         "torque_while_hanging",
         "at the first start, an arm that hangs is asked for more than 1.5 Nm, or a third of `max_effort`",

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.compensation.settings import COMPENSATOR, URDF_LAW, compensator_table, settings_of, urdf_table
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table, settings_of, urdf_table
 from exo_gravity.core.errors import named
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE
@@ -29,8 +30,7 @@ def check_nodes(nodes: Nodes) -> None:
             with named(f"{node} "):
                 TrunkEstimator(*(values[setting] for setting in settings))
         elif name == "compensator" and given.get("law") == URDF_LAW:
-            names = given.get("joint_names")
-            table = urdf_table(len(names) if isinstance(names, list) else 1, given)
+            table = urdf_table(given)
             node_values({node: _of_urdf(given, table)}, node, table)
         elif name == "compensator" and f"{namespace}/can_bridge" in nodes:
             read_arm(nodes, namespace).settings()

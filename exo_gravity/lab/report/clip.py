@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.progress import track
 
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.vocabulary import Source
@@ -214,6 +215,8 @@ def _description(bag: Bag, name: str) -> ArmDescription:
         if not given:
             node = node_of(name, executable)
             raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
+    if values["compensator"]["law"] == URDF_LAW:
+        raise DataError(f"{name}: a clip shows the paper's arm alone, not one with law {URDF_LAW}")
     return described(**values)
 
 

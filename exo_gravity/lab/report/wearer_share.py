@@ -12,6 +12,7 @@ import numpy as np
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
@@ -36,7 +37,7 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     Raises ParameterError or DataError that says why it is not known.
     """
     values = recorded_of(bag.parameters, recording.name, "compensator")
-    settings = settings_of({**values, "law": "exact"}) if values else None
+    settings = settings_of({**values, "law": "exact"}) if values and values["law"] != URDF_LAW else None
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()

@@ -72,7 +72,8 @@ def check_side(namespace: str, side: str) -> None:
 def sentence(s: Settings) -> str:
     """Return what is compensated, for the log."""
     carried = f"compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
-    return f"{s.side} arm, mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
+    side = "" if s.law == URDF_LAW else f"{s.side} arm, "
+    return f"{side}mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
 
 
 def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
