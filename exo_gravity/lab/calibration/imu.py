@@ -81,7 +81,9 @@ class ImuRecord(NamedTuple):
         if self.orientation is None or (np.isfinite(self.angular_velocity).all() and self.angular_velocity.any()):
             return self
         world_from_imu = Rotation.from_quat(self.orientation)
-        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.maximum(np.diff(self.time), 1e-6)[:, None]
+        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.maximum(np.diff(self.time), 1e-6)[
+            :, None
+        ]
         return self._replace(angular_velocity=np.vstack((turns, turns[-1:])))
 
 
@@ -247,8 +249,9 @@ def check_as_imu(record: ImuRecord, phases: Sequence[Phase], found: Mounting, va
         answer = None
         try:
             answer = estimator.update(ImuSample(*row))
+            problem = "" if answer else problem
         except ParameterError as error:
-            problem = f"{error.name} must be {error.expected}"
+            problem = problem or f"{error.name} must be {error.expected}"  # the first since the last tilt
         if k not in ends or record.time[k] < SETTLED:
             continue
         if answer is None:
