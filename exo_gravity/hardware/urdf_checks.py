@@ -177,7 +177,9 @@ class UrdfJoints:
 
     def _placed(self, positions: np.ndarray, at: Sequence[float] | np.ndarray = ()) -> np.ndarray:
         """Return the configuration for the positions of the arm's joints and, `at`, of the others."""
-        moved = self._coupling @ np.concatenate((positions, at)) + self._offset
+        moved: np.ndarray = self._coupling @ np.concatenate((positions, at)) + self._offset
+        if self.model.nq == self.model.nv:  # no continuous joint, which has two numbers in a configuration
+            return moved
         return np.asarray(self._pin.integrate(self.model, self._neutral, moved))
 
     def _torque(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
