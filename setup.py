@@ -109,6 +109,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", glob("config/*.yaml")),
+        (f"share/{package_name}/config/arms", glob("config/arms/*.urdf")),
         (f"share/{package_name}/config/trials", glob("config/trials/*.yaml")),
         (f"share/{package_name}/config/sros2", glob("config/sros2/*.xml")),
         (f"share/{package_name}/config/rviz", glob("config/rviz/*.rviz")),

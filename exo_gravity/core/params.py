@@ -135,19 +135,20 @@ def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
 def check_owned(instance: Any, count: int | None = None) -> None:
     """Check every owned field of a frozen dataclass instance, and convert its numbers; a list becomes a tuple.
 
-    count: of the arm's joints; None: as many as the longest list with one entry per joint has. Raises ParameterError
-    that names the field.
+    count: of the arm's joints; None: as many as the longest list with one entry per joint has. A default that is the
+    same for all joints has as many. Raises ParameterError that names the field.
     """
-    given = []
-    for param in params_of(type(instance)):
-        value = getattr(instance, param.name)
-        given.append((param, value.tolist() if isinstance(value, np.ndarray) else value))
+    params = {param.name: param for param in params_of(type(instance))}
+    given = {name: getattr(instance, name) for name in params}
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in given.items()}
     if count is None:
-        lists = [value for param, value in given if param.is_per_joint and isinstance(value, list | tuple)]
-        count = max(map(len, lists), default=0)
-    for param, plain in given:
-        checked = param.for_joints(count).check(plain)
-        object.__setattr__(instance, param.name, tuple(checked) if isinstance(checked, list) else checked)
+        lists = [plain[name] for name, param in params.items() if param.is_per_joint]
+        count = max([len(value) for value in lists if isinstance(value, list | tuple)], default=0)
+    defaults = {field.name: field.default for field in fields(instance)}
+    for name, param in params.items():
+        sized = param.for_joints(count)
+        checked = sized.check(sized.omitted if given[name] is defaults[name] else plain[name])
+        object.__setattr__(instance, name, tuple(checked) if isinstance(checked, list) else checked)
 
 
 def in_force(name: str, value: Any) -> dict[str, Any]:

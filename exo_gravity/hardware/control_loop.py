@@ -107,6 +107,8 @@ class ControlLoop:
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
+        #: What a start waits for besides the boards of the motors, set from outside; '' for nothing.
+        self.hindrance = ""
         #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
         self.attended = math.inf
         #: Its counts may be read, and it may be used within a `call`.
@@ -226,6 +228,8 @@ class ControlLoop:
             self.safety.trip(FaultCode.INTERNAL_ERROR, reason, now)
         if self._is_stopping:
             self.safety.disable(now)
+        if self.safety.state is State.CHECKING:
+            self.safety.hindrance = self.hindrance or self.bus.boards.hindrance(now, 1.0 / self.period)
         drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
             complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)

@@ -34,7 +34,7 @@ class UrdfLimits:
     share: float = 0.03  #: of the arm's largest torque, by which what is not known may change a torque
     poses: int = 100  #: that are tried
     gyration: float = 0.3  #: m, radius of gyration of a link about its own joint that no link of an arm has
-    strong: float = 50.0  #: times gravity's largest torque: an effort limit that limits nothing; a worn arm lifts its wearer, too
+    strong: float = 50.0  #: times gravity's largest torque: an effort limit that limits nothing, also of a worn arm
     weak: float = 0.5  #: share of gravity's largest torque at the joint, which an effort limit must reach
 
 

@@ -24,7 +24,7 @@ from exo_gravity.sim.trunk_motion import TrunkState
 
 SHAPES = ("visual", "collision")
 # Links without mass, which MuJoCo refuses to move, get the least; inertias that no body can have are corrected.
-COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-9", "boundinertia": "1e-9"}
+COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-14", "boundinertia": "1e-14"}
 POINT = (1e-7, 1e-7, 1e-7)  # kg m^2, the inertia of a point of mass
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 

@@ -24,6 +24,7 @@ from exo_gravity.core.motors.joint_motor import (
 
 AK60 = MOTORS["AK60-6"]
 V3 = MIT_V3.ranged(AK60)
+AK = {"motor": ["AK60-6"] * 4}
 
 
 def frame_bits(data_bytes: int, is_extended: bool = False) -> tuple[int, int]:
@@ -127,7 +128,7 @@ def test_a_rate_beyond_the_bus_is_rejected_with_the_largest_and_one_that_crowds_
 
 @pytest.mark.parametrize("interface", ["gs_usb", "slcan"])
 def test_an_adapter_without_a_bit_rate_is_refused(interface):
-    values = {"can.interface": interface, "can.channel": "c", "wire_format": ["mit", "mit", "mit", "mit_v3"]}
+    values = {"can.interface": interface, "can.channel": "c", "wire_format": ["mit", "mit", "mit", "mit_v3"], **AK}
     with pytest.raises(ParameterError, match=rf"can.options.bitrate = None: must be set for {interface}"):
         traffic_of(values, {})
     with pytest.raises(ParameterError, match=r"can.options.bitrate = 5: must be a whole number from 10000"):
@@ -136,10 +137,15 @@ def test_an_adapter_without_a_bit_rate_is_refused(interface):
 
 
 def test_each_bus_has_the_load_of_its_own_motors():
-    values = {"can.interface": "socketcan", "wire_format": ["mit"] * 4}
+    values = {"can.interface": "socketcan", "wire_format": ["mit"] * 4, **AK}
     two = traffic_of({**values, "can.channel": "can0,can0,can1,can1"}, {})
     assert two == {"can0": Traffic(2), "can1": Traffic(2)}
-    values = {"can.interface": "slcan", "can.channel": "a, b,b, b", "wire_format": ["mit", "mit", "mit_v3", "mit_v3"]}
+    values = {
+        "can.interface": "slcan",
+        "can.channel": "a, b,b, b",
+        "wire_format": ["mit", "mit", "mit_v3", "mit_v3"],
+        **AK,
+    }
     slow_and_fast = {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]}
     assert traffic_of(values, slow_and_fast) == {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)}
 

@@ -15,6 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation import guidance
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety import guidance as guided
@@ -30,7 +31,7 @@ ARMS = Path(__file__).parents[1] / "data" / "arms"
 URDF = ARMS / "ur5.urdf"
 NAMES = [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 POSE = (0.3, -0.8, 1.1, 0.4, -0.6, 0.2)
-EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, (0.0, 0.0, -9.80665))
+EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, Tilt.of("left"))
 PARAMETERS = {
     "law": "urdf",
     "joint_names": f"[{','.join(NAMES)}]",

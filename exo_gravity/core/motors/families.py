@@ -2,8 +2,8 @@
 
 A laboratory's own motors need no fork: a distribution that names a `Family` under the entry point group GROUP in its
 pyproject.toml or setup.cfg is found here, e.g. `our_motors = our_lab.motors:FAMILY`. Its simulated twin is named in a
-second group (sim/motors/__init__.py). Entry points are looked up when a name is not one of ours, or all are listed: an
-ordinary start does not pay for it.
+second group (sim/motors/__init__.py). Entry points are looked up when a name is not one of ours, and listed from then
+on: an ordinary start does not pay for them.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -38,14 +38,14 @@ class ByName(Mapping[str, Item]):
         return name in self._ours or name in self._all
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._all)
+        return iter(self._all if others.cache_info().currsize else self._ours)
 
     def __len__(self) -> int:
-        return len(self._all)
+        return sum(1 for _ in self)
 
     @property
     def _all(self) -> Mapping[str, Item]:
-        return _joined(self._of, (*OURS, *others()))
+        return _joined(self._of, every_family())
 
 
 def _joined(of: Callable[[Family], Mapping[str, Item]], families: tuple[Family, ...]) -> dict[str, Item]:
@@ -70,6 +70,11 @@ def others() -> tuple[Family, ...]:
             raise DataError(f"entry point {entry.name} = {entry.value} of {GROUP}: {', '.join(sorted(taken))}: taken")
         found.append(family)
     return tuple(found)
+
+
+def every_family() -> tuple[Family, ...]:
+    """Return our own families, and those of other distributions. Raises DataError."""
+    return (*OURS, *others())
 
 
 FAMILIES: Mapping[str, Family] = ByName(lambda family: {family.name: family})

@@ -25,7 +25,7 @@ import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import FAMILY, MIT
-from exo_gravity.core.motors.families import FAMILIES, MOTORS
+from exo_gravity.core.motors.families import FAMILIES, MOTORS, every_family
 from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, Frame, WireFormat
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, is_fd
 from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
@@ -113,7 +113,7 @@ class BusScan(contextlib.ExitStack):
         super().__init__()
         self._now = clock.monotonic
         self.name = address[1]
-        boards = [board for family in FAMILIES.values() for board in family.formats.values()]
+        boards = [board for family in every_family() for board in family.formats.values()]
         self._asked = sorted((board for board in boards if board.questions(1)), key=lambda board: board.last_id)
         self._reporting = [board for board in boards if not board.questions(1)]
         self._boards: dict[int, WireFormat] = {}  # of each motor that has answered or reported

@@ -232,8 +232,7 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        boards = loop.bus.boards.hindrance(time.monotonic(), 1.0 / loop.period)
-        loop.safety.hindrance = "the watchdog to start" if watchdog.is_starting else boards
+        loop.hindrance = "the watchdog to start" if watchdog.is_starting else ""
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 

@@ -99,8 +99,9 @@ class TermParameters:
     def __post_init__(self) -> None:
         check_owned(self)
         first = params_of(type(self))[0]
-        off = tuple(first.default) if isinstance(first.default, list) else first.default
-        object.__setattr__(self, "on", getattr(self, first.name) != off)
+        value = getattr(self, first.name)
+        off = tuple(first.for_joints(len(value)).default) if isinstance(value, tuple) else first.default
+        object.__setattr__(self, "on", value != off)
 
 
 @dataclass(frozen=True)
