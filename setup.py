@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
-here = Path(__file__).parent
+here = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
@@ -56,6 +56,7 @@ extras = {
         "zstandard>=0.22",
     ],
     "analysis": ["pandas>=2.1"],  # Bag.to_frame
+    "cluster": ["dask[distributed]>=2024.5"],  # report --scheduler
     "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
         "imufusion>=1.3",
@@ -65,7 +66,7 @@ extras = {
         "threadpoolctl>=3.0",
     ],
     "urdf": ["pin>=2.7"],  # law: urdf
-    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4"],
+    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4", "sphinx-copybutton>=0.5"],
     "test": [
         "axe-playwright-python>=0.1.4",
         "httpx>=0.27",

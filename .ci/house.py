@@ -10,8 +10,8 @@ import ast
 import re
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,6 +21,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
+import states  # noqa: E402
 import tables  # noqa: E402
 
 from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
@@ -29,23 +30,27 @@ from test.support.document_commands import DOCUMENTS, ROS2, commands_of  # noqa:
 
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|lab|panel|nodes|tools|.ci|.github"
 CORE_ENTRIES = 12  # at most, in the first floor of core
+COPYRIGHT = "# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0"
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 # Keys of rosdep's python.yaml that install Ubuntu's packages, each with the module it provides.
 ROSDEP = {
     "can": "python3-can",
     "hypothesis": "python3-hypothesis",
+    "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
     "pytest": "python3-pytest",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
     "serial": "python3-serial",
     "yaml": "python3-yaml",
 }
 # Needed although no module imports them: by python-can's udp_multicast, the launch files.
-INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
+INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
-    "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "lz4", "matplotlib", "mcap", "mcap_ros2",
-    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "rich", "roboticstoolbox", "rosbags", "rtbdata",
-    "scipy", "sklearn",
+    "PIL", "axe_playwright_python", "distributed", "httpx", "imageio", "imufusion", "lz4", "mcap", "mcap_ros2",
+    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "roboticstoolbox", "rosbags", "rtbdata",
+    "sklearn",
     "adafruit_extended_bus", "adafruit_icm20x", "adafruit_lsm6ds", "adafruit_mpu6050", "spatialmath", "starlette",
     "threadpoolctl", "uvicorn", "vqf", "websockets", "zstandard",
 }  # fmt: skip
@@ -89,15 +94,17 @@ def links_and_paths() -> Iterator[str]:
 
 
 def generated_tables() -> Iterator[str]:
-    """Yield each table that differs from the code, or has no place in a document."""
+    """Yield each generated table, and the picture of the states, that differs from the code or has no place."""
     places: set[str] = set()
     for path in DOCUMENTS:
         document = text_of(path)
         places |= {found[2] for found in tables.TABLE.finditer(document)}
         for table in tables.stale_tables(document):
             yield f"{path.relative_to(ROOT)}: table {table} differs from the code; run {tables.COMMAND}"
-    if missing := {*tables.PARAMETERS, "faults", "firmwares", "topics"} - places:
+    if missing := {*tables.PARAMETERS, "faults", "firmwares", "motors", "topics"} - places:
         yield f"no document has a place for the tables {', '.join(sorted(missing))}"
+    if text_of(states.PICTURE) != states.drawing():
+        yield "docs/states.svg differs from the transitions; run python docs/states.py"
 
 
 def commands_and_site() -> Iterator[str]:
@@ -108,6 +115,8 @@ def commands_and_site() -> Iterator[str]:
     with_run = {path.name for path in DOCUMENTS if "ros2 run exo_gravity" in text_of(path)}
     if with_run != {"README.md", "installation.md"}:  # the example of a workspace, and the rule
         yield f"`ros2 run exo_gravity` belongs before no command, see docs/installation.md: {', '.join(with_run)}"
+    unpublished = {path.name for path in DOCUMENTS if re.search(r"pip install '?exo_gravity\b(?!-)", text_of(path))}
+    yield from (f"{name}: nothing on PyPI is ours: name a wheel, or a folder" for name in unpublished)
     trees_of_site = re.findall(r"```{toctree}\n(.*?)```", text_of("docs/index.md"), re.DOTALL)
     listed = {line for tree in trees_of_site for line in tree.splitlines()}
     for path in sorted((ROOT / "docs").glob("*.md")):
@@ -116,13 +125,20 @@ def commands_and_site() -> Iterator[str]:
 
 
 def safety_case() -> Iterator[str]:
-    """Yield each difference between the rows of the fault matrix and those that the safety case names, once each."""
-    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety.md"))
+    """Yield each row of the fault matrix that the safety case does not name once, and each name that is no row's.
+
+    An asterisk in a name stands for any text.
+    """
+    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
     cells = (line.split(" | ")[-1] for table in found for line in table.splitlines())
-    named = Counter(name for cell in cells for name in re.findall(r"`([^`]+)`", cell))
-    played = Counter(case.name for case in CASES)
-    yield from (f"docs/safety.md does not name the row {row}" for row in played - named)
-    yield from (f"docs/safety.md names the row {row}, which is not played or is named before" for row in named - played)
+    names = [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
+    rows = [case.name for case in CASES]
+    for row in rows:
+        if (times := sum(fnmatchcase(row, name) for name in names)) != 1:
+            yield f"docs/safety_case.md must name the row {row} once, not {times} times"
+    for name in names:
+        if not any(fnmatchcase(row, name) for row in rows):
+            yield f"docs/safety_case.md: no row is called {name}"
 
 
 def troubleshooting() -> Iterator[str]:
@@ -152,6 +168,16 @@ def modules() -> Iterator[str]:
     entries = {path.name for path in (ROOT / "exo_gravity" / "core").iterdir() if path.suffix in ("", ".py")}
     if len(entries - {"__init__.py", "__pycache__"}) > CORE_ENTRIES:
         yield f"exo_gravity/core has more than {CORE_ENTRIES} entries"
+
+
+def copyright_lines() -> Iterator[str]:
+    """Yield each source file without the copyright line near its top."""
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for path in filter(lambda path: (ROOT / path).is_file(), tracked.splitlines()):
+        with (ROOT / path).open("rb") as file:
+            first = [next(file, b"").decode(errors="replace").rstrip() for _ in range(2)]
+        if (path.endswith(".py") or re.match(r"#!.*\b(ba|da)?sh\b", first[0])) and COPYRIGHT not in first:
+            yield f"{path}: no copyright line; run .ci/headers"
 
 
 def package_xml() -> Iterator[str]:
@@ -218,6 +244,7 @@ RULES = (
     safety_case,
     troubleshooting,
     modules,
+    copyright_lines,
     package_xml,
     release_files,
 )

@@ -24,7 +24,7 @@ project = "exo_gravity"
 author = "exo_gravity maintainers"
 release = version = ElementTree.parse(ROOT / "package.xml").findtext("version", "")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
+extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 include_patterns = ["docs/*.md", "README.md", "CONTRIBUTING.md", "CHANGELOG.rst", "test/data/*/*.md"]
 default_role = "code"  # what docstrings put in single backticks
 root_doc = "docs/index"

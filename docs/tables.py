@@ -1,4 +1,4 @@
-"""Writes the tables of docs/parameters.md, motors.md, safety.md and topics.md from the declarations in the code.
+"""Writes the tables of the documents from the declarations in the code.
 
 `python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.
 A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -->`. Needs the extra `sim`, not ROS.
@@ -11,9 +11,12 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.errors import ParameterError
@@ -33,7 +36,7 @@ from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent
 POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it with the running nodes
-README = DOCS.parent / "README.md"
+TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
 PARAMETERS = {
@@ -47,6 +50,9 @@ PARAMETERS = {
     "panel": PANEL,
     "calibrator": CALIBRATOR,
 }
+BASES = ("can_bridge", "compensator")
+# Their tables name the parameters that they share with one of BASES, and leave them out.
+REPEATING = ("simulator", "calibrator", "urdf_arm")
 RANGES = ("position_range", "velocity_range", "torque_range")
 MOTOR_HEAD = (
     "`motor`",
@@ -59,7 +65,7 @@ MOTOR_HEAD = (
     "angle after power-up",
     "shuts off, degC",
 )
-HEAD = ("parameter", "default", "unit", "range", "change", "meaning")
+HEAD = ("parameter", "default", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -149,16 +155,38 @@ FIRMWARE_QUESTIONS: tuple[tuple[str, tuple[str, ...], Callable[[Firmware], str]]
 )
 
 
-def parameter_table(params: Sequence[Param]) -> str:
-    """Return the Markdown table of one node's parameters."""
-    usual, expert = ([p for p in params if p.expert is wanted] for wanted in (False, True))
-    text = markdown(HEAD, map(_row, usual))
-    return f"{text}\nFor experts:\n\n{markdown(HEAD, map(_row, expert))}" if expert else text
+def parameter_table(node: str) -> str:
+    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts."""
+    shared: dict[str, list[str]] = defaultdict(list)
+    own = []
+    for param in PARAMETERS[node]:
+        base = next((base for base in BASES if any(_same(param, other) for other in PARAMETERS[base])), None)
+        if base and node in REPEATING:
+            shared[base].append(f"`{param.name}`")
+        else:
+            own.append(param)
+    as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
+    usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
+    text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _parameter_rows(usual)
+    return f"{text}\nFor experts:\n\n{_parameter_rows(expert)}" if expert else text
+
+
+def _parameter_rows(params: Sequence[Param]) -> str:
+    """Return a Markdown table; it says when a parameter may change where they differ in that."""
+    mixed = len({param.fixed for param in params}) > 1
+    keep = [n for n, title in enumerate(HEAD) if mixed or title != "change"]
+    return markdown([HEAD[n] for n in keep], ([_row(param)[n] for n in keep] for param in params))
+
+
+def _same(param: Param, other: Param) -> bool:
+    """Whether two nodes' parameters are the same to their user, except for when they may change."""
+    return replace(param, fixed=other.fixed, expert=other.expert) == other
 
 
 def fault_table() -> str:
     """Return the Markdown table of the fault codes, with the default of each limit that a meaning names."""
-    limits = {p.name: f"`{p.name}` {_shown(p.default)} {p.unit}".rstrip() for p in CAN_BRIDGE if p.bounds}
+    limited = (p for p in CAN_BRIDGE if p.bounds and np.any(p.default))
+    limits = {p.name: f"`{p.name}` {_default(p)}" for p in limited}
     rows = []
     for code in FaultCode:
         named = [limits[name] for name in re.findall(r"`(\w+)`", code.meaning) if name in limits]
@@ -210,12 +238,10 @@ def _has_ranges(board: WireFormat, spec: MotorSpec) -> bool:
 
 
 def topic_table() -> str:
-    """Return the Markdown table of the topics: the policy's publishers and subscribers, the README's types.
+    """Return the Markdown table of the policy's publishers and subscribers of each topic.
 
-    Raises KeyError for a topic that the README does not have.
+    Raises ValueError for a topic that docs/topics.md does not describe.
     """
-    types = dict(re.findall(r"^\| `([\w/]+)` \| ([^|]+?) \|", README.read_text(encoding="utf-8"), re.MULTILINE))
-    types["can_bridge/transition_event"] = "lifecycle_msgs/TransitionEvent"
     nodes: dict[tuple[str, str], set[str]] = defaultdict(set)
     for profile in ElementTree.parse(POLICY).iter("profile"):
         if profile.get("ns") == "/right" or profile.get("node") == "operator":
@@ -224,11 +250,14 @@ def topic_table() -> str:
             way = "publish" if "publish" in group.attrib else "subscribe"
             for topic in group:
                 nodes[re.sub("^/(left|right)/", "", str(topic.text)), way].add(f"`{profile.get('node')}`")
+    topics = sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
+    described = set(re.findall(r"^\| `([\w/]+)` \| \w+_msgs/", TOPICS.read_text(encoding="utf-8"), re.MULTILINE))
+    if missing := set(topics) - described:
+        raise ValueError(f"{TOPICS}: must describe {', '.join(sorted(missing))}")
     rows = [
-        (f"`{name}`", types[name], *(", ".join(sorted(nodes[name, way])) for way in ("publish", "subscribe")))
-        for name in sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
+        (f"`{name}`", *(", ".join(sorted(nodes[name, way])) for way in ("publish", "subscribe"))) for name in topics
     ]
-    return markdown(("topic", "type", "published by", "subscribed by"), rows)
+    return markdown(("topic", "published by", "subscribed by"), rows)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -239,7 +268,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def renewed(text: str) -> str:
     """Return a document's text with every table as the code declares it. Raises KeyError for an unknown table."""
-    tables = {name: parameter_table(params) for name, params in PARAMETERS.items()} | {
+    tables = {node: parameter_table(node) for node in PARAMETERS} | {
         "faults": fault_table(),
         "firmwares": firmware_table(),
         "motors": motor_table(),
@@ -255,21 +284,22 @@ def stale_tables(text: str) -> list[str]:
 
 
 def _row(p: Param) -> tuple[str, ...]:
-    return f"`{p.name}`", _default(p), p.unit, _range(p), _change(p), p.description
+    return f"`{p.name}`", _default(p), _range(p), "" if p.fixed else "live", p.description
 
 
 def _default(param: Param) -> str:
-    return "required" if param.required else _shown(param.default) or "empty"
+    if param.required:
+        return "required"
+    value = param.default
+    each = isinstance(value, list) and len(value) > 1 and len(set(value)) == 1
+    words = (_shown(value[0] if each else value) or "empty", param.unit, "each" if each else "")
+    return " ".join(filter(None, words))
 
 
 def _range(param: Param) -> str:
     if param.choices:
         return ", ".join(param.choices)
     return f"{param.bounds[0]:g} to {param.bounds[1]:g}" if param.bounds else ""
-
-
-def _change(param: Param) -> str:
-    return "read-only" if param.fixed else "live"
 
 
 def _shown(value: Any) -> str:

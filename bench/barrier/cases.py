@@ -189,7 +189,9 @@ def play(case: Case, make: Callable[[Limits, Sequence[float]], Barrier] | None, 
     device.arm.carry(case.extra)
     limits = Limits(JOINTS, max_effort=case.max_effort, sign_check_torque=0.0)
     compensator = Compensator(
-        Settings("right", ROBOT, mode=case.mode, wearer_mass=mass, wearer_cog=cog, max_effort=case.max_effort)
+        Settings(
+            "right", ROBOT, mode=case.mode, support=1.0, wearer_mass=mass, wearer_cog=cog, max_effort=case.max_effort
+        )
     )
     motion = Motion()
     begin = math.inf

@@ -62,7 +62,7 @@ class Bound(NamedTuple):
     energy: float = 0.3
 
 
-# Faults that cannot be detected at once have bounds of their own; docs/safety.md gives the reasons.
+# Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
 REVERSED = Bound(3.2, 0.1)
 

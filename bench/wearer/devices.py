@@ -108,7 +108,7 @@ def draw(seed: int) -> Worn:
     bare = moments_from(nominal, seen)
     left = turn - identify(seen, LENGTH).tilt
     values: dict[str, Any] = {change.name: change.value for change in bare.changes}
-    found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g"}
+    found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g", "support": 1.0}
     found |= {name: value for name, value in values.items() if name != "torque_scale"}
     # With the new scales, and the relaxed wearer
     true.scale = scale / values["torque_scale"]

@@ -24,6 +24,7 @@ from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Drive, Efforts, 
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.monitors import RestTracker
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -108,7 +109,7 @@ class ControlLoop:
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
         #: What a start waits for besides the boards of the motors, set from outside; '' for nothing.
-        self.hindrance = ""
+        self.hindrance = NO_REASON
         #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
         self.attended = math.inf
         #: Its counts may be read, and it may be used within a `call`.
@@ -229,7 +230,8 @@ class ControlLoop:
         if self._is_stopping:
             self.safety.disable(now)
         if self.safety.state is State.CHECKING:
-            self.safety.hindrance = self.hindrance or self.bus.boards.hindrance(now, 1.0 / self.period)
+            boards = self.bus.boards.hindrance(now, 1.0 / self.period)
+            self.safety.hindrance = self.hindrance or (Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
         drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
             complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)

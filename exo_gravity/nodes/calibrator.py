@@ -23,6 +23,7 @@ from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare
@@ -130,7 +131,10 @@ class CalibratorNode(Node):
         sys.stdout.writelines(json.dumps(event, default=np.ndarray.tolist) + "\n" for event in events)
         sys.stdout.flush()
         level = ERROR if trouble else OK if self._began else WARN
-        self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress)
+        working = NodeState.MEASURING if self._began else NodeState.WAITING
+        state = NodeState.WITHDRAWN if trouble else NodeState.DONE if tour.done else working
+        values = {"state": state, "poses": len(tour.measured)}
+        self._diagnostics.report(level, f"withdrawn: {trouble}" if trouble else progress, values)
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ from exo_gravity.core.numbers import Rate
 from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
@@ -131,32 +132,33 @@ class ImuNode(Node):
     def _report(self) -> None:
         now = time.monotonic()
         age, refusal = now - self._arrived, self._refusal
-        values = {
+        values: dict[str, object] = {
             "rate (Hz)": f"{self._rate.update(now, self._received):.0f}",
             "age of samples (ms)": milliseconds(age),
             "received": self._received,
             "missed": self._driver.missed,
             "published": self._published,
             "refused": self._refused,
-            "last refusal": refusal or "none",
+            "refusal text": refusal or NONE,
             "gyroscope bias (rad/s)": row(self._estimator.gyroscope_bias, 4),
         }
         if self._device:
             values |= self._device.values
         if self._device and self._device.reopening.problem:
-            self._diagnostics.report(ERROR, self._device.reopening.problem, values)
+            level, state, message = ERROR, ImuState.NO_DEVICE, self._device.reopening.problem
         elif not self._received:
-            self._diagnostics.report(WARN, f"waiting for {self._topic}", values)
+            level, state, message = WARN, ImuState.WAITING, f"waiting for {self._topic}"
         elif refusal and now - self._refused_at < REFUSAL_TIME:
-            self._diagnostics.report(ERROR, f"refused: {refusal.name} must be {refusal.expected}", values)
+            level, state, message = ERROR, ImuState.REFUSING, f"refused: {refusal.name} must be {refusal.expected}"
         elif age > self._timeout:
-            self._diagnostics.report(ERROR, f"no samples on {self._topic}", values)
+            level, state, message = ERROR, ImuState.STOPPED, f"no samples on {self._topic}"
         elif self._driver.are_several:
-            self._diagnostics.report(ERROR, f"more than one publisher of {self._topic}", values)
+            level, state, message = ERROR, ImuState.SECOND_PUBLISHER, f"more than one publisher of {self._topic}"
         elif self._estimator.settling:
-            self._diagnostics.report(WARN, f"settling: {self._estimator.settling}", values)
+            level, state, message = WARN, ImuState.SETTLING, f"settling: {self._estimator.settling}"
         else:
-            self._diagnostics.report(OK, "publishing", values)
+            level, state, message = OK, ImuState.PUBLISHING, "publishing"
+        self._diagnostics.report(level, message, {"state": state, **values})
 
 
 class ImuDevice(PeriodicThread):
@@ -185,12 +187,13 @@ class ImuDevice(PeriodicThread):
         """What is known of the device, for /diagnostics."""
         source, opened = self.reopening.source, self.reopening.openings
         if source is None:
-            return {"device": "closed", "opened": opened}
+            return {"device": NONE, "opened": opened}
         return {
             "device": source.name,
             "opened": opened,
-            "lost samples": f"{source.lost} {source.loss}".rstrip(),
-            "temperature (degC)": "unknown" if source.temperature is None else f"{source.temperature:.1f}",
+            "lost samples": source.lost,
+            "loss text": source.loss,
+            "temperature (degC)": UNKNOWN if source.temperature is None else f"{source.temperature:.1f}",
         }
 
     def stop(self) -> None:

@@ -20,17 +20,21 @@ from std_msgs.msg import String
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, is_fd
 from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.core.vocabulary import NodeState, SimulatorWarning, words
 from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.lab.packages import extras
 from exo_gravity.nodes.imu import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED
-from exo_gravity.sim import SimulatedImu, VirtualWearer
-from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
-from exo_gravity.sim.script import IDLE, Step, TrialScript
-from exo_gravity.sim.trunk_motion import TrunkState
+
+with extras("simulator", "sim"):
+    from exo_gravity.sim import SimulatedImu, VirtualWearer
+    from exo_gravity.sim.device import MAX_CATCH_UP
+    from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
+    from exo_gravity.sim.script import IDLE, Step, TrialScript
+    from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
 
@@ -150,19 +154,22 @@ class Simulator(Node):
 
     def _report(self) -> None:
         device = self._device
+        warnings: dict[SimulatorWarning, str] = {}
+        if device.longest_stall > MAX_CATCH_UP:
+            stalled = f"stalled for {1000.0 * device.longest_stall:.0f} ms: this computer is too busy"
+            warnings[SimulatorWarning.STALLED] = stalled
+        if device.disconnected:
+            warnings[SimulatorWarning.DISCONNECTED] = "a simulated fault disconnects a motor"
         values: dict[str, object] = {
+            "state": NodeState.RUNNING,
+            "warnings": words(*warnings),
             "motors": "on" if device.powered else "off",
             "longest stall (ms)": f"{1000.0 * device.longest_stall:.0f}",
             "longest silence (ms)": f"{1000.0 * device.longest_silence:.0f}",
             "time lost (ms)": f"{1000.0 * device.slip:.0f}",
             "disconnected": "yes" if device.disconnected else "no",
         }
-        level, message = OK, "running"
-        if device.longest_stall > MAX_CATCH_UP:
-            level, message = WARN, f"stalled for {1000.0 * device.longest_stall:.0f} ms: this computer is too busy"
-        elif device.disconnected:
-            level, message = WARN, "a simulated fault disconnects a motor"
-        self._diagnostics.report(level, message, values)
+        self._diagnostics.report(WARN if warnings else OK, "; ".join(warnings.values()) or "running", values)
 
     def _apply(self, accepted: tuple[dict[str, Any], TrialScript | None], changed: set[str]) -> None:
         values, script = accepted

@@ -24,6 +24,7 @@ HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
+COAST = 0.02  # s for which a motor may stop driving within a stretch: a light arm is thrown and caught by turns
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
@@ -36,10 +37,11 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
-    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. A WEAK torque
-    drives nothing, and a stretch of LITTLE energy has no speed. damping: torque by damping alone as a multiple of the
-    motor's rated torque, also while a hand is on the arm.
+    A stretch is motion beyond SLOW in the direction of the motor's whole torque, that of its damping included, but for
+    COAST; a WEAK torque drives nothing. speed: rad/s that `joint` (1..n) gained within a stretch, at `time` as in the
+    records; what it had before is not the motor's, and a stretch of LITTLE energy has none. energy: J in one stretch,
+    and power: W in it. damping: torque by damping alone as a multiple of the motor's rated torque, also while a hand is
+    on the arm.
     """
 
     speed: float = 0.0
@@ -56,9 +58,11 @@ def driven(records: np.ndarray) -> Driven:
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
     power[np.abs(records["torque"]) < WEAK] = 0.0
     is_moved = (power > 0.0) & (gained > SLOW)
+    time = records["time"][:, None]
+    in_stretch = time - np.maximum.accumulate(np.where(is_moved, time, -np.inf), axis=0) <= COAST
     done = np.cumsum(np.where(is_moved, power, 0.0) * _lasting(records)[:, None], axis=0)
-    energy = done - np.maximum.accumulate(np.where(is_moved, 0.0, done), axis=0)
-    speed = np.where(energy > LITTLE, gained, 0.0)
+    energy = done - np.maximum.accumulate(np.where(in_stretch, 0.0, done), axis=0)
+    speed = np.where(energy > LITTLE, _gained_in(in_stretch, gained), 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
     return Driven(
         speed=float(speed[when, joint]),
@@ -68,6 +72,21 @@ def driven(records: np.ndarray) -> Driven:
         joint=int(joint) + 1,
         time=float(records["time"][when]),
     )
+
+
+def _gained_in(in_stretch: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Return the speed (n, joints) in rad/s by which each joint exceeds the least that it has had in its stretch.
+
+    A joint that had at most twice SLOW before it counts as at rest then.
+    """
+    gained = np.zeros_like(speed)
+    for joint, flags in enumerate(in_stretch.T):
+        edges = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            before = speed[max(0, first - 1), joint]
+            least = np.minimum(np.minimum.accumulate(speed[first:end, joint]), before if before > 2.0 * SLOW else 0.0)
+            gained[first:end, joint] = speed[first:end, joint] - least
+    return gained
 
 
 def _lasting(records: np.ndarray) -> np.ndarray:

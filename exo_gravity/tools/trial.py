@@ -25,6 +25,7 @@ from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.packages import MissingPackageError
 from exo_gravity.lab.processes import stop_on_signals
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.scripted import analysed, packaged_trials, read_script
@@ -39,12 +40,14 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, is_guided, run_attempts
+    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, check_bridges, is_guided, run_attempts
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
     folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
     guided = options.attach == "guided" if options.attach else is_guided(params)
+    if not options.attach:
+        check_bridges(params)
     trial = Trial(path, script, None if options.attach else params, guided, session, folder)
     tell: Callable[..., None] = _print_json if options.attach else lambda **values: None
     stopped = stop_on_signals()
@@ -119,4 +122,4 @@ def main(args: Sequence[str] | None = None) -> int:
             return _run(options, params, clip, Console(highlight=False, stderr=bool(options.attach)))
     except ExoGravityError as error:
         print(f"trial: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ParameterError) else 1
+        return 2 if isinstance(error, ParameterError | MissingPackageError) else 1

@@ -9,11 +9,15 @@ import pytest
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3, pack_reply
+from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ID_BITS, MotorReply, pack_command
 from exo_gravity.core.motors.joint_motor import (
     BITRATE,
     COMMAND_BITS,
+    FD_BITS,
+    FD_COMMAND_BITS,
+    FD_REPLY_BITS,
     REPLY_BITS,
     STATUS_BITS,
     V3_COMMAND_BITS,
@@ -100,6 +104,37 @@ def test_every_frame_is_between_its_length_without_stuffing_and_the_worst_case(i
 def test_typical_bits_are_the_mean_of_a_carried_arm_and_the_most_those_of_the_specification(kind, bits):
     assert np.mean([stuffed_bits(*frame) for frame in frames(kind)]) == pytest.approx(bits.typical, abs=1.0)
     assert bits.most == frame_bits(8, kind.startswith("V3"))[1]
+
+
+def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
+    """The bits of a CAN FD frame at the bit rates of arbitration and of data, with its stuff bits before the CRC.
+
+    After the data: stuff count 4, CRC 17, 6 fixed stuff bits; then, slowly, delimiter, acknowledgement, end, space.
+    """
+    head = [0, *bits_of(can_id, 11), 0, 0, 1, 0, 1]
+    rest = [0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
+    stuff, last, run = [0, 0], None, 0
+    for index, bit in enumerate((*head, *rest)):
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuff[index >= len(head)] += 1
+            last, run = 1 - bit, 1
+    return len(head) + 13 + stuff[0], len(rest) + 27 + stuff[1]
+
+
+def test_typical_bits_of_can_fd_are_the_mean_of_a_carried_arm():
+    rng, spec = np.random.default_rng(5), MOTORS["DM-J4340"]
+    commands, replies = [], []
+    for index in range(1000):
+        can_id = index % 8 + 1
+        torque, position, velocity = rng.uniform((-9, -1.65, -1), (9, 3.14, 1)).tolist()
+        reply = MotorReply(can_id, position, velocity, torque, int(rng.integers(20, 60)), 0, True)
+        commands.append(fd_bits(can_id, pack_command(spec, 0.0, 0.0, 0.0, 0.0, torque)))
+        replies.append(fd_bits(DAMIAO_MIT.reply_id(can_id), DAMIAO_MIT.pack_reply(spec, reply)))
+    assert np.mean(commands, axis=0) == pytest.approx((FD_BITS.typical, FD_COMMAND_BITS.typical), abs=1.0)
+    assert np.mean(replies, axis=0) == pytest.approx((FD_BITS.typical, FD_REPLY_BITS.typical), abs=1.0)
+    assert np.all(np.max([*commands, *replies], axis=0) <= (FD_BITS.most, FD_COMMAND_BITS.most))
 
 
 def test_the_load_of_replying_and_reporting_motors():

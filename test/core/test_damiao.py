@@ -167,10 +167,10 @@ RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
 @pytest.mark.parametrize(
     ("number", "value", "sentence"),
     [
-        (TMAX, 28.0, r"its TMAX \(register 23\) is 28, must be 10, or torque_range another"),
-        (PMAX, 12.566, r"its PMAX \(register 21\) is 12\.566, must be 12\.5, or position_range another"),
-        (10, 2, r"its CTRL_MODE \(register 10\) is 2, must be 1 \(MIT\)"),
-        (TIMEOUT, 0, r"its TIMEOUT \(register 9\) is 0, must be 4000, or motor_timeout another"),
+        (TMAX, 28.0, r"its TMAX \(register 23\) is 28, must be 10, or torque_range 28 in the file"),
+        (PMAX, 12.566, r"its PMAX \(register 21\) is 12\.566, must be 12\.5, or position_range 12\.566 in"),
+        (10, 2, r"its CTRL_MODE \(register 10\) is 2, must be 1$"),
+        (TIMEOUT, 8000, r"its TIMEOUT \(register 9\) is 8000, must be 4000, or motor_timeout 0\.4 in the file"),
         (7, 0x21, r"its MST_ID \(register 7\) is 33, must be 17"),
         (22, 30.001, ""),  # a float, and the file's decimal
     ],

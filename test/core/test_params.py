@@ -100,7 +100,7 @@ def test_a_list_of_whole_and_other_numbers_which_ros_cannot_load_is_refused_by_n
 
 
 def test_the_wearers_arm_follows_from_the_body_mass():
-    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g"}
+    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": 1.0}
     assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
     half = values_of(COMPENSATOR, {**wearer, "support": 0.5})
     assert settings_of(half).arm.total_mass == pytest.approx(3.707, abs=1e-3)

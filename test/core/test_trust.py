@@ -12,6 +12,7 @@ import pytest
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.trust import Readings
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
 from ..support.safety_run import LIMITS, SafetyRun, reading
 
@@ -191,9 +192,9 @@ def test_a_confirmation_lapses_and_is_asked_for_again(moved, waited):
     arm.enable().cycle(0.5)
     assert arm.machine.pose.asked
     assert arm.machine.confirm_pose(arm.now) == "" and not arm.machine.pose.asked
-    arm.machine.hindrance = "the watchdog to start" if waited else ""
+    arm.machine.hindrance = Reason(Wait.WATCHDOG, "the watchdog to start") if waited else NO_REASON
     arm.changes[3] = {"position": moved, "velocity": 0.0}
     arm.cycle(max(0.02, waited))
-    arm.machine.hindrance = ""
+    arm.machine.hindrance = NO_REASON
     arm.cycle(2.0)
     assert arm.machine.state is State.CHECKING and arm.machine.pose.asked

@@ -155,7 +155,7 @@ V3_BOARDS = (
 SUPPLY = (
     FaultCase("enabled, and the supply cut for 4 s while checking", in_turn(CUT, pause(4.0), RELEASE, pause(OBSERVED)),
         ShortEnableRig, stage="checking", clear=RELEASE, outcomes=("disabled",),
-        afterwards=reported("can_bridge", "refusal", "not enabled within 2 s")),
+        afterwards=reported("can_bridge", "refusal text", "not enabled within 2 s")),
     supply_case("supply cut for 2 s", in_turn(CUT, pause(2.0)), Rig),
     supply_case("supply cut for 30 s, cleared meanwhile", in_turn(CUT, pause(15.0), clear, pause(15.0)), Rig),
     supply_case("V3 boards: supply cut for 2 s", in_turn(CUT, pause(2.0)), V3Rig),

@@ -50,7 +50,7 @@ def other_efforts(rig: Rig) -> JointState:
     return message
 
 
-def outer_loop_case(name: str, inject: Action, report: str) -> FaultCase:
+def outer_loop_case(name: str, inject: Action, reason: str) -> FaultCase:
     return FaultCase(
         name,
         inject,
@@ -58,16 +58,16 @@ def outer_loop_case(name: str, inject: Action, report: str) -> FaultCase:
         limit=None,
         outcomes=("active",),
         check=only_the_assistance_ends,
-        afterwards=reported("compensator", "assist", report),
+        afterwards=reported("compensator", "assist reason", reason),
     )
 
 
 # fmt: off
 OUTER_LOOP = (
-    outer_loop_case("outer loop killed", send_signal("outer_loop", signal.SIGKILL), "waiting: assist_efforts stopped"),
-    outer_loop_case("outer loop frozen", send_signal("outer_loop", signal.SIGSTOP), "waiting: assist_efforts stopped"),
-    outer_loop_case("outer loop sends NaN", send_signal("outer_loop", GO_WRONG), "refused: assist_efforts must be num"),
-    outer_loop_case("second outer loop for half a second", publish(JointState, TOPIC, other_efforts), "assisting"),
+    outer_loop_case("outer loop killed", send_signal("outer_loop", signal.SIGKILL), "stopped"),
+    outer_loop_case("outer loop frozen", send_signal("outer_loop", signal.SIGSTOP), "stopped"),
+    outer_loop_case("outer loop sends NaN", send_signal("outer_loop", GO_WRONG), "invalid"),
+    outer_loop_case("second outer loop for half a second", publish(JointState, TOPIC, other_efforts), "none"),
 )
 LEASES = (
     FaultCase("who holds control killed", send_signal("holder", signal.SIGKILL), HeldRig, LET_DOWN,

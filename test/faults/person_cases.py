@@ -20,7 +20,7 @@ import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from ..support.launched_nodes import LaunchedNodes, Parameters, executable
 from .actions import ERROR, NO_ERROR, in_turn, pause, publish, simulator, stamped, wearer
@@ -41,10 +41,26 @@ CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the j
 *SHOULDER, FLEXION, ELBOW = COMPENSATOR["joint_names"]
 SUPPORT = itertools.cycle((1.0, 0.0, math.nan, 50.0, -1.0))
 
-AskingRig = variant(WearerRig, bridge={"start_pose": "confirm"})
 TimeoutRig = variant(Rig, simulator={"firmware": {"timeout": TIMEOUT}})
 ExchangedRig = variant(SignCheckRig, bridge={**SignCheckRig.bridge, "can_id": [1, 2, 4, 3]})
 PermutedRig = variant(Rig, bridge={"joint_names": [*SHOULDER, ELBOW, FLEXION]})
+
+
+class AskingRig(WearerRig):
+    """The bridge asks an operator about the pose; one answers that the arm hangs, until `operator_answers` is False."""
+
+    bridge: ClassVar[Parameters] = {"start_pose": "confirm"}
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
+        self.operator_answers = True
+        self._confirm = self.probe.node.create_client(Trigger, "/right/can_bridge/confirm_pose")
+        self.probe.node.create_timer(0.5, self._answer)
+        self.probe.executor.wake()
+
+    def _answer(self) -> None:
+        if self.operator_answers and self.probe.state == "checking" and self._confirm.service_is_ready():
+            self._confirm.call_async(Trigger.Request())
 
 
 class AdaptiveRig(WearerRig):
@@ -95,12 +111,13 @@ def activate_while_deactivating(rig: Rig) -> float:
     return start
 
 
-def stop_in_the_lap(rig: Rig) -> float:
+def stop_in_the_lap(rig: AskingRig) -> float:
     """Press the emergency stop, lay the arm in the lap, release it, clear the fault and enable; the wearer relaxes.
 
-    The elbow's encoder has lost a turn.
+    The elbow's encoder has lost a turn. The operator does not say again that the arm hangs.
     """
     start = time.time()
+    rig.operator_answers = False
     CUT(rig)
     wearer(rig, [{"move": LAP, "over": 20.0}, {"hold": 600.0}])
     rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)

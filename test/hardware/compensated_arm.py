@@ -66,7 +66,7 @@ class CompensatedArm(DirectController, VirtualArm):
     ) -> None:
         mass, cog = WEARER
         worn = {"wearer_mass": mass, "wearer_cog": cog}
-        given = {"mode": "zero_g", "max_effort": limit, "use_imu": bool(imu), **worn, **settings}
+        given = {"mode": "zero_g", "support": 1.0, "max_effort": limit, "use_imu": bool(imu), **worn, **settings}
         self.settings = Settings("right", DEFAULT_LINKS, **given)
         self.is_damped = True
         self.top_speed = self.driven = 0.0

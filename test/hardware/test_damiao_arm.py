@@ -181,9 +181,9 @@ def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> No
 @pytest.mark.parametrize(
     ("register", "value", "sentence"),
     [
-        (TMAX, 10.0, "its TMAX (register 23) is 10, must be 54, or torque_range another"),
-        (TIMEOUT, 0.0, "its TIMEOUT (register 9) is 0, must be 4000, or motor_timeout another"),
-        (CTRL_MODE, 2.0, "its CTRL_MODE (register 10) is 2, must be 1 (MIT)"),
+        (TMAX, 10.0, "its TMAX (register 23) is 10, must be 54, or torque_range 10 in the file"),
+        (TIMEOUT, 0.0, "its TIMEOUT (register 9) is 0, must be 4000"),
+        (CTRL_MODE, 2.0, "its CTRL_MODE (register 10) is 2, must be 1"),
     ],
 )
 def test_a_motor_that_is_set_otherwise_than_the_file_says_is_not_switched_on(

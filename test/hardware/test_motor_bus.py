@@ -155,8 +155,7 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
         (frame(1, ENTER), "foreign command"),
         (frame(1, b""), "foreign command"),
         (frame(1, ENTER[:6]), "foreign command"),
-        (frame(0x83, ENTER), "foreign command"),  # the open drive compares 7 bits of the ID
-        (frame(0x703, b"\x05"), "foreign command"),
+        (frame(0x83, ENTER), "foreign frame"),
         (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
         (frame(1, REPLY[:5]), "malformed reply"),
@@ -174,6 +173,14 @@ def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(bus, other, message,
     bus.exchange(OFF, now(bus))
     assert bus.samples[0].time == float("-inf")
     assert bus.ignored == {kind: 1}
+
+
+@pytest.mark.parametrize(("length", "kind"), [(7, "foreign command"), (8, "foreign frame")])
+def test_another_id_with_the_same_lowest_7_bits_commands_an_open_drive_alone(bus, other, length, kind):
+    for message in (frame(1, REPLY[:length]), frame(0x81, ENTER), frame(0x701, b"\x05")):
+        other.send(message)
+    bus.exchange(OFF, now(bus))
+    assert bus.ignored == {kind: 2}
 
 
 @pytest.mark.parametrize("can_id", [0, 1])

@@ -87,8 +87,8 @@ def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_t
     rig.wait_until(lambda: rig.values["assist"] == "assisting" and rig.values["terms"] == "assist")
     rig.assisted = False
     rig.wait_until(lambda: rig.adds(STILL))
-    rig.wait_until(lambda: rig.values["assist"] == "waiting: assist_efforts stopped")
-    rig.wait_until(lambda: rig.message == "compensating")
+    rig.wait_until(lambda: (rig.values["assist"], rig.values["assist reason"]) == ("waiting", "stopped"))
+    rig.wait_until(lambda: rig.message == "compensating" and rig.values["warnings"] == "none")
 
 
 def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(rig):
@@ -98,6 +98,7 @@ def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goe
     rig.efforts = (math.nan, 0.0, 0.0, 0.0)  # other refusals: test/core/terms/test_assist.py
     rig.wait_until(lambda: rig.adds(STILL))
     rig.wait_until(lambda: rig.message.startswith("gravity compensation alone: assist_efforts must be numbers"))
+    assert (rig.values["assist reason"], rig.values["warnings"]) == ("invalid", "terms_refused")
     rig.efforts = ASSIST
     rig.wait_until(lambda: rig.adds(ASSIST) and rig.message == "compensating")
 

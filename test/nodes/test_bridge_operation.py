@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.compensation.compensator import Compensation
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
@@ -21,6 +21,7 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.vocabulary import NO_REASON
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
@@ -29,6 +30,7 @@ from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
 from ..hardware.rig import CarriedArm
+from ..support.keys import broken
 from ..support.waiting import wait_until
 
 NAMES = ("a", "b", "c", "elbow")
@@ -60,9 +62,9 @@ def sent(node, monkeypatch):
 
     def sent(loop, count, answered=None):
         arm = ArmOnBus(("virtual", "arm", {}), MOTORS_OF_ARM, Limits(NAMES), 0.004)
-        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease())
+        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease(), SimpleNamespace(last=("none", "none")))
         for n in range(count):
-            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), "none")
+            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), NO_REASON)
             clock.now += 0.1
         return reports
 
@@ -102,14 +104,59 @@ def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
     assert reports[-1][:2] == (OK, "active")
 
 
+def keys_of(report):
+    """Return what programs read of a report, which must keep to docs/keys.md."""
+    values = {"interface": "1", **{key: str(value) for key, value in report[2].items()}}
+    assert not broken("right/can_bridge", values)
+    return values
+
+
+def test_what_a_start_waits_for_and_why_it_ended_have_words_and_figures(sent):
+    limits, loop = Limits(NAMES), carrying(0.0)
+    hanging = JointSample(0.0, 0.0, 0.0, None, 0, math.inf)
+    loop.samples = [hanging] * 3 + [hanging._replace(position=limits.position_max[3] + math.radians(2.0))]
+    loop.safety = safety = SafetyMachine(limits, 0.004)
+    safety.enable(0.0)
+    safety.step(0.0, loop.samples, NO_EFFORTS)
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["motors"], values["waiting for"]) == ("checking", "off", "joint_limits")
+    assert (values["joints outside limits"], float(values["turn back (deg)"])) == (
+        "elbow",
+        pytest.approx(-2.0, abs=0.11),
+    )
+    assert values["refusal"] == "none" and values["elbow temperature (degC)"] == "unknown"
+    safety.step(30.0, loop.samples, NO_EFFORTS)
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["waiting for"], values["refusal"]) == ("disabled", "none", "joint_limits")
+    loop.samples = [hanging] * 4
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["joints outside limits"], values["turn back (deg)"]) == ("none", "none")
+
+
+def test_an_inactive_bridge_has_its_state_and_who_controls_it(sent):
+    values = keys_of(sent(lambda _: None, 1)[-1])
+    assert (values["state"], values["source"], values["control held by"]) == ("inactive", "simulated", "nobody")
+
+
+def test_every_key_of_a_carried_arm_is_documented(sent):
+    values = keys_of(sent(lambda n: carrying(6.0, 20 * n, temperature=-15), 1200)[-1])
+    assert values["warnings"] == "above_rated_torque, odd_temperature, slow_loop"
+    assert values["joints above rated torque"] == "elbow" and values["fault"] == "none"
+
+
 @pytest.fixture
 def ask(node):
-    """A function that asks for a service of a bridge whose control thread is `loop`; it returns why not, or ''."""
+    """A function that asks for a service of a bridge whose control thread is `loop`; it returns why not, or ''.
 
-    def ask(service, loop, data=None, zero=0.0):
+    last: the keys `request` and `answer` after it.
+    """
+
+    def ask(service, loop, data=None, zero=0.0, hindrance=""):
         motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
-        services = BridgeServices(node, lambda: loop, motors, lambda: "")
+        services = BridgeServices(node, lambda: loop, motors, lambda: hindrance)
+        assert services.last == ("none", "none")
         response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
+        ask.last = services.last
         if response.success:
             assert ("/diagnostics" in response.message) is (loop.safety.state is State.CHECKING)
             return ""
@@ -144,13 +191,35 @@ def standing():
 
 def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
     loop = standing()
-    assert ask("enable", loop, True) == ""
-    assert ask("enable", loop, True).startswith("refused")
+    assert ask("enable", loop, True) == "" and ask.last == ("enable", "done")
+    assert ask("enable", loop, True).startswith("refused") and ask.last == ("enable", "refused")
     loop.safety.trip(FaultCode.BUS_ERROR, "unplugged", 1.0)
     assert "unplugged" in ask("enable", loop, True)
     assert ask("enable", loop, False) == ask("clear_fault", loop) == ""
-    assert ask("clear_fault", loop).startswith("no fault to clear")
-    assert ask("enable", None, True) == "the node is not active"
+    assert ask("clear_fault", loop).startswith("no fault to clear") and ask.last == ("clear_fault", "refused")
+    assert ask("enable", None, True) == "the node is not active" and ask.last == ("enable", "inactive")
+
+
+def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monkeypatch):
+    loop = standing()
+    assert ask("enable", loop, True, hindrance="leaves") == "leaves" and ask.last == ("enable", "leaving")
+    assert ask("enable", loop, False, hindrance="leaves") == "" and ask.last == ("let_down", "done")
+    run, waiting = loop.call, Future()
+    loop.call = lambda function: waiting
+    monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.0)
+    assert "did not respond" in ask("enable", loop, True) and ask.last == ("enable", "no_response")
+    broken = Future()
+    broken.set_exception(BusError("unplugged"))
+    loop.call = lambda function: broken
+    assert ask("resume", loop) == "unplugged" and ask.last == ("resume", "bus_error")
+    overtaken = Future()
+    overtaken.cancel()
+    loop.call = lambda function: overtaken
+    assert "asked to be let down" in ask("confirm_pose", loop) and ask.last == ("confirm_pose", "overtaken")
+    loop.call = run
+    monkeypatch.setattr(operation, "age_of_request", lambda node: 1.5)
+    assert "1.5 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
+    assert ask("enable", loop, False) == ""
 
 
 def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
@@ -214,7 +283,7 @@ def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
     compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
     exchange.take(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
     command = await_efforts(
-        exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, "", (), "", (), False, held))
+        exchange, lambda: compensator.send(0.0, JointState(), Compensation(effort, NO_REASON, (), "", (), False, held))
     )
     assert (tuple(command.effort), command.damped, command.held) == (effort, False, bool(held))
 

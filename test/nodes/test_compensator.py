@@ -90,12 +90,17 @@ def test_a_tilt_is_believed_by_its_stamp_and_gravitys_vector_goes_before_pitch_a
     for bow, expected in ((0.36, by_vector), (None, by_angles)):
         tilt.vector_bow = bow
         probe.wait_until(lambda expected=expected: is_compensated(expected))
-    for lag, reason in (
-        (0.7, "older than 500 ms by its stamp: the IMU driver lags"),
-        (3600.0, "age of the trunk tilt by its stamp must be from -0.05 to 1 s: synchronise the clocks"),
+    for lag, word, sentence in (
+        (0.7, "late_tilt_stamp", "older than 500 ms by its stamp: the IMU driver lags"),
+        (
+            3600.0,
+            "refused_tilt",
+            "age of the trunk tilt by its stamp must be from -0.05 to 1 s: synchronise the clocks",
+        ),
     ):
         tilt.lag = lag
-        probe.wait_until(lambda reason=reason: probe.status_contains("compensator", reason))
+        probe.wait_until(lambda word=word: probe.diagnostic("compensator", "reason") == word)
+        assert sentence in probe.diagnostic("compensator", "reason text")
         probe.wait_until(lambda: not commands[-1].effort)  # the status may overtake it
         tilt.lag = 0.0
         probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
@@ -110,12 +115,14 @@ def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_
     feed()
 
     def budget() -> str:
-        return probe.diagnostic("wearer", "budget") or ""
+        return probe.diagnostic("wearer", "budget text") or ""
 
-    probe.wait_until(lambda: budget() == "within rated torque everywhere")
-    assert probe.set_parameters("compensator", atomically=True, mode="zero_g", wearer__body_mass=75).successful
+    probe.wait_until(lambda: probe.diagnostic("wearer", "budget") == "within_rated")
+    worn = {"mode": "zero_g", "support": 1.0, "wearer__body_mass": 75}
+    assert probe.set_parameters("compensator", atomically=True, **worn).successful
     needs = "right_shoulder_abduction needs 19.6 Nm in its worst pose (rated 9, peak 18)"
     probe.wait_until(lambda: needs in budget())
+    assert probe.diagnostic("wearer", "budget") == "above_rated"
     assert f"the largest support that fits is {probe.diagnostic('wearer', 'largest support')}" in budget()
     probe.wait_until(lambda: probe.status_contains("compensator", ", right_shoulder_flexion"))
     probe.wait_until(lambda: probe.effort_commands[-1].effort[2] == 3.0)

@@ -203,7 +203,7 @@ def test_joint_states_that_are_old_by_their_stamps_are_ignored(rig):
     rig.lag = 1.0
     rig.wait_until(rig.is_zero)
     rig.wait_until(lambda: "no joint_states younger than 150 ms" in rig.status.message)
-    assert "age by its stamp" in rig.values["last refused message"]
+    assert rig.values["refused message"] == "joint_states" and "age by its stamp" in rig.values["refused message text"]
 
 
 def test_a_missing_joint_fades_the_torque(rig):

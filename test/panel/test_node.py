@@ -76,7 +76,8 @@ class PlayedArm:
         self._states.publish(JointState(name=NAMES, position=[0.1] * 4, velocity=[0.0] * 4, effort=[1.0] * 4))
         values = [KeyValue(key="state", value="disabled"), KeyValue(key="fault", value="none")]
         values.append(KeyValue(key="control held by", value=self.holder))
-        status = DiagnosticStatus(name="right/can_bridge", message="disabled", values=values)
+        # The panel decides by keys alone: this is no sentence of ours.
+        status = DiagnosticStatus(name="right/can_bridge", message="zqx vw: kfj", values=values)
         self._statuses.publish(DiagnosticArray(status=[status]))
 
     def _on_control(self, message: KeyValue) -> None:
@@ -146,6 +147,8 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
             assert ask(do="enable", arm="right") == (200, "")
             assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
             assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")
+            answer = httpx.get(panel.url + "settings/right", verify=False)  # also before the panel has heard of it
+            assert answer.json() == {"settings": {"support": 0.2}}
             message(connection, "setup", lambda setup: is_known(setup, 0.2))
             assert ask(do="let_down") == (200, "")
             assert arm.asked == [("enable", True), ("clear_fault", None), ("enable", False)]

@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity.hardware.network import keep_to_this_machine
 
 from . import CONFIG
+from .keys import broken, documented
 from .node_thread import NodeThread
 
 keep_to_this_machine()
@@ -34,7 +35,7 @@ class Timeout(AssertionError):
 
 
 class RosProbe:
-    """Listens to the arm in the namespace `arm`, on its own thread.
+    """Listens to the arm in the namespace `arm`, on its own thread. It takes no status that breaks docs/keys.md.
 
     joint_states, effort_commands, wearer_steps: the messages so far. states: those that can_bridge reported so far.
     statuses: the newest DiagnosticStatus by node.
@@ -50,6 +51,7 @@ class RosProbe:
         self.wearer_steps: list[String] = []
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.states: list[str | None] = []
+        self._broken: list[str] = []  # of docs/keys.md, by statuses of our nodes
         self.node.create_subscription(JointState, f"{arm}/joint_states", self.joint_states.append, 1000)
         self.node.create_subscription(JointState, f"{arm}/effort_commands", self.effort_commands.append, 1000)
         self.node.create_subscription(String, f"{arm}/wearer_step", self.wearer_steps.append, 10)
@@ -66,6 +68,8 @@ class RosProbe:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self.statuses[f"/{status.name}"] = status
+            if status.name.rpartition("/")[2] in documented():  # a test may add a node of its own
+                self._broken += broken(status.name, {pair.key: pair.value for pair in status.values})
             if f"/{status.name}" == f"{self.arm}/can_bridge":
                 self.states.append(self.state)
 
@@ -99,6 +103,7 @@ class RosProbe:
         deadline = min(time.monotonic() + timeout, self._deadline)
         with self._news:
             while not condition():
+                assert not self._broken, self._broken[:10]
                 if time.monotonic() > deadline:
                     messages = {name: status.message for name, status in self.statuses.items()}
                     raise Timeout(f"the condition did not hold in time; diagnostics: {messages}")
@@ -178,7 +183,8 @@ class RosProbe:
         """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home."""
         helped = -math.inf
         while self.state != "active":
-            misplaced = self.fault == "implausible_zero" or self.status_contains("can_bridge", "to be moved")
+            is_outside = self.diagnostic("can_bridge", "joints outside limits") not in (None, "none")
+            misplaced = self.fault == "implausible_zero" or is_outside
             if misplaced and time.monotonic() > helped + HELP_TIME:
                 helped = time.monotonic()
                 self.set_parameters("simulator", trial=str(CONFIG / "home.yaml"))

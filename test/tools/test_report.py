@@ -17,10 +17,12 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.bag.content import Event
+from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.report import figures
-from exo_gravity.lab.report.trial_report import analyse, print_report, write, write_empty
+from exo_gravity.lab.report import figures, html
+from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write, write_empty
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.tools.report import main
 
@@ -123,7 +125,7 @@ def test_the_page_refers_to_nothing_outside_itself_and_its_pictures_are_the_png_
     page = Page(folder)
     assert "url(" not in page.source and f"<h1>{held.title}</h1>" in page.source
     embedded = [base64.b64decode(ref.removeprefix("data:image/png;base64,")) for ref in page.references]
-    assert embedded == [(folder / f"right_{kind}.png").read_bytes() for kind in ("overview", "drift")]
+    assert embedded == [(folder / "right_overview.png").read_bytes()]  # the joints stayed: no drift to draw
     picture = matplotlib.image.imread(folder / "right_overview.png")
     assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
 
@@ -260,7 +262,8 @@ def test_a_trial_of_which_nothing_was_recorded_has_a_report_too(tmp_path):
 COMPENSATOR = """/right/compensator:
   ros__parameters: {side: right, mode: zero_g, support: 0.3, wearer.body_mass: 75.0, wearer.sex: female}
 """
-FAULT = "right/can_bridge: letting down: over_speed: right_elbow_flexion turns too fast"
+REASON = "right_elbow_flexion turns too fast"
+FAULT = f"right/can_bridge: letting down: over_speed: {REASON}"
 WHOLE = made.trial(made.POSES, hold=6.0, rate=250.0)
 
 
@@ -271,6 +274,15 @@ def report_of(recording, *events, given=COMPENSATOR, **more):
     return analyse(made.bag_of(recording, events=events, parameters=parameters, session=session, **more))
 
 
+def reported(seconds, node, level, message, fault="none", fault_text=""):
+    """Return the event of a status on /diagnostics."""
+    return Event(seconds, f"{node}: {message}", status=NodeStatus(node, level, message, fault, fault_text))
+
+
+def fault_at(seconds):
+    return reported(seconds, "right/can_bridge", 2, f"letting down: over_speed: {REASON}", "over_speed", REASON)
+
+
 def mode_set(seconds, mode):
     return Event(seconds, f"/right/compensator: mode = {mode}", ("/right/compensator", "mode", mode))
 
@@ -278,14 +290,56 @@ def mode_set(seconds, mode):
 def test_rows_and_page_say_of_whom_under_what_settings_and_by_what_criteria(page_of, tmp_path):
     page = page_of(report_of(WHOLE, mode_set(9.0, "one_g")))
     rows = csv_rows(tmp_path / "holds.csv")
-    shared = {"trial": "demo", "subject": "P01", "arm": "right", "side": "right", "support": "0.3", "version": "1.2.3"}
+    shared = {"trial": "demo", "subject": "P01", "arm": "right", "side": "right", "version": "1.2.3"}
     assert all(row.items() >= shared.items() for row in rows)
-    assert [row["mode"] for row in rows] == ["zero_g"] * 4 + ["one_g"] * 4
+    carried = [(row["mode"], row["support"]) for row in rows]
+    assert carried == [("zero_g", "0.3")] * 4 + [("one_g", "")] * 4  # One-G does not use the support
     top = ("It held.", "P01", "pilot", "first visit", "Zero-G, One-G from 9.0 s", "30 %", "75 kg, female", "Criteria:")
     places = [page.text.index(part) for part in (*top, "1.2.3", "Arm: right")]
     assert places == sorted(places)
     one_g = COMPENSATOR.replace("zero_g", "one_g")  # it does not use the support
     assert "One-G, support none" in printed(report_of(WHOLE, given=one_g))
+
+
+BRIDGE = """/right/can_bridge:
+  ros__parameters: {{can.interface: {}, can.channel: {}}}
+"""
+SAID = {"simulated": "Simulated: programs made", "real": "Recorded on a real arm", "unknown": "does not say whether"}
+
+
+@pytest.mark.parametrize(
+    ("bridge", "source"),
+    [(("virtual", "stage"), "simulated"), (("socketcan", "can0"), "real"), (("socketcan", "vcan0"), "unknown")],
+)
+def test_page_rows_figures_and_terminal_say_where_the_numbers_come_from(tmp_path, bridge, source, monkeypatch):
+    stamped = []
+    monkeypatch.setattr(html, "stamp", lambda figure, text: stamped.append(text))
+    monkeypatch.setattr(html, "png_of", lambda *_: b"")
+    report = analyse(made.bag_of(WHOLE, parameters={"/right/can_bridge": BRIDGE.format(*bridge)}))
+    write(report, tmp_path)
+    text = Page(tmp_path).text
+    assert text.index(SAID[source]) < text.index(report.held)
+    assert {row["source"] for row in csv_rows(tmp_path / "holds.csv")} == {source}
+    assert set(report.bag.columns()["source"]) == {source}
+    assert set(stamped) == {STAMPS[Source(source)]}
+    assert f"source: {source}" in printed(report)
+
+
+def test_what_the_nodes_say_of_the_source_is_believed_before_the_parameters(tmp_path):
+    entries = [*made.messages(WHOLE), made.status(0.5, "active", state="active", source="real")]
+    bag = read_bag(made.write_bag(tmp_path / "bag", entries))
+    assert bag.source("right") is Source.REAL and bag.source("left") is Source.UNKNOWN
+
+
+def test_only_joints_that_moved_are_drawn_and_the_others_are_a_line(tmp_path, page_of):
+    away = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])
+    report = analyse(made.bag_of(made.trial(made.POSES, hold=6.0, rate=100.0, drift=away)))
+    figure = figures.drift(*report.arms[0], report.criteria)
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert [title for title in titles if title] == ["joint 4"]
+    text = page_of(report).text
+    assert re.search(r"none of joint 1, joint 2, joint 3 moved more than 0\.0\d\d degrees", text)
+    assert "no joint moved more than 0.0" in page_of(analyse(made.bag_of(WHOLE))).text
 
 
 def test_the_report_of_an_arm_that_did_not_hold_leads_with_it_and_each_reason(page_of):
@@ -301,7 +355,7 @@ def let_down(end, **more):
 
 
 def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it_unless_it_was_planned():
-    report = report_of(let_down(12.5), Event(12.6, FAULT))
+    report = report_of(let_down(12.5), fault_at(12.6))
     text, good = report.verdict
     lowest = np.abs(np.degrees(made.POSES[1])).max()  # rotates back to 0
     moved = re.search(r"joint 4 moved ([\d.]+) degrees, at up to (\d+) deg/s", text)
@@ -312,7 +366,22 @@ def test_the_report_leads_with_a_fall_and_the_fault_that_caused_it_unless_it_was
     assert planned[1] and "let down" not in planned[0]
     unscripted = let_down(12.5, steps=())
     assert "let down" not in report_of(unscripted).verdict[0]
-    assert "let down" in report_of(unscripted, Event(12.5, FAULT)).verdict[0]
+    assert "let down" in report_of(unscripted, fault_at(12.5)).verdict[0]
+
+
+@pytest.mark.parametrize(
+    ("fault", "fault_text", "named"),
+    [
+        ("over_speed", REASON, f" (over_speed: {REASON})"),
+        ("over_speed", "", f" (over_speed: {FaultCode.OVER_SPEED.meaning})"),  # a recording of an earlier version
+        ("new_fault", "", " (new_fault: a fault)"),  # of a later one
+        ("none", "", ""),
+    ],
+)
+def test_the_fault_that_a_report_names_comes_from_its_key_whatever_the_sentence_says(fault, fault_text, named):
+    said = "letting down: wrong_sign: zqx vw kfj"
+    report = report_of(let_down(12.5), reported(12.6, "right/can_bridge", 2, said, fault, fault_text))
+    assert report.verdict[0].startswith(f"Right: let down at 12.5 s{named}: ")
 
 
 def test_a_motion_after_a_change_of_load_names_the_change_but_not_one_to_the_same_value():
@@ -344,9 +413,9 @@ def test_where_nothing_moved_the_resolution_is_stated():
 
 
 def test_lines_of_the_start_are_left_out_and_markers_are_listed(page_of):
-    starting = [Event(0.1 * n, f"right/can_bridge: checking: waiting for {n}") for n in range(5)]
-    starting += [Event(0.6, "right/can_bridge: OK, active"), Event(0.7, "imu: WARN that lasts")]
+    starting = [reported(0.1 * n, "right/can_bridge", 1, f"checking: waiting for {n}") for n in range(5)]
+    starting += [reported(0.6, "right/can_bridge", 0, "OK, active"), reported(0.7, "imu", 1, "WARN that lasts")]
     carried = replace(WHOLE, carried=((1.0, 16.0),))
-    text = page_of(report_of(carried, *starting, Event(3.0, FAULT), markers=(Event(2.0, "cramp"),))).text
+    text = page_of(report_of(carried, *starting, fault_at(3.0), markers=(Event(2.0, "cramp"),))).text
     assert "checking" not in text and "OK, active" not in text
     assert text.index("WARN that lasts") < text.index("2.0 s  marker: cramp") < text.index(f"3.0 s  {FAULT}")

@@ -20,7 +20,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.trial import run as running
 from exo_gravity.lab.trial.run import TrialEnd, follow, is_guided, too_busy
-from exo_gravity.lab.trial.screen import LEAD, TrialScreen, describe
+from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen, describe
 from exo_gravity.lab.trial.scripted import analysed, read_script
 from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.tools import trial
@@ -198,6 +198,55 @@ def test_why_a_trial_ends_early(bridge, silence, exit_code, why):
     assert why in screen.end_of_trial(exit_code)
 
 
+NO_SENTENCE = "zqx vw: kfj, 17"  # in the place of each: what a program decides does not depend on it
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_a_trial_ends_by_keys_whatever_the_sentences_say(name):
+    bridge, silence, exit_code, why = ENDS[name]
+    screen = Screen()
+    screen.at(0.0, bridge={**ACTIVE, "message": NO_SENTENCE})
+    screen.at(1.0, bridge={**bridge, "message": NO_SENTENCE})
+    screen.now += silence
+    assert (NO_SENTENCE if why == MOTOR else why) in screen.end_of_trial(exit_code)
+
+
+@pytest.mark.parametrize("guided", [False, True])
+def test_a_start_that_has_ended_ends_a_trial_unless_a_person_may_start_it_again(guided):
+    screen = Screen(guided=guided, lead=LEAD if guided else None)
+    refused = {**status("disabled", 1, message=NO_SENTENCE), "refusal": "joint_limits"}
+    screen.at(0.0, bridge=refused)
+    stopped = threading.Event()
+    threading.Timer(0.2, stopped.set).start()
+    found = follow(screen, stopped, lambda: None, Future())
+    assert found == ("stopped by the operator" if guided else f"right/can_bridge: {NO_SENTENCE}")
+
+
+def test_a_trial_on_running_nodes_ends_after_a_few_seconds_without_a_bridge():
+    screen = Screen(bridges=())
+    line = {"right": {"position": [0.0] * 4, "effort": [0.0] * 4}, "status": {"right/compensator": ACTIVE}}
+    for screen.now in (100.0, 100.1 + BRIDGE_TIMEOUT):
+        screen.take(json.dumps(line))
+    assert "no can_bridge has reported" in screen.end_of_trial()
+    screen = Screen(bridges=())
+    for now in (100.0, 100.1 + BRIDGE_TIMEOUT):
+        screen.at(now, bridge=status("disabled"))
+    assert not screen.has_no_bridge
+    screen = Screen()  # the trial has started its bridge: its process is watched
+    screen.take(json.dumps(line))
+    screen.now += 2.0 * BRIDGE_TIMEOUT
+    assert not screen.has_no_bridge
+
+
+def test_a_file_without_a_bridge_is_refused_at_once(tmp_path, capsys):
+    path = tmp_path / "urdf.yaml"
+    of_urdf = {"law": "urdf", "urdf.file": "arm.urdf", "joint_names": ["a1", "a2"], "command_interface": "multi_array"}
+    path.write_text(yaml.safe_dump({"/arm/compensator": {"ros__parameters": of_urdf}}))
+    assert trial.main(["two_poses", "--params", str(path), "--output", str(tmp_path / "out")]) == 2
+    assert "must be a file with a can_bridge" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("step", "words"),
     [
@@ -243,6 +292,8 @@ CASES = {
 def test_only_a_gap_and_late_replies_or_efforts_of_a_simulated_arm_mean_a_busy_computer(bridge, device, reason):
     found = too_busy({"right/can_bridge": bridge, **({"right/simulator": device} if device else {})})
     assert reason in found and bool(found) == bool(reason)
+    unsaid = {"right/can_bridge": bridge, **({"right/simulator": device} if device else {})}
+    assert too_busy({name: {**values, "message": NO_SENTENCE} for name, values in unsaid.items()}) == found
 
 
 STALLED = "right/simulator was not run for 140 ms"

@@ -23,6 +23,7 @@ from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
 from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
+from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingRefused, WeighingTrouble, Withdrawal
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
@@ -36,7 +37,7 @@ class Compensation(NamedTuple):
     """What the compensator answers to one reading of the joints."""
 
     effort: Torque | None  #: (n,) Nm; None for the given `reason`
-    reason: str  #: why there are no efforts, or ''
+    reason: Reason  #: why there are no efforts; false if there are
     clamped: tuple[int, ...]  #: indices of the joints whose gravity torque exceeds `max_effort`
     fallback: str  #: why the exact law replaced the chosen one, or ''
     remainder: Torque  #: (n,) Nm by which a change of load is not done yet; () if none is under way
@@ -44,7 +45,7 @@ class Compensation(NamedTuple):
     held: str  #: why the last tilt is held on, and the bound of the error in Nm; or ''
 
     @classmethod
-    def withdrawn(cls, reason: str) -> "Compensation":
+    def withdrawn(cls, reason: Reason) -> "Compensation":
         """Return the answer without efforts."""
         return cls(None, reason, clamped=(), fallback="", remainder=(), damped=False, held="")
 
@@ -99,14 +100,14 @@ class Compensator:
             settings = replace(settings, raised_support=last.raised_support)
         self._pending = settings
 
-    def weigh(self, weighing: Weighing) -> str:
-        """Let `weighing` carry the load in the hand from the next `step` on; return why it cannot, or ''."""
+    def weigh(self, weighing: Weighing) -> Reason:
+        """Let `weighing` carry the load in the hand from the next `step` on; return why it cannot, false if it can."""
         if self._active_weighing:
-            return "a weighing is under way"
+            return Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
         if not self._change.is_over:
-            return "the load is changing: wait for it"
+            return Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
         self.weighing = weighing
-        return ""
+        return NO_REASON
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
@@ -115,8 +116,9 @@ class Compensator:
         """
         if len(theta) != len(self._effort) or not all(-MAX_ANGLE <= angle <= MAX_ANGLE for angle in theta):
             expected = f"{len(self._effort)} numbers within {MAX_ANGLE:g} rad"
-            return Compensation.withdrawn(f"joint angles {list(theta)} are not {expected}")
-        held = late = self.tilt.problem(now) if self.settings.use_imu else ""
+            impossible = f"joint angles {list(theta)} are not {expected}"
+            return Compensation.withdrawn(Reason(Withdrawal.IMPOSSIBLE_ANGLES, impossible))
+        late, held = self.tilt.problem(now) if self.settings.use_imu else NO_REASON, ""
         if late:
             turn = self.tilt.unknown_turn(now)
             if not turn <= TILT.turn:
@@ -129,7 +131,8 @@ class Compensator:
         was_replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
-            return Compensation.withdrawn(f"torque {list(gravity)} Nm from the law is not finite")
+            infinite = f"torque {list(gravity)} Nm from the law is not finite"
+            return Compensation.withdrawn(Reason(Withdrawal.LAW_NOT_FINITE, infinite))
         s, dt = self.settings, now - self._last_time
         torque = gravity
         if velocity:
@@ -152,7 +155,7 @@ class Compensator:
         self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
-        return Compensation(self._effort, "", over, self._fallback, remainder, change.is_large, held)
+        return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, held)
 
     def _follow_request(self, now: float) -> None:
         """Carry as much of the wearer's arm as is asked for."""
@@ -174,7 +177,7 @@ class Compensator:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
         if weighing := self._active_weighing:
-            weighing.trouble = "the settings changed"
+            weighing.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, "the settings changed")
         self.tilt.timeout = settings.tilt_timeout
         self.terms.apply(settings.terms, settings.moving)
         return before

@@ -6,6 +6,7 @@ from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.vocabulary import NO_REASON
 
 
 class SampleController:
@@ -41,7 +42,7 @@ class DirectController(SampleController):
     def __init__(self, compensator: Compensator, limits: Limits) -> None:
         super().__init__(limits)
         self.compensator = compensator
-        self.answer = Compensation.withdrawn("")  #: the compensator's last one
+        self.answer = Compensation.withdrawn(NO_REASON)  #: the compensator's last one
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
         position, velocity, effort, _, _, times, *_ = zip(*samples, strict=True)

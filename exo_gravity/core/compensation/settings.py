@@ -76,7 +76,7 @@ class Settings:
     robot: Arm  #: the arm alone
     law: str = owned("exact", "law that computes the gravity torque", choices=LAWS)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
-    support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
+    support: float = owned(0.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.core.vocabulary import NO_REASON, Reason, SupportRequested
 
 TOPIC, NAME = "support_request", "support"  # of the message, and of its one entry
 
@@ -35,7 +36,7 @@ class SupportRequest:
         self._tuning = tuning
         self._support = 0.0
         self._stamp = self._contradicted = self._changed = -math.inf
-        self._refusal, self._refused = "", -math.inf
+        self._refusal, self._refused = NO_REASON, -math.inf
 
     def receive(
         self, now: float, names: Sequence[str], values: Sequence[float], stamp: float, from_another: bool = False
@@ -72,21 +73,23 @@ class SupportRequest:
         self._changed = now
         return wanted
 
-    def report(self, now: float) -> str:
+    def report(self, now: float) -> Reason:
         """Return what is asked for, or what was wrong with a message of the last seconds, without its value."""
         if now - self._contradicted <= self._tuning.distrust:
-            return f"refused: more than one publisher of {TOPIC}"
+            return Reason(SupportRequested.SECOND_PUBLISHER, f"refused: more than one publisher of {TOPIC}")
         if now - self._refused <= self._tuning.expires:
-            return f"refused: {self._refusal}"
+            return Reason(self._refusal.word, f"refused: {self._refusal}")
         asked = self.fresh(now)
-        return "none" if asked is None else f"{100.0 * asked:.0f} %"
+        if asked is None:
+            return Reason(SupportRequested.NONE, "none")
+        return Reason(SupportRequested.FRESH, f"{100.0 * asked:.0f} %")
 
-    def _problem(self, now: float, names: Sequence[str], values: Sequence[float], stamp: float) -> str:
-        """Return what is wrong with a message, '' if nothing is."""
+    def _problem(self, now: float, names: Sequence[str], values: Sequence[float], stamp: float) -> Reason:
+        """Return what is wrong with a message, false if nothing is."""
         if list(names) != [NAME] or len(values) != 1:
-            return f"{TOPIC} must have the one name {NAME} with one position"
+            return Reason(SupportRequested.INVALID, f"{TOPIC} must have the one name {NAME} with one position")
         if not 0.0 <= values[0] <= 1.0:
-            return f"{TOPIC} must be a number from 0 to 1"
+            return Reason(SupportRequested.INVALID, f"{TOPIC} must be a number from 0 to 1")
         if not now - self._tuning.max_age <= stamp <= now + self._tuning.max_lead:
-            return f"{TOPIC} is late by its stamp, or its clock differs"
-        return ""
+            return Reason(SupportRequested.LATE, f"{TOPIC} is late by its stamp, or its clock differs")
+        return NO_REASON

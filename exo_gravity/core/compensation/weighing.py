@@ -21,6 +21,7 @@ from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.numbers import COVER
+from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingPhase, WeighingRefused, WeighingTrouble
 
 CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
 
@@ -58,29 +59,33 @@ class Weighed(NamedTuple):
     lever: np.ndarray
 
 
-def refusal(s: Settings, terms: Sequence[str], rate: float) -> str:
-    """Return why nothing can be weighed with these settings, active terms, and joint states at `rate` Hz, or ''."""
+def refusal(s: Settings, terms: Sequence[str], rate: float) -> Reason:
+    """Return why nothing can be weighed with these settings, active terms, and joint states at `rate` Hz."""
     if carriers := [name for name in terms if name in CARRIERS]:
-        return f"{', '.join(carriers)} would carry a part of the load: switch it off"
+        carried = f"{', '.join(carriers)} would carry a part of the load: switch it off"
+        return Reason(WeighingRefused.TERMS, carried)
     if any(s.wearer_mass) and (s.mode != "zero_g" or s.support < 1.0):
-        return "a wearer can relax only while the whole arm is carried: mode zero_g with support 1"
+        relaxed = "a wearer can relax only while the whole arm is carried: mode zero_g with support 1"
+        return Reason(WeighingRefused.SUPPORT, relaxed)
     if rate < WEIGHING.least_rate:
-        return f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
+        slow = f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
+        return Reason(WeighingRefused.SLOW, slow)
     if not s.robot.has_hand:
-        return "urdf.hand does not say which link holds a load"
-    return ""
+        return Reason(WeighingRefused.NO_HAND, "urdf.hand does not say which link holds a load")
+    return NO_REASON
 
 
 class Weighing:
     """One weighing, from the first call of `torque` on.
 
     names: of the joints (n,). rate: of the calls, Hz. empty: result of the empty hand, if known.
-    result: None while there is none. trouble: why there is none, or ''.
+    result: None while there is none. trouble: why there is none. elapsed: s since it began.
     """
 
     def __init__(self, settings: Settings, names: Sequence[str], rate: float, empty: Weighed | None = None) -> None:
         self.result: Weighed | None = None
-        self.trouble = ""
+        self.trouble = NO_REASON
+        self.elapsed = 0.0
         self._settings, self._names, self._empty = settings, names, empty
         self._tracker, friction = Tracker(rate, settings.max_effort), settings.terms.friction
         if any(friction.coulomb):  # less what the term `friction` compensates
@@ -102,23 +107,53 @@ class Weighing:
         return result if is_empty else self._empty
 
     @property
+    def phase(self) -> WeighingPhase:
+        """How far it is."""
+        if self.trouble:
+            return WeighingPhase.FAILED
+        if self.result:
+            return WeighingPhase.DONE
+        return WeighingPhase.SWEEPING if self._is_moving else WeighingPhase.TAKING_OVER
+
+    @property
+    def excess(self) -> tuple[float, float] | None:
+        """The mass in kg that the settings do not carry, and half its 95 % band; None without a result."""
+        if self.result is None:
+            return None
+        mass, random, _ = self.result
+        return mass, COVER * math.hypot(random, self._model, self._share * mass)
+
+    @property
+    def payload(self) -> tuple[float, float] | None:
+        """The `payload.mass` in kg that carries the load, and half its 95 % band; None for an empty hand."""
+        if self.result is None or self.excess is None or self.empty is self.result:
+            return None
+        more, band = self._beyond_empty or self.excess
+        return max(0.0, self._settings.payload_mass + more), band
+
+    @property
+    def _beyond_empty(self) -> tuple[float, float] | None:
+        """The mass in kg beyond that of the empty hand in the same pose, and half its 95 % band."""
+        empty = self._empty
+        if self.result is None or empty is None or math.dist(empty.lever, self.result.lever) > WEIGHING.same_pose:
+            return None
+        more = self.result.mass - empty.mass
+        parts = self.result.deviation, empty.deviation, self._share * more, math.sqrt(2.0) * self._leaning
+        return more, COVER * math.hypot(*parts)
+
+    @property
     def text(self) -> str:
         """What is known, in a sentence."""
         if self.trouble:
             return f"not weighed: {self.trouble}"
-        if self.result is None:
+        if self.excess is None:
             return "the arm moves a little: stay relaxed" if self._is_moving else "relax: the motors take the load over"
-        mass, random, lever = self.result
-        error = COVER * math.hypot(random, self._model, self._share * mass)
-        text = f"{mass:.3f} +- {error:.3f} kg more than the settings carry"
-        if self.empty is self.result:
+        text = "{:.3f} +- {:.3f} kg more than the settings carry".format(*self.excess)
+        if self.payload is None:
             return f"{text}: the hand is empty"
-        more, empty = mass, self._empty
-        if empty and math.dist(empty.lever, lever) <= WEIGHING.same_pose:
-            more -= empty.mass
-            error = COVER * math.hypot(random, empty.deviation, self._share * more, math.sqrt(2.0) * self._leaning)
-            text = f"{text}; {more:.3f} +- {error:.3f} kg more than with an empty hand"
-        return f"{text}: payload.mass = {max(0.0, self._settings.payload_mass + more):.3f} carries it"
+        if self._beyond_empty:
+            text = "{}; {:.3f} +- {:.3f} kg more than with an empty hand".format(text, *self._beyond_empty)
+        return f"{text}: payload.mass = {self.payload[0]:.3f} carries it"
 
     def torque(
         self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
@@ -129,6 +164,7 @@ class Weighing:
             self._begin(theta, velocity, tilt)
         if self.is_over:
             return torque
+        self.elapsed += dt
         effort = self._tracker.step(dt, theta, velocity, torque, tilt.direction, self._matrix)
         if self.is_over or self._is_wrong(dt):
             return torque
@@ -147,10 +183,11 @@ class Weighing:
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
-            self.trouble = f"the hand hangs below the joints, where a load needs no torque: {pose}"
+            hangs = f"the hand hangs below the joints, where a load needs no torque: {pose}"
+            self.trouble = Reason(WeighingTrouble.HANGS_DOWN, hangs)
             return
         if fastest > WEIGHING.start_speed:
-            self.trouble = f"the arm moves at {fastest:.2f} rad/s: hold it still"
+            self.trouble = Reason(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
         wearer = s.robot.massless(gravity).with_wearer(s.wearer_mass, s.wearer_cog)
         self._worn = np.array(wearer.torque(theta, tilt))  # Nm
         by_tilt = np.array([s.arm.torque(theta, axis) for axis in AXES]).T  # (n, 3) Nm/rad
@@ -189,16 +226,18 @@ class Weighing:
         is_foreign = max(foreign) > WEIGHING.foreign or not -WEIGHING.lifted < mass < MAX_PAYLOAD
         self._foreign = self._foreign + dt if is_foreign else 0.0
         if not dt <= WEIGHING.pause:
-            self.trouble = f"no joint states for {1000.0 * dt:.0f} ms"
+            self.trouble = Reason(WeighingTrouble.NO_JOINT_STATES, f"no joint states for {1000.0 * dt:.0f} ms")
         elif abs(error[worst]) > WEIGHING.largest_error:
             is_thrown = float(error @ self._lever) < 0.0
             why = "was the load dropped?" if is_thrown else "relax gradually, and touch nothing"
-            self.trouble = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
+            away = f"{self._names[worst]} moved by {abs(error[worst]):.2f} rad: {why}"
+            self.trouble = Reason(WeighingTrouble.MOVED_AWAY, away)
         elif self._foreign > WEIGHING.persistence:
-            self.trouble = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"
+            hand = f"{self._names[int(np.argmax(foreign))]}: {max(foreign):.1f} Nm of a hand on the arm"
+            self.trouble = Reason(WeighingTrouble.HAND_ON_ARM, hand)
         elif saturated:
             remedy = "the load needs more than max_effort here: hold it nearer to the body"
-            self.trouble = f"{', '.join(saturated)}: {remedy}"
+            self.trouble = Reason(WeighingTrouble.TOO_HEAVY, f"{', '.join(saturated)}: {remedy}")
         return bool(self.trouble)
 
     def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
@@ -213,12 +252,15 @@ class Weighing:
         unlike = np.abs(seen.effort - needed) - known - WEIGHING.unlike[0] - WEIGHING.unlike[1] * np.abs(needed)
         restless = math.hypot(*(weight * unrest)) / gravity
         if restless > WEIGHING.unrest[0] + WEIGHING.unrest[1] * abs(mass):
-            self.trouble = f"{restless:.2f} kg between two turns: relax, and touch nothing"
+            between = f"{restless:.2f} kg between two turns: relax, and touch nothing"
+            self.trouble = Reason(WeighingTrouble.RESTLESS, between)
         for name, share, off in zip(self._names, shares, unlike, strict=True):
             if share < MOTION.followed:
-                self.trouble = f"{name} does not follow: is the arm carried, is a hand on it?"
+                stays = f"{name} does not follow: is the arm carried, is a hand on it?"
+                self.trouble = Reason(WeighingTrouble.NOT_FOLLOWED, stays)
             elif off > 0.0:
                 torque = f"{off + WEIGHING.unlike[0]:.1f} Nm"
-                self.trouble = f"{name}: no load in the hand explains {torque}: someone may be touching the arm"
+                unlike_load = f"{name}: no load in the hand explains {torque}: someone may be touching the arm"
+                self.trouble = Reason(WeighingTrouble.NO_LOAD, unlike_load)
         if not self.trouble:
             self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)

@@ -246,6 +246,7 @@ class MitFormat(WireFormat):
     """The frames of V1 and V2 boards; the methods are those of `WireFormat`."""
 
     reply_lengths: tuple[int, ...] = REPLY_LENGTHS
+    open_length: int = 7
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
         """Return the data of a reply. Raises ParameterError."""

@@ -135,8 +135,9 @@ class Boards:
             if now - told > CHECK.valid:
                 return f"motor {motor.can_id} to tell its {setting.name}"
             if not setting.low <= value <= setting.high:
-                name = f"{setting.name} (register {setting.number})"
-                return f"motor {motor.can_id} to be set right: its {name} is {value:g}, must be {setting.must}"
+                name, right = f"{setting.name} (register {setting.number})", 0.5 * (setting.low + setting.high)
+                known = f", or {setting.parameter} {setting.unit * value:g} in the file" if setting.parameter else ""
+                return f"motor {motor.can_id} to be set right: its {name} is {value:g}, must be {right:g}{known}"
         return ""
 
     @property

@@ -67,7 +67,7 @@ FLOATS = frozenset((GEAR, PMAX, VMAX, TMAX))  # registers that hold a float; the
 NAMES: Final = {MST_ID: "MST_ID", TIMEOUT: "TIMEOUT", CTRL_MODE: "CTRL_MODE", PMAX: "PMAX", VMAX: "VMAX", TMAX: "TMAX"}
 MIT_MODE = 1  # of CTRL_MODE
 TICK = 50e-6  # s, one step of TIMEOUT
-SAME = 1e-3  # share by which a float may differ from the file's decimal
+SAME = 1e-3  # share by which a register may differ from the file's decimal
 
 _RPM = 2.0 * math.pi / 60.0  # rad/s
 
@@ -260,17 +260,17 @@ class DamiaoFormat(WireFormat):
 
     def settings(self, spec: MotorSpec, motor_id: int, reply_id: int, timeout: float) -> Sequence[Setting]:
         """Return the registers without whose values a command would mean something else than the file says."""
-        ranges = {PMAX: spec.position_range, VMAX: spec.velocity_range, TMAX: spec.torque_range}
-        fields = {PMAX: "position_range", VMAX: "velocity_range", TMAX: "torque_range"}
-        ticks = timeout / TICK
-        return (
-            _setting(motor_id, CTRL_MODE, MIT_MODE, 0.0, f"{MIT_MODE} (MIT)"),
-            _setting(motor_id, MST_ID, reply_id, 0.0, f"{reply_id}, or master_id another"),
-            _setting(motor_id, TIMEOUT, ticks, 1.0, f"{ticks:.0f}, or motor_timeout another (in s, 1 = 50 us)"),
-            *(
-                _setting(motor_id, number, value, SAME * value, f"{value:g}, or {fields[number]} another")
-                for number, value in ranges.items()
-            ),
+        rows = (
+            (CTRL_MODE, MIT_MODE, "", 1.0),
+            (MST_ID, reply_id, "master_id", 1.0),
+            (TIMEOUT, timeout / TICK, "motor_timeout", TICK),
+            (PMAX, spec.position_range, "position_range", 1.0),
+            (VMAX, spec.velocity_range, "velocity_range", 1.0),
+            (TMAX, spec.torque_range, "torque_range", 1.0),
+        )
+        return tuple(
+            Setting(NAMES[number], number, read(motor_id, number), value * (1 - SAME), value * (1 + SAME), name, unit)
+            for number, value, name, unit in rows
         )
 
     def unpack_setting(self, data: bytes | bytearray) -> tuple[int, float]:
@@ -286,10 +286,6 @@ class DamiaoFormat(WireFormat):
 def read(motor_id: int, register: int) -> Frame:
     """Return the frame that asks a motor for a register."""
     return REGISTERS, bytes((motor_id, 0, READ, register, 0, 0, 0, 0))
-
-
-def _setting(motor_id: int, number: int, value: float, tolerance: float, must: str) -> Setting:
-    return Setting(NAMES[number], number, read(motor_id, number), value - tolerance, value + tolerance, must)
 
 
 DAMIAO_MIT = DamiaoFormat(

@@ -146,7 +146,8 @@ class Setting(NamedTuple):
     question: Frame  #: which the board answers with the value
     low: float  #: the least value that is right
     high: float  #: and the largest
-    must: str  #: what is right, and where else than on the board it could be changed
+    parameter: str  #: of the file that states it, '' for none
+    unit: float  #: of that parameter, that 1 on the board means
 
 
 def is_special(data: bytes | bytearray) -> bool:
@@ -225,6 +226,9 @@ class WireFormat(ABC):
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
     stops: frozenset[bytes] = frozenset((EXIT,))  #: data of all commands that switch a motor off
     reply_lengths: tuple[int, ...] = (8,)  #: bytes of a reply or status frame
+    open_length: int = (
+        0  #: of them, that of a board that obeys other IDs, too, because it compares a part of them; 0: none
+    )
     needs_timeout: bool = False  #: whether a motor's own time-out must be set
     #: codes of errors that say no more than that the motor has switched itself off, and can be switched on again
     let_go: frozenset[int] = frozenset()

@@ -14,6 +14,7 @@ from exo_gravity.core.motors.families import FORMATS, MOTORS, format_of
 from exo_gravity.core.motors.frames import EXTENDED, Frame, MotorSpec, Setting, WireFormat
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import Param
+from exo_gravity.core.vocabulary import Source
 
 # In the format `mit` the first byte of an AK motor's reply is its ID. The position of our commands is 0, unless they
 # hold a joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like
@@ -39,8 +40,12 @@ MAX_DATA_BITRATE = 8_000_000  # bit/s, of CAN FD
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
 SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
-# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
-NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
+# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one, or at the one
+# that their adapter had last. test/hardware/test_bit_rates.py compares them with python-can's sources.
+NEED_BITRATE = (
+    "canalystii", "cantact", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi", "nican", "nixnet", "pcan",
+    "robotell", "seeedstudio", "slcan", "systec", "usb2can", "vector",
+)  # fmt: skip
 
 
 class JointSample(NamedTuple):
@@ -156,6 +161,7 @@ class JointMotor:
 
 LARGEST_ZERO = POSITION_RANGE_BOUNDS[1]  # rad; `JointMotor` has the limit of each motor
 SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
+VIRTUAL_CAN = "vcan"  # begins Linux's names of CAN interfaces without an adapter: only programs are behind one
 
 # fmt: off
 # `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
@@ -212,6 +218,14 @@ def channels_of(channel: str, count: int) -> list[str]:
     return names * (count // len(names))
 
 
+def source_of_bus(interface: str, channel: str) -> Source:
+    """Return whether the motors on a bus are real: the values of `can.interface` and `can.channel`."""
+    if interface in SIMULATED_BUSES:
+        return Source.SIMULATED
+    is_virtual = any(name.strip().startswith(VIRTUAL_CAN) for name in channel.split(","))
+    return Source.UNKNOWN if is_virtual else Source.REAL
+
+
 def buses_of(channel: str, options: Mapping[str, Any], count: int) -> dict[str, tuple[list[int], dict[str, Any]]]:
     """Return which of `count` motors, from 0 on, are on each bus, by its channel, and its options for python-can.
 
@@ -244,7 +258,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
         low, high = own / WIRE_RANGE_FACTOR, own * WIRE_RANGE_FACTOR
         if given[name] and not low <= given[name] <= high:
-            expected = f"0, the usual one, or from {low:g} to {high:g} for an {plain.name}"
+            expected = f"0, the usual one, or from {low:g} to {high:g} for motor = {plain.name}"
             raise ParameterError(name, given[name], expected)
     if given["torque_per_ampere"] and board.replies:
         expected = f"0 with wire_format = {board.name}, whose replies carry the torque itself"
@@ -269,7 +283,7 @@ COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and
 V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
 # Of CAN FD frames with 11-bit IDs and 8 bytes: at the bit rate of arbitration, and at that of data.
 FD_BITS = FrameBits(32, 34)
-FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(100, 113)
+FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(99, 113)
 
 
 @dataclass(frozen=True)

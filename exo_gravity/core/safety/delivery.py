@@ -28,7 +28,7 @@ class Delivery:
     share: float = 0.25  #: of the expected torque, in addition
     span: float = 0.03  #: s of the loop before the last reply, whose commands a reply may answer
     #: Nm s, excess times the period of a reply; one reply adds at most half. No false alarm in 2 hours at 0.15 Nm of
-    #: noise and 100 Hz: docs/safety.md
+    #: noise and 100 Hz: docs/safety_case.md
     evidence: float = 0.0075
     noted: int = 256  #: commands, at most, while a motor is silent
 

@@ -8,6 +8,7 @@ from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
 # The gate waits for these to pass; other faults refuse the start.
 WAITED_OUT = frozenset(
@@ -66,26 +67,28 @@ class HangingArm:
 START_GATE, SWITCH_ON, SIGN_PUSH, HANGING_ARM = StartGate(), SwitchOn(), SignPush(), HangingArm()
 
 
+def turns_back(limits: Limits, joints: Sequence[JointSample]) -> dict[int, float]:
+    """Return by how many rad each joint is to be turned to be within its limits, by index of those that are not."""
+    columns = enumerate(zip(joints, limits.position_min, limits.position_max, strict=True))
+    excess = {n: joint.position - max(low, min(high, joint.position)) for n, (joint, low, high) in columns}
+    return {n: -beyond for n, beyond in excess.items() if beyond}
+
+
 def missing_for_a_start(
     limits: Limits, joints: Sequence[JointSample], fault: Fault | None, zeros_are_trusted: bool
-) -> Fault | str:
-    """Return the fault that refuses a start, or what the motors' readings `joints` lack for it, '' for nothing.
+) -> Fault | Reason:
+    """Return the fault that refuses a start, or what the motors' readings `joints` lack for it.
 
     fault: what the readings show.
     """
-    columns = zip(limits.joint_names, joints, limits.position_min, limits.position_max, strict=True)
-    outside = [
-        f"{name} to be moved by {_at_least(-excess)} degrees, within its limits {math.degrees(low):.0f} to "
-        f"{math.degrees(high):.0f}"
-        for name, joint, low, high in columns
-        if (excess := joint.position - max(low, min(high, joint.position)))
-    ]
     if fault and fault.code not in WAITED_OUT:
         return fault
     if fault and fault.code is not FaultCode.OUTSIDE_LIMITS:
-        return fault.reason
-    if outside:
-        return outside[0]
+        return Reason(fault.code, fault.reason)
+    for n, turn in turns_back(limits, joints).items():
+        low, high = math.degrees(limits.position_min[n]), math.degrees(limits.position_max[n])
+        back = f"to be moved by {at_least(turn)} degrees, within its limits {low:.0f} to {high:.0f}"
+        return Reason(Wait.JOINT_LIMITS, f"{limits.joint_names[n]} {back}")
     if not zeros_are_trusted:
         zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
         for name, joint, home, tolerance in zeros:
@@ -95,7 +98,8 @@ def missing_for_a_start(
                     "bring the joint there by hand, or correct the parameter zero"
                 )
                 return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
-    return "the arm to be at rest" if any(abs(joint.velocity) > START_GATE.at_rest for joint in joints) else ""
+    is_moving = any(abs(joint.velocity) > START_GATE.at_rest for joint in joints)
+    return Reason(Wait.REST, "the arm to be at rest") if is_moving else NO_REASON
 
 
 def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | None:
@@ -146,18 +150,18 @@ class PoseQuestion:
         self._confirmed, self._until, self.asked = self.asked, now + HANGING_ARM.valid, ()
         return True
 
-    def missing(self, now: float, joints: Sequence[JointSample], others: str) -> str:
-        """Return what the start lacks at `now` s, '' for nothing; others: what it lacks apart from the answer."""
+    def missing(self, now: float, joints: Sequence[JointSample], others: Reason) -> Reason:
+        """Return what the start lacks at `now` s; others: what it lacks apart from the answer."""
         pose = tuple(joint.position for joint in joints)
         pairs = zip(pose, self._confirmed, strict=True) if self._confirmed else ()
         if now > self._until or any(not abs(angle - then) <= HANGING_ARM.moved for angle, then in pairs):
             self._confirmed = ()
         is_due = not (others or self._confirmed)
         self.asked = pose if is_due else ()
-        return f"the operator to confirm the pose (degrees): {self.text}" if is_due else others
+        return Reason(Wait.POSE, f"the operator to confirm the pose (degrees): {self.text}") if is_due else others
 
 
-def _at_least(angle: float) -> str:
+def at_least(angle: float) -> str:
     """Return `angle` (rad) in degrees, rounded away from zero, so that a joint turned by it is far enough."""
     return f"{math.degrees(angle) + math.copysign(0.05, angle):+.1f}"
 
@@ -241,7 +245,7 @@ class SignCheck:
     effort: (n,) Nm to apply now.
     damped: (n,) which joints have moved the right way: these may be damped.
     done: whether every joint has passed. pushes: whether it pushes any joint at all.
-    hint: what the wearer should do, '' for nothing.
+    hint: what the wearer should do.
     """
 
     def __init__(self, names: Sequence[str], torque: Sequence[float]) -> None:
@@ -249,7 +253,7 @@ class SignCheck:
         self.damped = [False] * len(names)
         self.pushes = any(torque)
         self.done = not any(torque)
-        self.hint = ""
+        self.hint = NO_REASON
         self._names = names
         self._dt = 0.0
         self._position = [math.nan] * len(names)  # rad
@@ -270,13 +274,13 @@ class SignCheck:
                 yield from self._wait_for_rest(i)
                 if (yield from self._push_both_ways(i, most)):
                     break
-                self.hint = f"{self._names[i]} moves without being pushed: hold still"
+                self.hint = Reason(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
             else:
                 yield self._fault(i, "it moves without being pushed: hold still and let it hang")
             while self.effort[i]:
                 self._approach(i, 0.0, SIGN_PUSH.fall)
                 yield None
-            self.hint = ""
+            self.hint = NO_REASON
         self.done = True
 
     def _wait_for_rest(self, i: int) -> Iterator[Fault | None]:

@@ -1,7 +1,7 @@
 """The limits of a worn arm, and which motor readings are a fault.
 
 `find_faults` checks a motor's reading; trust.py confirms what it finds. barrier.py keeps every drive within the limits.
-docs/safety.md compares the defaults with those of other systems.
+docs/safety_case.md compares the defaults with those of other systems.
 """
 
 from collections.abc import Mapping, Sequence
@@ -185,7 +185,7 @@ class Limits:
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
+    Param("autostart", False, "configure and activate once at the start, without an operator", fixed=True),
     Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
     Param(

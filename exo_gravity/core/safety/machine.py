@@ -46,6 +46,7 @@ from exo_gravity.core.safety.power import POWER, MotorPower, Power, PowerChange,
 from exo_gravity.core.safety.stall import StallWatch
 from exo_gravity.core.safety.transitions import TRANSITIONS, StateEvent
 from exo_gravity.core.safety.trust import Readings
+from exo_gravity.core.vocabulary import NO_REASON, Motors, Reason, Resume, Wait
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
 
@@ -57,16 +58,16 @@ class SafetyMachine:
     motors: of the arm, which bound its torque and damping; by default `max_effort` does, and nothing.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
-    the last enable was refused without a fault, or "". acted: for each limit that has acted, by name, the last time.
-    power: of each motor. ride: through late efforts. motion: judges the efforts by gravity alone.
-    pose: the question to the operator whether the arm hangs as it is drawn.
+    the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. power: of
+    each motor. ride: through late efforts. motion: judges the efforts by gravity alone. pose: the question to the
+    operator whether the arm hangs as it is drawn.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
         self.limits = limits
         self.state = State.DISABLED
         self.fault: Fault | None = None
-        self.waiting_for = self.refusal = ""
+        self.waiting_for = self.refusal = NO_REASON
         self.acted: dict[str, float] = {}
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
@@ -95,8 +96,8 @@ class SafetyMachine:
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
         self.unsent: Sequence[bool] = (False,) * len(self.power)
-        #: What else CHECKING waits for, set from outside; '' for nothing.
-        self.hindrance = ""
+        #: What else CHECKING waits for, set from outside.
+        self.hindrance = NO_REASON
 
     @property
     def is_unreached(self) -> bool:
@@ -109,11 +110,18 @@ class SafetyMachine:
         """Whether the arm is down, and each motor has confirmed that it is off."""
         return self._is_standing and not self._may_be_powered
 
+    @property
+    def motors(self) -> Motors:
+        """Whether motors may be on."""
+        if self.is_unreached:
+            return Motors.UNREACHED
+        return Motors.OFF if self.is_off else Motors.ON
+
     def enable(self, now: float) -> bool:
         """Start the checks, after which torque ramps in. Return False, and do nothing, unless DISABLED."""
         if self.state is not State.DISABLED:
             return False
-        self.waiting_for, self.refusal = "the first replies of the motors", ""
+        self.waiting_for, self.refusal = Reason(Wait.REPLIES, "the first replies of the motors"), NO_REASON
         self._calm_since = now
         self._on(StateEvent.ENABLE, now)
         return True
@@ -131,14 +139,17 @@ class SafetyMachine:
         return True
 
     @property
-    def why_not_resumed(self) -> str:
-        """Why `resume` would be refused; '' if it would not."""
+    def why_not_resumed(self) -> Reason:
+        """Why `resume` would be refused; false if it would not."""
         if self.state is not State.FAULT or self.fault is None:
-            return f"the arm is {self.state.value}, must be in fault"
+            return Reason(Resume.NO_FAULT, f"the arm is {self.state.value}, must be in fault")
         if not self.fault.code.is_resumable:
-            return f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
-        is_trusted = self._readings.trusted
-        return "" if is_trusted else "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+            cause = f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
+            return Reason(Resume.HAS_CAUSE, cause)
+        if not self._readings.trusted:
+            unsure = "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
+            return Reason(Resume.ZEROS_UNSURE, unsure)
+        return Reason(Resume.POSSIBLE, "")
 
     def confirm_pose(self, now: float) -> str:
         """Take the operator's word that the arm hangs as it is drawn; return '' or why that is not asked."""
@@ -278,15 +289,18 @@ class SafetyMachine:
         if isinstance(missing, Fault):
             self._trip(missing)
             return
-        missing = self.hindrance or missing or ("effort commands" if effort is None else "")
-        missing = missing or ("the motors to confirm that they are off" if not self._all_off else "")
+        missing = self.hindrance or missing
+        if not missing and effort is None:
+            missing = Reason(Wait.EFFORTS, "effort commands")
+        if not missing and not self._all_off:
+            missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
         asks = not readings.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
         if readings.fault:
             self.pose.withdraw()
         if asks:
             missing = self.pose.missing(self._now, readings.joints, missing)
-        self.waiting_for = missing or f"{START_GATE.calm:g} s without a fault"
+        self.waiting_for = missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         if missing:
             self._calm_since = self._now
         if effort is not None and self._now - self._calm_since >= START_GATE.calm:
@@ -294,7 +308,7 @@ class SafetyMachine:
             if fault:
                 self._trip(fault)
                 return
-            self.waiting_for = ""
+            self.waiting_for = NO_REASON
             largest = 0.0 if readings.trusted else limits.sign_check_torque
             self._switching, self._attempts = SwitchingOn(self._replies), 0
             self._switch_on = SwitchOnCheck(limits)
@@ -302,7 +316,8 @@ class SafetyMachine:
             self._delivery.reset()
             self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
-            self._refuse(f"not enabled within {patience:g} s: waited for {self.waiting_for}")
+            waited = f"not enabled within {patience:g} s: waited for {self.waiting_for}"
+            self._refuse(Reason(self.waiting_for.word, waited))
 
     def _prove(self) -> None:
         """Advance the checks of motors that were just switched on."""
@@ -389,7 +404,7 @@ class SafetyMachine:
         self._switch_quiet_off()
         if any(power.state is Power.ON for power in self.power):
             if self.state is State.CHECKING:
-                self.refusal = "a motor was still on: it is let down"
+                self.refusal = Reason(Wait.MOTOR_ON, "a motor was still on: it is let down")
             self._on(StateEvent.FOUND_ON)
             return self._descend()
         if self._all_off:
@@ -422,7 +437,7 @@ class SafetyMachine:
     def _may_be_powered(self) -> bool:
         return any(power.may_be_on for power in self.power)
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: Reason) -> None:
         self.refusal = reason
         self._on(StateEvent.REFUSED)
 

@@ -23,6 +23,7 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, 
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
 NO_ROTATION = ZERO  # rad/s
@@ -33,7 +34,9 @@ class TiltLimits:
     """What a message of the tilt may say, and how long it is used."""
 
     speed: float = 5.0  #: rad/s, faster than a trunk can tilt
-    jump: float = 0.1  #: rad, by which two tilts may differ however close in time
+    #: rad, by which a tilt may lie off a direction that follows the tilts at `speed`: noise stays within it, a tilt
+    #: that creeps with many small jumps leaves it as one that jumps
+    jump: float = 0.1
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
     #: gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages,
     lead: float = 0.05
@@ -68,6 +71,7 @@ class TiltInput:
         self._in_time = -math.inf  # s, when the newest one that came in time was measured
         self._arrival = -math.inf
         self._lead = 0.0  # s, of the stamps
+        self._followed = self._tilt.direction  # (3,), follows the tilts no faster than a trunk
         self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
         self._refusal = ""  # why the newest one was refused; contains no measured value
 
@@ -114,16 +118,19 @@ class TiltInput:
             return math.inf
         return (TILT.turn_rate if any(self._angular_velocity) else TILT.turn_rate_alone) * (now - self._in_time)
 
-    def problem(self, now: float) -> str:
-        """Return why there is no fresh tilt at `now`; '' if there is one."""
+    def problem(self, now: float) -> Reason:
+        """Return why there is no fresh tilt at `now`; false if there is one."""
         if now - self._time <= self.timeout:
-            return ""
-        text = f"trunk tilt older than {self.timeout * 1000:.0f} ms"
+            return NO_REASON
+        word, text = Withdrawal.LATE_TILT, f"trunk tilt older than {self.timeout * 1000:.0f} ms"
         if self._time == -math.inf:
-            text = "no trunk tilt yet"
+            word, text = Withdrawal.NO_TILT, "no trunk tilt yet"
         elif now - self._arrival <= self.timeout:
-            text += " by its stamp: the IMU driver lags, or its clock differs"
-        return f"{text} (the newest was refused: {self._refusal})" if self._refusal else text
+            lags = "by its stamp: the IMU driver lags, or its clock differs"
+            word, text = Withdrawal.LATE_TILT_STAMP, f"{text} {lags}"
+        if self._refusal:
+            return Reason(Withdrawal.REFUSED_TILT, f"{text} (the newest was refused: {self._refusal})")
+        return Reason(word, text)
 
     def _set(self, now: float, gravity: Callable[[], Vector], angular_velocity: Sequence[float], age: float) -> None:
         """Take a direction of gravity, or note why it is refused and raise ParameterError."""
@@ -143,10 +150,13 @@ class TiltInput:
         lead = max(lead, -age)
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
-        reach = TILT.jump + TILT.speed * max(0.0, measured - self._time)
-        if angle_between(tilt.direction, self._tilt.direction) > reach:
-            expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last tilt"
+        way, reach = angle_between(tilt.direction, self._followed), TILT.speed * max(0.0, measured - self._time)
+        if way > TILT.jump + reach:
+            expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last ones"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
+        share = 1.0 if way <= reach else reach / way
+        x, y, z = (old + share * (new - old) for new, old in zip(tilt.direction, self._followed, strict=True))
+        self._followed = x, y, z
         self._tilt, self._angular_velocity = tilt, angular_velocity
         self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
         if now - measured <= self.timeout:

@@ -39,9 +39,13 @@ Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options o
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
+    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason.
+
+    By these settings alone: python-can's own files and variables (~/.canrc, CAN_CONFIG) belong to other programs.
+    """
     try:
-        bus = can.Bus(interface=interface, channel=channel, **options)
+        number = int(channel) if channel.isdecimal() else channel  # of a channel of an adapter with several
+        bus = can.Bus(channel=number, interface=interface, ignore_config=True, **options)
         if bus.channel_info == can.BusABC.channel_info:  # some backends leave it "unknown"
             bus.channel_info = f"{interface} {channel}"
         return bus

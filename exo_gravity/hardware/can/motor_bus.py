@@ -53,7 +53,8 @@ CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correctin
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
-HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
+HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint,
+HOLD_STEP = 0.01  # s for which it does so at once, at most: after a stall of the loop the torque must not step
 FOREIGN_COMMAND = "foreign command"
 AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
@@ -97,6 +98,7 @@ class MotorBus:
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+        self._open_drives: set[int] = set()  # IDs of motors whose board obeys other IDs, too: it compares 7 bits
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
         self._drive = Drive.off(count)  # last sent
@@ -249,7 +251,10 @@ class MotorBus:
                 continue
             kind, can_id = board.classify(frame_id, message.data, reply_ids, message.is_remote_frame)
             if kind == COMMAND:
-                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
+                if port.is_echo(message):
+                    return "echo", 0
+                is_obeyed = message.is_extended_id or frame_id == can_id or can_id in self._open_drives
+                return (FOREIGN_COMMAND, can_id) if is_obeyed else ("foreign frame", 0)
             if kind != OTHER:
                 return kind, can_id
         return "foreign frame", 0
@@ -269,6 +274,8 @@ class MotorBus:
                 self.boards.heard(self._joint_of[can_id], kind, frame, self._now())
             return
         joint, now = self._joint_of[can_id], self._now()
+        if len(message.data) == self._motors[joint].wire_format.open_length:
+            self._open_drives.add(can_id)
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
@@ -290,7 +297,8 @@ class MotorBus:
         position = sample.position
         if self._hold(joint, sample.time):
             away = position - self._held[joint]
-            step = max(HOLD_SPEED * (sample.time - self.samples[joint].time), abs(away) - HOLD_REACH)
+            passed = min(HOLD_STEP, sample.time - self.samples[joint].time)
+            step = max(HOLD_SPEED * passed, abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 

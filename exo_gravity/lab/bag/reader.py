@@ -22,9 +22,21 @@ from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
+from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
-from exo_gravity.lab.bag.content import COMMANDS, JOINT_STATE, STATES, STEPS, Bag, Event, arm_of, leaf
+from exo_gravity.lab.bag.content import (
+    BRIDGE,
+    COMMANDS,
+    JOINT_STATE,
+    STATES,
+    STEPS,
+    Bag,
+    Event,
+    NodeStatus,
+    arm_of,
+    leaf,
+)
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.storage import Storage, StoredRows
@@ -53,17 +65,20 @@ class Plausible:
 
 
 PLAUSIBLE = Plausible()
+KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
 
 
-def read_bag(path: str | Path) -> Bag:
+def read_bag(path: str | Path, every: int = 1) -> Bag:
     """Read a recording: a rosbag2 folder, or an .mcap or .db3 file, complete or cut short.
+
+    every: of each arm's samples, the first of so many is kept. Each has the command that was in force.
 
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
-    storage, contents = Storage(path), _Contents()
+    storage, contents = Storage(path), _Contents(every)
     for rows in storage.rows(content.is_wanted):
         contents.add(rows)
     contents.conclude(storage)
@@ -95,6 +110,7 @@ def read_bag(path: str | Path) -> Bag:
     return Bag(
         Path(path), start, recordings, events, contents.parameters, tuple(contents.notes), tuple(contents.problems),
         contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
+        contents.sources,
     )  # fmt: skip
 
 
@@ -162,15 +178,17 @@ def _pitch_and_roll(tilt: np.ndarray) -> np.ndarray:
 
 
 class _Contents:
-    """Collects the messages of a recording, topic by topic."""
+    """Collects the messages of a recording, topic by topic. every: see `read_bag`."""
 
-    def __init__(self) -> None:
+    def __init__(self, every: int) -> None:
+        self.every = every
         self.joints: dict[str, JointArrays] = {}
         self.parameters: dict[str, str] = {}
         self.losses = ""
         self.session = Session()
-        self.events: list[tuple[Any, ...]] = []  # row, text and setting of faults and changed parameters
+        self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
+        self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
         self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
         self.notes: list[str] = []
@@ -191,7 +209,8 @@ class _Contents:
             ordinals = self._count + chosen
             if msgtype == JOINT_STATE:
                 if topic not in self.joints:
-                    self.joints[topic] = JointArrays(topic, FIELDS if leaf(topic) == STATES else ("effort",))
+                    kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
+                    self.joints[topic] = JointArrays(topic, *kept)
                 self.joints[topic].add(ordinals, batch)
             elif topic in (content.IMU, content.TILT_TOPIC):
                 (self.trunk if topic == content.IMU else self.tilt).add(ordinals, batch)
@@ -304,16 +323,21 @@ class _Contents:
             self.parameters[node.strip()] = f"{node}:{text}"
 
     def _add_status(self, row: Row, status: Any) -> None:
-        level = int(status.level)
-        last = self._last.get(status.name, (0, ""))
+        level, values = int(status.level), {entry.key: entry.value for entry in status.values}
+        fault = values.get("fault", NONE), values.get("fault text", "")
+        last, found = self._last.get(status.name, (0, "")), NodeStatus(status.name, level, status.message, *fault)
         if level > 0 and (level, status.message) != last:
-            self.events.append((row, f"{status.name}: {status.message}"))
+            self.events.append((row, f"{status.name}: {status.message}", None, found))
         elif level == 0 and last[0] > 0:
-            self.events.append((row, f"{status.name}: OK, {status.message}"))
+            self.events.append((row, f"{status.name}: OK, {status.message}", None, found))
         self._last[status.name] = (level, status.message)
         for entry in status.values:
-            if entry.key == "state" and entry.value:
+            if entry.key == "state" and entry.value and leaf(status.name) == BRIDGE:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
+        if leaf(status.name) == "simulator":
+            self.sources[arm_of(status.name)] = Source.SIMULATED
+        elif leaf(status.name) == BRIDGE and values.get("source") in KNOWN:
+            self.sources.setdefault(arm_of(status.name), Source(values["source"]))
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.vocabulary import TEXT, Source
 from exo_gravity.lab.bag import content
-from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event
+from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event, NodeStatus
 from exo_gravity.lab.bag.layout import TYPES
 from exo_gravity.lab.bag.writer import BagWriter, Message, offered_qos
 from exo_gravity.lab.trial.recording import Recording
@@ -35,11 +36,13 @@ def write_recordings(
     messages: list[Unsent] = [
         *((content.PARAMETERS, 0.0, STRING, (text,)) for text in parameters.values()),
         (content.SESSION, 0.0, STRING, (json.dumps(asdict(session)),)),
-        *(_status(now, 1, *text.split(": ", 1)) for now, text, _ in events),
+        *(_of_event(event.time, event.status) for event in events if event.status),
         *(message for arm in arms for message in _of_arm(arm)),
     ]
     messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
+    for arm in arms:
+        writer.describe(content.source_key(arm.name), Source.SIMULATED.value)
     for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
         writer.add_topic(topic, kind, offered_qos(True, topic in (content.PARAMETERS, content.SESSION), 1))
     writer.write([_serialised(start, *message) for message in messages])
@@ -52,7 +55,7 @@ def _of_arm(arm: Recording) -> Iterator[Unsent]:
     """Yield the states of an arm and its bridge, the commands, and the steps of the script."""
     carried = [(now, State.ACTIVE) for span in arm.carried or () for now in span]
     for now, state in (*carried, (float(arm.time[-1]), State.DISABLED)):
-        yield _status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value)
+        yield _status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value, source=Source.SIMULATED.value)
     for index, step in enumerate(arm.steps):
         text = json.dumps({"step": index, "action": step.action, "duration": step.end - step.start})
         yield f"/{arm.name}/{content.STEPS}", step.start, STRING, (text,)
@@ -64,6 +67,12 @@ def _of_arm(arm: Recording) -> Iterator[Unsent]:
             yield f"/{arm.name}/{content.COMMANDS}", last, JOINT_STATE, (names, none, none, wanted)
         yield f"/{arm.name}/{content.STATES}", now, JOINT_STATE, (names, position, velocity, effort)
         last = now
+
+
+def _of_event(now: float, status: NodeStatus) -> Unsent:
+    """Return the message of a status, as a node sends it."""
+    fault = {"fault": status.fault, f"fault{TEXT}": status.fault_text}
+    return _status(now, status.level, status.node, status.message, **fault)
 
 
 def _status(now: float, level: int, name: str, text: str, **values: str) -> Unsent:

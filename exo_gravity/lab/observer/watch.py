@@ -7,6 +7,7 @@ from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.numbers import COVER
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, Adapts
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.contact import ContactWatch
 from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
@@ -50,32 +51,37 @@ class WearerWatch:
     def values(self, now: float) -> dict[str, str]:
         """Return torques and share with their 95 % bands, the newest contact, and the support, for /diagnostics."""
         estimate = self._estimate if now - self._time <= OLD else None
-        share, torque, shared, contact = self.adaptation.share, "unknown", "unknown", "none"
-        if estimate:
-            columns = zip(self._names, estimate.torque, estimate.deviation, estimate.distinguishable, strict=True)
-            different = [f"{name} {tau:+.1f} +- {COVER * error:.1f}" for name, tau, error, shown in columns if shown]
-            torque = ", ".join(different) or "not distinguishable from zero"
-        if estimate and share:
-            shared = f"{100.0 * share[0]:.0f} +- {100.0 * COVER * share[1]:.0f}"
-        if self._contact.last:
-            at, joint, jump = self._contact.last
-            ago = f"{min(99.0, now - at):.0f} s ago; {self._contact.count} in all"
-            contact = f"{self._names[joint]} {jump:+.1f} Nm, {ago}"
-        return {
-            "wearer (Nm)": torque,
-            "share of the wearer (%)": shared,
-            "contact": contact,
-            "support adapts": self._adaptation_text(),
+        values = values_of(self._names, estimate, self.adaptation.share if estimate else None)
+        requested, problem, contact = self.adaptation.requested, self.adaptation.problem, self._contact
+        values |= {
+            "support adapts": (Adapts.HELD if problem else Adapts.ON) if self._settings.is_adaptive else Adapts.OFF,
+            "support adapts text": problem,
+            "support asked for": NONE if requested is None else f"{requested:.3f}",
+            "contacts": str(contact.count),
         }
+        if contact.last is None:
+            return values | dict.fromkeys(("contact joint", "contact torque (Nm)", "contact age (s)"), NONE)
+        at, joint, jump = contact.last
+        values["contact joint"], values["contact torque (Nm)"] = self._names[joint], f"{jump:.1f}"
+        return values | {"contact age (s)": f"{now - at:.0f}"}
 
-    def _adaptation_text(self) -> str:
-        """Return from which support to which it adapts."""
-        s, problem = self._settings, self.adaptation.problem
-        if not s.is_adaptive:
-            return "off"
-        supports = (s.support, self.adaptation.requested or s.support)
-        ends = dict.fromkeys(f"{100.0 * support:.0f}" for support in supports)
-        return f"{' -> '.join(ends)} %{f', cannot rise: {problem}' if problem else ''}"
+
+def values_of(
+    names: Sequence[str], estimate: WearerEstimate | None, share: tuple[float, float] | None
+) -> dict[str, str]:
+    """Return torques and share with half their 95 % bands, for /diagnostics.
+
+    names: of the joints (n,). estimate: None if there is none. share: of the wearer, and its standard deviation, 0..1.
+    """
+    value, deviation = share or (None, 0.0)
+    values = {"share of the wearer (%)": UNKNOWN, "share band (%)": UNKNOWN}
+    if value is not None:
+        values["share of the wearer (%)"] = f"{round(100.0 * value)}"
+        values["share band (%)"] = f"{round(100.0 * COVER * deviation)}"
+    for n, name in enumerate(names):
+        values[f"{name} wearer (Nm)"] = f"{round(estimate.torque[n], 1) + 0.0:.1f}" if estimate else UNKNOWN
+        values[f"{name} wearer band (Nm)"] = f"{COVER * estimate.deviation[n]:.1f}" if estimate else UNKNOWN
+    return values
 
 
 def _known_of(s: Settings) -> object:

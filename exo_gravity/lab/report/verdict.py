@@ -11,11 +11,14 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.lab.bag.content import Bag
+from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.vocabulary import NONE, Source
+from exo_gravity.lab.bag.content import BRIDGE, Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report import table
 from exo_gravity.lab.report.wearer_share import WearerPart
+from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.analysis import Hold, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.lab.trial.recording import Recording
 
@@ -122,6 +125,11 @@ class Report:
         return text, not (bad or self.failures)
 
     @property
+    def source(self) -> Source:
+        """Where the numbers of all arms together come from."""
+        return of_all(self.bag.source(recording.name) for recording in self.bag.recordings)
+
+    @property
     def trial(self) -> str:
         """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
         path = self.bag.path.resolve()
@@ -143,9 +151,12 @@ class Report:
     def row_head(self, arm: str, time: float) -> dict[str, str]:
         """Return the first columns of a row of the CSV files, about `arm` at `time` s."""
         in_force = self.settings[arm].at(time)
+        if in_force.get("mode") == "one_g":  # it does not use the support
+            in_force.pop("support", None)
         settings = {key: str(in_force.get(key, "")) for key in ("side", "mode", "support")}
-        session = self.bag.session
-        return {"trial": self.trial, "subject": session.subject, "arm": arm, **settings, "version": session.version}
+        session, source = self.bag.session, self.bag.source(arm).value
+        of_whom = {"trial": self.trial, "subject": session.subject, "arm": arm, "source": source}
+        return {**of_whom, **settings, "version": session.version}
 
 
 def _falls(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:
@@ -197,7 +208,11 @@ def _event(recording: Recording, what: str, angle: np.ndarray, bad: bool, speed:
 
 
 def _fault_near(bag: Bag, arm: str, time: float) -> str:
-    """Return the fault that the arm's bridge reported at about `time` s, without its state, or ''."""
-    reported = re.compile(rf"{re.escape(arm)}(?:/can_bridge)?: (?:letting down|fault): (.*)")
-    found = (reported.match(event.text) for event in bag.events if abs(event.time - time) <= NEAR)
-    return next((match[1] for match in found if match), "")
+    """Return code and text of the fault that the arm's bridge reported at about `time` s, or ''."""
+    bridge = node_of(arm, BRIDGE).lstrip("/")
+    near = (event.status for event in bag.events if event.status and abs(event.time - time) <= NEAR)
+    fault = next((status for status in near if status.node == bridge and status.fault != NONE), None)
+    if fault is None:
+        return ""
+    meanings = {code.value: code.meaning for code in FaultCode}  # for recordings without the fault's text
+    return f"{fault.fault}: {fault.fault_text or meanings.get(fault.fault, 'a fault')}"

@@ -15,6 +15,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, observed, share_of, while_between
@@ -53,12 +54,13 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve)) if len(curve.time) else None
 
 
-def sentence(part: WearerPart) -> str:
+def sentence(part: WearerPart, source: Source) -> str:
     """Return the share over the recording, with its 95 % band."""
     share = part.whole
+    where = "In the simulation, the" if source is Source.SIMULATED else "The"
     if not np.isfinite(share.value):
-        return "The wearer's arm hung all the time: there was nothing to carry."
+        return f"{where} wearer's arm hung all the time: there was nothing to carry."
     band = COVER * float(share.deviation)
     value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
     caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
-    return f"The wearer carried {value}{caveat}."
+    return f"{where} wearer carried {value}{caveat}."

@@ -15,7 +15,6 @@ from rich.progress import Progress, TaskID
 
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
-from exo_gravity.lab.bag.content import Event
 from exo_gravity.lab.bag.simulated import write_recordings
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
@@ -85,7 +84,7 @@ def record_offline(trial: Trial, console: Console, should_stop: Callable[[], boo
         console.print(
             f"{one.arm.name}: {length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time"
         )
-    events = sorted(Event(*event) for one in simulated for event in one.events)
+    events = sorted((event for one in simulated for event in one.events), key=lambda event: event.time)
     texts = {
         node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
         for node, values in nodes.items()

@@ -18,14 +18,18 @@ from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.safety.drive import CARRYING, Efforts, State
+from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.vocabulary import NONE
+from exo_gravity.lab.bag.content import BRIDGE, Event, NodeStatus
+from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.script import IDLE, TrialScript
 from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
+NOT_OK = 2  # the level of an event, as diagnostic_msgs/DiagnosticStatus has it
 GRACE = 0.5  # s from the end of the script until the arm is let down
 COLUMNS = ("position", "velocity", "effort", "command")  # of the recording, each of all joints, after the time
 
@@ -49,7 +53,7 @@ class OfflineTrial:
     compensator: by default one with the arm's settings.
     wearer: by default one who performs the script. Raises ParameterError if the script is for another arm.
 
-    events: s and text of everything that went wrong. trouble: why the trial ended before the script, or ''.
+    events: everything that went wrong. trouble: why the trial ended before the script, or ''.
     """
 
     def __init__(
@@ -63,7 +67,7 @@ class OfflineTrial:
         script.check(len(arm.motors))
         self.arm, self.script, self.wearer = arm, script, wearer or VirtualWearer(script)
         self._no_effort = (math.nan,) * len(arm.motors)
-        self.events: list[tuple[float, str]] = []
+        self.events: list[Event] = []
         self.trouble = ""
         self.compensator = compensator or Compensator(arm.settings, arm.limits.joint_names)
         self._controller = DirectController(self.compensator, arm.limits)
@@ -104,7 +108,7 @@ class OfflineTrial:
         if safety.refusal:
             self._abort(now, f"the arm was never carried: {safety.refusal}")
         if safety.fault:
-            self._abort(now, f"fault: {safety.fault.code}: {safety.fault.reason}")
+            self._abort(now, f"fault: {safety.fault.code}: {safety.fault.reason}", safety.fault)
         return self._recording()
 
     def efforts(self, latest: float) -> Efforts:
@@ -121,7 +125,7 @@ class OfflineTrial:
         self._controller.take(now, samples)
         reason = self._controller.answer.reason
         if reason and reason != self._reason:
-            self._note(now, f"withdrawn: {reason}")
+            self._note(now, "compensator", f"withdrawn: {reason}", None)
         self._reason = reason
 
     def _follow_script(self, now: float) -> None:
@@ -133,15 +137,17 @@ class OfflineTrial:
         elif now > self._start + self.script.duration + GRACE:
             self.safety.disable(now)
 
-    def _abort(self, now: float, why: str) -> None:
+    def _abort(self, now: float, why: str, fault: Fault | None = None) -> None:
         why = f"{why} ({self._reason})" if self._reason else why
-        self._note(now, why)
-        self.trouble = self.trouble or self.events[-1][1]
+        self._note(now, BRIDGE, why, fault)
+        self.trouble = self.trouble or f"{self.arm.name}: {why}"
         self.arm.device.start(VirtualWearer(IDLE))
         self.safety.disable(now)
 
-    def _note(self, now: float, text: str) -> None:
-        self.events.append((now, f"{self.arm.name}: {text}"))
+    def _note(self, now: float, executable: str, message: str, fault: Fault | None) -> None:
+        code, reason = fault or (NONE, "")
+        status = NodeStatus(node_of(self.arm.name, executable).lstrip("/"), NOT_OK, message, str(code), reason)
+        self.events.append(Event(now, f"{status.node}: {message}", status=status))
 
     def _recording(self) -> Recording:
         if not self._rows:

@@ -16,16 +16,17 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.parameter_file import load, stages
+from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, Stopping
-from exo_gravity.lab.trial.screen import LEAD, TrialScreen
+from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.sim.script import TrialScript
 
@@ -57,6 +58,14 @@ def is_guided(params: Path) -> bool:
     return not any(node.endswith("/simulator") for node in load(params))
 
 
+def check_bridges(params: Path) -> None:
+    """Raise ParameterError unless the parameter file has a can_bridge: a trial follows the arm that it carries."""
+    nodes = load(params)
+    if not stages(nodes)[0]:
+        expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
+        raise ParameterError("params", str(params), expected)
+
+
 @dataclass(frozen=True)
 class Trial:
     """Who performs which script on which nodes, and where that is recorded."""
@@ -70,18 +79,17 @@ class Trial:
 
     def prepare(self, with_recorder: bool = True) -> Path:
         """Write the trial's own parameter file into the new folder, and return its path. Raises ParameterError."""
-        content: dict[str, Any] = yaml.safe_load(self.params.read_text(encoding="utf-8")) if self.params else {}
-        for node, entry in content.items():
+        nodes = load(self.params) if self.params else {}
+        for node, values in nodes.items():
             if node.endswith("/simulator"):
-                entry["ros__parameters"]["trial"] = str(self.path)
+                values["trial"] = str(self.path)
         if with_recorder:
             of_whom = {param.name: getattr(self.session, param.name) for param in params_of(Session)}
-            content[RECORDER] = {"ros__parameters": {"output": str(self.folder / "bag"), "live": True, **of_whom}}
+            nodes[RECORDER] = {"output": str(self.folder / "bag"), "live": True, **of_whom}
         path = self.folder / "params.yaml"
         try:
             self.folder.mkdir(parents=True)
-            text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-            path.write_text(text, encoding="utf-8")
+            path.write_text(text_of(nodes), encoding="utf-8")
         except OSError as error:
             expected = f"a writable folder ({error.strerror})"
             raise ParameterError("output", str(self.folder.parent), expected) from None
@@ -165,7 +173,9 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
             return f"the recorder ended with exit code {code} before the trial was done"
         if screen.silence > RECORDER_TIMEOUT:
             return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
-        if message := fault_of(screen.status)[1]:
+        if screen.has_no_bridge:
+            return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
+        if message := fault_of(screen.status)[1] or ("" if screen.guided else refusal_of(screen.status)):
             return message
         if screen.done:
             stopped.wait(GRACE)
@@ -185,9 +195,15 @@ def is_falling(status: Status) -> bool:
 def fault_of(status: Status) -> tuple[str, str]:
     """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
     for name, values in status.items():
-        if values.get("fault", "none") != "none":
+        if values.get("fault", NONE) != NONE:
             return str(values["fault"]), f"{name}: {values['message']}"
     return "", ""
+
+
+def refusal_of(status: Status) -> str:
+    """Return the message of a bridge whose start has ended without a fault, or '': only a person starts it again."""
+    ended = (name for name, values in status.items() if values.get("refusal", NONE) != NONE)
+    return next((f"{name}: {status[name]['message']}" for name in ended), "")
 
 
 def too_busy(status: Status) -> str:

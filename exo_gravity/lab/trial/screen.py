@@ -20,6 +20,7 @@ from exo_gravity.sim.script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
 LEAD = 5.0  # s for a person to get ready when the arm is carried
+BRIDGE_TIMEOUT = 5.0  # s from the recorder's first line, in which a bridge that runs already has reported ten times
 
 
 @dataclass(eq=False)
@@ -43,6 +44,7 @@ class TrialScreen:
         self._arms: dict[str, dict[str, Any]] = {}
         self._index = -1  # of the current step
         self._step_start = self._last_line = self.clock()
+        self._first_line = math.inf
         self._start = math.inf  # of a script that the clock leads
         self._origin: dict[str, list[float]] = {}  # position of each arm from which drift is measured
         self._ending = ""
@@ -64,6 +66,7 @@ class TrialScreen:
         except json.JSONDecodeError:
             return
         self._last_line = self.clock()
+        self._first_line = min(self._first_line, self._last_line)
         self.status = content.pop("status", {})
         self.faults = content.pop("faults", [])
         self._arms = {name: arm for name, arm in content.items() if "position" in arm}
@@ -76,6 +79,12 @@ class TrialScreen:
     def silence(self) -> float:
         """Time in s since the recorder's last line; 0 before its first."""
         return self.clock() - self._last_line if self._arms else 0.0
+
+    @property
+    def has_no_bridge(self) -> bool:
+        """Whether no bridge reports although all nodes run already. Those that are started may need longer."""
+        is_late = self.clock() - self._first_line > BRIDGE_TIMEOUT
+        return is_late and not self.bridges and not self._states
 
     @property
     def is_let_down(self) -> bool:
@@ -93,8 +102,13 @@ class TrialScreen:
         return max(0.0, due - self.clock())
 
     @property
+    def _states(self) -> dict[str, Any]:
+        """The state that each bridge reports, by its name."""
+        return {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
+
+    @property
     def _all_active(self) -> bool:
-        states = {name: values.get("state") for name, values in self.status.items() if name.endswith("can_bridge")}
+        states = self._states
         return bool(states) and set(self.bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
 
     def _follow(self, simulated_steps: list[int]) -> None:

@@ -21,6 +21,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Efforts, FaultCode
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.vocabulary import NO_REASON, Reason, RefusedEfforts
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import SHORT_QUEUE, PolledSubscription, Publishers
@@ -32,14 +33,14 @@ Answer = Callable[[JointState], JointState | None]  # efforts for a joint state,
 class EffortExchange:
     """The topics `joint_states` and `effort_commands` of `node`, the controller of the loop.
 
-    get_loop returns the present control loop, None while the node is inactive. refusal: why the last message was
-    refused, or "none". answer: of a compensator in this process.
+    get_loop returns the present control loop, None while the node is inactive. refusal: why the last message that was
+    refused was. answer: of a compensator in this process.
     """
 
     def __init__(
         self, node: Node, limits: Limits, get_loop: Callable[[], ControlLoop | None], answer: Answer | None = None
     ) -> None:
-        self.refusal = "none"
+        self.refusal = NO_REASON
         self._answer = answer
         self._limits = limits
         self._get_loop = get_loop
@@ -86,7 +87,7 @@ class EffortExchange:
         if loop is None:
             return
         if self._commander.note(info):
-            self.refusal = "a second publisher of effort_commands"
+            self.refusal = Reason(RefusedEfforts.SECOND_PUBLISHER, "a second publisher of effort_commands")
             self.newest = Efforts(None, time.monotonic(), False, False)  # fails the start gate
             if loop.safety.state in CARRYING:
                 loop.trip(FaultCode.SECOND_COMMANDER, "more than one publisher of effort_commands")
@@ -96,14 +97,15 @@ class EffortExchange:
     def _receive(self, loop: ControlLoop, message: JointState) -> None:
         answered = self._published.get(to_nanoseconds(message.header.stamp))
         if answered is None:
-            self.refusal = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
+            unknown = f"stamp {to_nanoseconds(message.header.stamp)} ns answers no joint state of this bridge"
+            self.refusal = Reason(RefusedEfforts.UNKNOWN_STAMP, unknown)
         else:
             try:
                 effort = by_name(message, "effort", self._limits.joint_names) if message.effort else None
                 if any(message.velocity):
                     raise ParameterError("velocity", list(message.velocity), "empty, or zeros to ask for damping")
             except ParameterError as error:
-                effort, self.refusal = None, str(error)
+                effort, self.refusal = None, Reason(RefusedEfforts.INVALID, str(error))
                 loop.trip(FaultCode.COMMAND_IMPOSSIBLE, f"effort_commands: {error.name} must be {error.expected}")
             is_late = message.header.frame_id == LATE_TILT
             self.newest = Efforts(effort, answered, bool(message.velocity), is_late)

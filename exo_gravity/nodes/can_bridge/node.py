@@ -29,6 +29,7 @@ from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -115,8 +116,10 @@ class CanBridge(LifecycleNode):
         self.error = ""  #: why the last transition failed
         self._exchange = EffortExchange(self, limits, lambda: self.loop, answer)
         lease = operation.Operator(self, lambda: self.loop).lease
-        self._report = operation.BridgeReport(self, self._arm, traffic, lease)
-        operation.BridgeServices(self, lambda: self.loop, motors, lambda: LEAVING if self._is_leaving else "")
+        services = operation.BridgeServices(
+            self, lambda: self.loop, motors, lambda: LEAVING if self._is_leaving else ""
+        )
+        self._report = operation.BridgeReport(self, self._arm, traffic, lease, services)
         prepare_transitions(self, self._prepare)
         if any(limits.largest_moment):
             _follow_gravity(self, lambda: self.loop)
@@ -232,7 +235,7 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        loop.hindrance = "the watchdog to start" if watchdog.is_starting else ""
+        loop.hindrance = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 

@@ -20,11 +20,21 @@ from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, JointMotor, Traffic
+from exo_gravity.core.motors.joint_motor import (
+    REPLY_SHARE,
+    SIMULATED_BUSES,
+    JointMotor,
+    JointSample,
+    Traffic,
+    source_of_bus,
+)
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
+from exo_gravity.core.safety.gate import at_least, turns_back
 from exo_gravity.core.safety.lease import Lease
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Reason, words
 from exo_gravity.hardware.can.adapter import serial_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -90,6 +100,7 @@ class BridgeServices:
 
     get_loop: returns the present control loop, None while the node is inactive.
     hindrance: returns why the arm may not be armed now; '' if it may.
+    last: the request that was answered last, and the Answer.
 
     Each method below, on the control thread, does what its service is for and returns why it is refused, or ''.
     """
@@ -101,6 +112,7 @@ class BridgeServices:
         motors: Sequence[JointMotor],
         hindrance: Callable[[], str],
     ) -> None:
+        self.last: tuple[str, str] = NONE, Answer.NONE
         self._node = node
         self._get_loop = get_loop
         self._hindrance = hindrance
@@ -145,21 +157,34 @@ class BridgeServices:
         )
 
     async def answer(self, function: Callable[[ControlLoop, Any], str], request: Any, response: Any) -> Any:
-        """Run `function` on the control thread.
+        """Run `function` on the control thread, and fill the response."""
+        loop, lets_down = self._get_loop(), function == self.enable and not request.data
+        if loop is None:
+            why_not = Reason(Answer.INACTIVE, "the node is not active")
+        else:
+            why_not = await self._carry_out(loop, function, request, lets_down)
+        self.last = "let_down" if lets_down else function.__name__, why_not.word
+        response.success, response.message = not why_not, str(why_not)
+        if loop is not None and response.success:
+            response.message = FOLLOWS.get(loop.safety.state, "")
+            if function == self.confirm_pose:
+                response.message = f"confirmed (degrees): {loop.safety.pose.text}; {response.message}"
+        return response
+
+    async def _carry_out(
+        self, loop: ControlLoop, function: Callable[[ControlLoop, Any], str], request: Any, lets_down: bool
+    ) -> Reason:
+        """Run `function` on the control thread; return why it was not carried out, false if it was.
 
         A call that has timed out never runs later: an arm must not be enabled after its operator was refused.
         """
-        loop = self._get_loop()
-        response.success, response.message = False, "the node is not active"
-        if loop is None:
-            return response
-        lets_down = function == self.enable and not request.data
-        if not lets_down and (why_not := why_too_old(age_of_request(self._node)) or self._hindrance()):
-            response.message = why_not
-            return response
         if lets_down:
             for waiting in tuple(self._arming):
                 waiting.cancel()
+        elif too_old := why_too_old(age_of_request(self._node)):
+            return Reason(Answer.TOO_OLD, too_old)
+        elif hindrance := self._hindrance():
+            return Reason(Answer.LEAVING, hindrance)
         future = loop.call(lambda: function(loop, request))
         if not lets_down:
             self._arming.add(future)
@@ -167,20 +192,15 @@ class BridgeServices:
         await Until(future.done, CALL_TIMEOUT)
         self._arming.discard(future)
         try:
-            response.message = future.result(0.0)
+            refusal = future.result(0.0)
         except BusError as error:
-            response.message = str(error)
+            return Reason(Answer.BUS_ERROR, str(error))
         except futures.CancelledError:
-            response.message = "refused: the arm was asked to be let down"
+            return Reason(Answer.OVERTAKEN, "refused: the arm was asked to be let down")
         except futures.TimeoutError:  # before Python 3.11 not the built-in one
             future.cancel()
-            response.message = "the control thread did not respond"
-        response.success = not response.message
-        if response.success:
-            response.message = FOLLOWS.get(loop.safety.state, "")
-            if function == self.confirm_pose:
-                response.message = f"confirmed (degrees): {loop.safety.pose.text}; {response.message}"
-        return response
+            return Reason(Answer.NO_RESPONSE, "the control thread did not respond")
+        return Reason(Answer.REFUSED if refusal else Answer.DONE, refusal)
 
 
 class Operator:
@@ -234,68 +254,97 @@ def log_risks(node: Node, interface: str, traffic: Mapping[str, Traffic], rate: 
 
 
 class BridgeReport:
-    """The status of one bridge. lease: of control."""
+    """The status of one bridge, with its keys for programs. lease: of control. services: what was asked for last."""
 
-    def __init__(self, node: Node, arm: ArmOnBus, traffic: Mapping[str, Traffic], lease: Lease) -> None:
+    def __init__(
+        self, node: Node, arm: ArmOnBus, traffic: Mapping[str, Traffic], lease: Lease, services: BridgeServices
+    ) -> None:
         self._diagnostics = Diagnostics(node)
-        self._names = arm.limits.joint_names
-        self._lease = lease
+        self._limits, self._names = arm.limits, arm.limits.joint_names
+        self._source = source_of_bus(*arm.address[:2])
+        self._lease, self._services = lease, services
         self._traffic = traffic
         self._rate = Rate()
         self._slow = SLOW / arm.period  # Hz
         self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
         names = zip(self._names, arm.motors, strict=True)
-        self._without_timeout = ", ".join(name for name, motor in names if not motor.timeout) or "none"
+        self._without_timeout = words(*[name for name, motor in names if not motor.timeout])
 
-    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: str) -> None:
+    def send(self, loop: ControlLoop | None, newest: Efforts, refusal: Reason) -> None:
         """Report on `loop`, None while the node is inactive. refusal: why the last message was refused."""
-        operator = {HELD_BY: self._lease.holder or NOBODY}
+        request, answer = self._services.last
+        operator = {HELD_BY: self._lease.holder or NOBODY, "request": request, "answer": answer}
         if loop is None:
-            self._diagnostics.report(WARN, "inactive", operator)
+            self._diagnostics.report(WARN, INACTIVE, {"state": INACTIVE, "source": self._source, **operator})
             return
         now, safety = time.monotonic(), loop.safety
-        acting = ", ".join(sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
+        fault, resume = safety.fault, safety.why_not_resumed  # read once: the control thread goes on
+        acting = words(*sorted(limit for limit, acted in tuple(safety.acted.items()) if acted > now - RECENT))
         rate = self._rate.update(now, loop.cycles)
         samples = loop.samples
         loads = self._motors.update(now, samples)
+        hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
+        warnings: dict[BridgeWarning, str] = {}
+        if acting != NONE:
+            warnings[BridgeWarning.LIMITED] = f"limited by {acting}"
+        if now - safety.ride.ended < RECENT:
+            warnings[BridgeWarning.LATE_EFFORTS] = f"riding through: {safety.ride.why}"
+        if hot:
+            warnings[BridgeWarning.ABOVE_RATED_TORQUE] = f"above rated torque for too long: {', '.join(hot)}"
+        if odd := loop.bus.boards.odd_temperature:
+            warnings[BridgeWarning.ODD_TEMPERATURE] = odd
+        if 0.0 < rate < self._slow:
+            warnings[BridgeWarning.SLOW_LOOP] = f"slower than {self._slow:.0f} Hz"
         values: dict[str, object] = {
             "state": safety.state.value,
-            "fault": safety.fault.code if safety.fault else "none",
+            "source": self._source,
+            "motors": safety.motors,
+            "fault": fault.code if fault else NONE,
+            "fault text": fault.reason if fault else "",
+            **self._start(safety, samples),
+            "resume": resume.word,
+            "resume text": resume,
             **operator,
-            "refusal": safety.refusal or "none",
-            "limits acting": acting or "none",
+            "warnings": words(*warnings),
+            "limits acting": acting,
+            "joints above rated torque": words(*hot),
             "rate (Hz)": f"{rate:.1f}",
             "bus load (%)": row([100.0 * bus.load(rate) if rate else 0.0 for bus in self._traffic.values()], 0),
             "age of efforts (ms)": milliseconds(now - newest.answered),
             "rides": safety.ride.rides,
-            "resume": safety.why_not_resumed or "possible",
-            POSE_TO_CONFIRM: row(list(map(math.degrees, safety.pose.asked)), 0) if safety.pose.asked else NO_POSE,
             "cycles": loop.cycles,
             "late cycles": loop.late,
             "incomplete cycles": loop.incomplete,
-            "temperatures when switched on": "implausible" if loop.bus.boards.odd_temperature else "plausible",
-            "frames ignored": ", ".join(f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())) or "none",
+            "temperatures when switched on": "implausible" if odd else "plausible",
+            "frames ignored": words(*[f"{kind}: {n}" for kind, n in sorted(dict(loop.bus.ignored).items())]),
             "motors without time-out": self._without_timeout,
-            "publishing errors": f"{loop.cycle_errors}, last: {loop.cycle_error}" if loop.cycle_errors else "none",
-            "last refused message": refusal,
+            "publishing errors": loop.cycle_errors,
+            "publishing error text": loop.cycle_error if loop.cycle_errors else "",
+            "refused message": refusal.word,
+            "refused message text": refusal,
         }
         for name, joint, (power, rms, share) in zip(self._names, samples, loads, strict=True):
-            values[f"{name} temperature (degC)"] = joint.temperature
+            values[f"{name} temperature (degC)"] = UNKNOWN if joint.temperature is None else joint.temperature
             values[f"{name} torque (Nm)"] = row([joint.effort], 2)
             values[f"{name} power (W)"] = row([power], 1)
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)
             values[f"{name} RMS of rated torque (%)"] = row([100.0 * share], 0)
-        warnings = [f"limited by {acting}"] if acting else []
-        if now - safety.ride.ended < RECENT:
-            warnings.append(f"riding through: {safety.ride.why}")
-        hot = [name for name, (_, _, share) in zip(self._names, loads, strict=True) if share > 1.0]
-        if hot:
-            warnings.append(f"above rated torque for too long: {', '.join(hot)}")
-        if odd := loop.bus.boards.odd_temperature:
-            warnings.append(odd)
-        if 0.0 < rate < self._slow:
-            warnings.append(f"slower than {self._slow:.0f} Hz")
-        self._diagnostics.report(*_headline(loop, ", ".join(warnings)), values)
+        self._diagnostics.report(*_headline(loop, ", ".join(warnings.values())), values)
+
+    def _start(self, safety: SafetyMachine, samples: Sequence[JointSample]) -> dict[str, object]:
+        """Return the keys of the present start, and of the last one that was refused."""
+        waiting = safety.waiting_for if safety.state in (State.CHECKING, State.PROVING) else NO_REASON
+        turns = {n: turn for n, turn in turns_back(self._limits, samples).items() if math.isfinite(turn)}
+        pose = [math.degrees(angle) for angle in safety.pose.asked]
+        return {
+            "waiting for": waiting.word,
+            "waiting text": waiting,
+            "refusal": safety.refusal.word,
+            "refusal text": safety.refusal,
+            "joints outside limits": words(*[self._names[n] for n in turns]),
+            "turn back (deg)": words(*map(at_least, turns.values())),
+            POSE_TO_CONFIRM: row(pose, 0) if pose else NO_POSE,
+        }
 
 
 def _headline(loop: ControlLoop, warnings: str) -> tuple[bytes, str]:

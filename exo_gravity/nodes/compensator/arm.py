@@ -21,9 +21,11 @@ from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, Reason, WeighingPhase, words
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare, given_to
@@ -75,12 +77,14 @@ def sentence(s: Settings) -> str:
 
 def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
     """Return what the arm's settings and terms are, for /diagnostics. names: of the joints."""
-    s, terms = control.settings, control.terms
-    most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, ""))
-    values: dict[str, object] = {"law": s.law, "changing load": f"{name}, {most:.1f} Nm to go" if name else "none"}
-    facts = {f"robot {what}": "not known" if known is None else row(known) for what, known in s.robot.facts.items()}
+    s, terms, now = control.settings, control.terms, time.monotonic()
+    most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, NONE))
+    asked, why_not = control.support_request.fresh(now), terms.assist.reason
+    facts = {f"robot {what}": UNKNOWN if known is None else row(known) for what, known in s.robot.facts.items()}
     return {
-        **values,
+        "law": s.law,
+        "changing load": name,
+        "load to change (Nm)": f"{most:.1f}" if answer.remainder else NONE,
         "max effort (Nm)": row(s.max_effort),
         "law in use": "exact" if answer.fallback else s.law,
         "mass carried (kg)": f"{s.mass:.3f}",
@@ -88,15 +92,63 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         "mode": s.mode,
         "support": s.support,
         "support in use": row([s.support_now]),
-        "support request": control.support_request.report(time.monotonic()),
+        "support request": control.support_request.report(now).word,
+        "support requested": NONE if asked is None else row([asked]),
         **facts,
         "wearer mass (kg)": row(s.wearer_mass),
         "wearer cog (m)": row(s.wearer_cog),
         "payload mass (kg)": f"{s.payload_mass:.3f}",
-        "terms": ", ".join(terms.active) or "none",
-        "assist": terms.assist.report,
+        "terms": words(*terms.active),
+        "assist": terms.assist.state,
+        "assist reason": why_not.word,
+        "assist text": why_not,
         "inertia tank (J)": f"{terms.tank.level:.2f}",
     }
+
+
+def weighing_report(weighing: Weighing | None, number: int, refusal: Reason) -> dict[str, object]:
+    """Return the last weighing, for /diagnostics.
+
+    number: of weighings so far. refusal: why the last one that was asked for did not begin.
+    """
+    excess, payload = (weighing.excess, weighing.payload) if weighing else (None, None)
+    mass, band = excess or (None, None)
+    carried, carried_band = payload or (None, None)
+    figures = {
+        "weighing time (s)": (weighing.elapsed if weighing else None, 1),
+        "weighed mass (kg)": (mass, 3),
+        "weighed band (kg)": (band, 3),
+        "weighed payload (kg)": (carried, 3),
+        "weighed payload band (kg)": (carried_band, 3),
+    }
+    return {
+        "weighing": weighing.phase if weighing else WeighingPhase.NONE,
+        "weighing text": weighing.text if weighing else "",
+        "weighing number": number,
+        "weighing trouble": weighing.trouble.word if weighing else NONE,
+        "weigh refused": refusal.word,
+        "weigh refused text": refusal,
+        **{key: NONE if value is None else row([value], digits) for key, (value, digits) in figures.items()},
+    }
+
+
+def warnings_of(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[CompensatorWarning, str]:
+    """Return what `control` works with although it is not as it should be. names: of the joints."""
+    warnings: dict[CompensatorWarning, str] = {}
+    problem = control.terms.problem
+    if answer.held:
+        warnings[CompensatorWarning.LATE_TILT] = answer.held
+    if answer.fallback:
+        replaces = f"the exact law replaces {control.settings.law}: {answer.fallback}"
+        warnings[CompensatorWarning.EXACT_LAW] = replaces
+    if problem:
+        warnings[CompensatorWarning.TERMS_REFUSED] = f"gravity compensation alone: {problem}"
+    if answer.remainder:
+        warnings[CompensatorWarning.CHANGING_LOAD] = "changing load"
+    if answer.clamped:
+        clamped = ", ".join(names[joint] for joint in answer.clamped)
+        warnings[CompensatorWarning.CLAMPED] = f"gravity exceeds max_effort: {clamped}"
+    return warnings
 
 
 def _forget_unused(node: Node, used: set[str]) -> None:
@@ -184,7 +236,7 @@ class MultiArrayInterface(PeriodicThread):
     @property
     def values(self) -> dict[str, object]:
         """What is known of the output, for /diagnostics."""
-        return {"output": self._fade.state, "output fault": self._fade.reason or "none"}
+        return {"output": self._fade.state, "output text": self._fade.reason}
 
     def read(self, message: JointState) -> JointReading:
         """Return positions and velocities of these joints, which may be some of many.

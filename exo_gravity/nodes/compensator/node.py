@@ -25,6 +25,7 @@ from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.compensation.weighing import Weighing, refusal
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
+from exo_gravity.core.vocabulary import NO_REASON, NONE, CompensatorState, Reason, Withdrawal, words
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import (
     JointStateInterface,
@@ -33,6 +34,8 @@ from exo_gravity.nodes.compensator.arm import (
     declared,
     report,
     sentence,
+    warnings_of,
+    weighing_report,
 )
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
@@ -69,17 +72,18 @@ class CompensatorNode(Node):
         settings = read(values)
         self._control = Compensator(settings, self._names)
         self._weighing: Weighing | None = None
+        self._weighings, self._weighing_refusal = 0, NO_REASON
         self._threads: list[PeriodicThread] = []
         self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
-        self._answer = Compensation.withdrawn("")
+        self._answer = Compensation.withdrawn(NO_REASON)
         self._changes: deque[Compensation] = deque(maxlen=MAX_CHANGES)
         self._last_answer = -math.inf
         self._answers = self._rides = 0
         self._rate = Rate()
-        self._refusal = "none"
+        self._refused_topic, self._refusal = NONE, ""
         topic = self._interface.topic
         self._source = Publishers()
         self._sources = {topic: self._source}  # of what the torque depends on
@@ -156,15 +160,16 @@ class CompensatorNode(Node):
             if self._urdf:
                 self._urdf.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
-                answer = Compensation.withdrawn(self._interface.problem)
+                answer = Compensation.withdrawn(Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
                 with self._lock:
                     self._control.applied = message.effort if message.name == self._names else None
                     answer = self._control.step(now, theta, velocity)
         except ParameterError as error:
-            answer = Compensation.withdrawn(self._refused(self._interface.topic, error))
+            refused = self._refused(self._interface.topic, error)
+            answer = Compensation.withdrawn(Reason(Withdrawal.INVALID_JOINT_STATES, refused))
         if problem := second_publisher(self._sources):
-            answer = Compensation.withdrawn(problem)
+            answer = Compensation.withdrawn(Reason(Withdrawal.SECOND_PUBLISHER, problem))
         efforts = self._interface.send(now, message, answer)
         self._answers += answer.effort is not None
         self._rides += bool(answer.held and not self._answer.held)
@@ -199,7 +204,7 @@ class CompensatorNode(Node):
 
     def _refused(self, topic: str, error: ParameterError) -> str:
         """Note an impossible message. Its value goes to /diagnostics only: a hostile sender could fill the log."""
-        self._refusal = f"{topic}: {error}"
+        self._refused_topic, self._refusal = topic, str(error)
         return f"{topic}: {error.name} must be {error.expected}"
 
     def _apply(self, settings: Settings, _changed: set[str]) -> None:
@@ -214,25 +219,32 @@ class CompensatorNode(Node):
         with self._lock:
             problem = refusal(settings, terms.active, rate) or self._control.weigh(weighing)
         if not problem:
-            self._weighing = weighing
-        response.success, response.message = not problem, problem or "relax: `weighing` in /diagnostics has the result"
+            self._weighing, self._weighings = weighing, self._weighings + 1
+        self._weighing_refusal = problem
+        begun = "relax: the keys of /diagnostics have the result, docs/keys.md"
+        response.success, response.message = not problem, str(problem) or begun
         return response
 
     def _values(self, now: float, answer: Compensation) -> dict[str, object]:
+        weighing = weighing_report(self._weighing, self._weighings, self._weighing_refusal)
         return {
+            "reason": answer.reason.word,
+            "reason text": answer.reason,
+            "warnings": words(*warnings_of(self._control, answer, self._names)),
             **self._interface.values,
-            **({"joints taken to be at 0": ", ".join(self._urdf.fixed) or "none"} if self._urdf else {}),
-            "limits acting": ", ".join(f"max_effort ({self._names[joint]})" for joint in answer.clamped) or "none",
+            **({"joints taken to be at 0": words(*self._urdf.fixed)} if self._urdf else {}),
+            "limits acting": words(*[f"max_effort ({self._names[joint]})" for joint in answer.clamped]),
             "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
             "age of joint states (ms)": milliseconds(now - self._last_answer),
             "age of tilt (ms)": milliseconds(self._control.tilt.age(now)),
             "answers": self._answers,
             "rides": self._rides,
             "joint states missed": self._source.missed,
-            "effort (Nm)": row(answer.effort) if answer.effort else "none",
+            "effort (Nm)": row(answer.effort) if answer.effort else NONE,
             **report(self._control, answer, self._names),
-            "weighing": self._weighing.text if self._weighing else "none",
-            "last refused message": self._refusal,
+            **weighing,
+            "refused message": self._refused_topic,
+            "refused message text": self._refusal,
         }
 
     def _report_changes(self) -> None:
@@ -249,26 +261,19 @@ class CompensatorNode(Node):
 
     def _report(self, answer: Compensation) -> None:
         now = time.monotonic()
-        self._diagnostics.report(*self._headline(now, answer), self._values(now, answer))
+        level, state, message = self._headline(now, answer)
+        self._diagnostics.report(level, message, {"state": state, **self._values(now, answer)})
 
-    def _headline(self, now: float, answer: Compensation) -> tuple[bytes, str]:
+    def _headline(self, now: float, answer: Compensation) -> tuple[bytes, CompensatorState, str]:
         if self._interface.problem:
-            return ERROR, self._interface.problem
+            return ERROR, CompensatorState.FAULTED, self._interface.problem
         if now - self._last_answer > SILENCE:
-            return STALE if self._answers else WARN, f"waiting for {self._interface.topic}"
+            level, state = (STALE, CompensatorState.STOPPED) if self._answers else (WARN, CompensatorState.WAITING)
+            return level, state, f"waiting for {self._interface.topic}"
         if answer.effort is None:
-            return ERROR, f"withdrawn: {answer.reason}"
-        warnings = [answer.held] if answer.held else []
-        problem = self._control.terms.problem
-        if answer.fallback:
-            warnings.append(f"the exact law replaces {self._control.settings.law}: {answer.fallback}")
-        elif problem:
-            warnings.append(f"gravity compensation alone: {problem}")
-        elif answer.remainder:
-            warnings.append("changing load")
-        if answer.clamped:
-            warnings.append(f"gravity exceeds max_effort: {', '.join(self._names[joint] for joint in answer.clamped)}")
-        return (WARN, "; ".join(warnings)) if warnings else (OK, "compensating")
+            return ERROR, CompensatorState.WITHDRAWN, f"withdrawn: {answer.reason}"
+        warnings = warnings_of(self._control, answer, self._names).values()
+        return WARN if warnings else OK, CompensatorState.COMPENSATING, "; ".join(warnings) or "compensating"
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.lab.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Statuses, by_name, to_nanoseconds
@@ -90,7 +91,8 @@ class RobotModel(Node):
         problems = [self._problem, *(arm.problem for arm in self._arms.values())]
         problem = next(filter(None, problems), "" if self._arms else "waiting for a compensator")
         level, message = (WARN, problem) if problem else (OK, f"publishing {', '.join(sorted(self._arms))}")
-        self._diagnostics.report(level, message, {"arms": len(self._arms), "shown": len(self._views)})
+        values = {"state": NodeState.WAITING if problem else NodeState.PUBLISHING, "arms": len(self._arms)}
+        self._diagnostics.report(level, message, values | {"shown": len(self._views)})
 
     def _publish_states(self) -> None:
         names = dict(zip(self._described, joint_names(list(self._described.values())), strict=True))

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.vocabulary import INTERFACE
 
 OK, WARN, ERROR, STALE = (getattr(DiagnosticStatus, level) for level in ("OK", "WARN", "ERROR", "STALE"))
 HELD_BY, NOBODY = "control held by", "nobody"  # key in can_bridge's status; value without an operator
@@ -74,12 +75,12 @@ class Diagnostics:
         self._last: tuple[bytes, str] | None = None
         self._sent = -math.inf
 
-    def report(self, level: bytes, message: str, values: Mapping[str, object] | None = None) -> None:
+    def report(self, level: bytes, message: str, values: Mapping[str, object]) -> None:
         """Publish a status if it is due; log its level and message if they changed.
 
         level: OK, WARN, ERROR or STALE.
         message: for people.
-        values: for programs, by key.
+        values: for programs, by key; `state` is among them (docs/keys.md).
         """
         now, changed = time.monotonic(), (level, message) != self._last
         if not changed and now - self._sent < REPEAT_PERIOD:
@@ -90,7 +91,7 @@ class Diagnostics:
             name=self._name,
             message=message,
             hardware_id=self._node.get_namespace().lstrip("/"),
-            values=[KeyValue(key=key, value=str(value)) for key, value in (values or {}).items()],
+            values=[KeyValue(key=key, value=str(value)) for key, value in {"interface": INTERFACE, **values}.items()],
         )
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()

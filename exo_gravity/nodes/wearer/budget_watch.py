@@ -13,6 +13,7 @@ from rclpy.node import Node
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
 from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
@@ -29,13 +30,14 @@ class BudgetWatch:
     """
 
     def __init__(self, node: Node) -> None:
-        self.text = "unknown: waiting for can_bridge's parameters"  #: the result for the settings checked last
+        #: the result for the settings checked last
+        self.result = Reason(Budget.UNKNOWN, "unknown: waiting for can_bridge's parameters")
         #: share 0..1 of the wearer's arm within rated torque everywhere, 0 if none is, 'none' without a wearer
-        self.largest_support = "unknown"
+        self.largest_support = UNKNOWN
         self._logger = node.get_logger()
         self._bridge = NodeParameters(node, "can_bridge", once=True)
         self._request: Request | None = None
-        self._job: Future[tuple[str, str]] | None = None
+        self._job: Future[tuple[Reason, str]] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
 
     def update(self, names: Sequence[str], settings: Settings) -> None:
@@ -46,9 +48,9 @@ class BudgetWatch:
         self._bridge.update()
         if self._job is not None:
             if self._job.done():
-                (self.text, self.largest_support), self._job = self._job.result(), None
-                if self.text != WITHIN:
-                    self._logger.warning(f"{self.text}; efforts stay clamped to max_effort")
+                (self.result, self.largest_support), self._job = self._job.result(), None
+                if self.result.word != Budget.WITHIN_RATED:
+                    self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
         elif self._bridge.values.keys() >= BRIDGE_PARAMETERS:
             request = request_of(settings)
             if request != self._request:
@@ -63,8 +65,8 @@ def request_of(s: Settings) -> Request:
     return s.loaded, (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
 
 
-def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[str, str]:
-    """Return `text` and `largest_support` of `BudgetWatch`.
+def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
+    """Return `result` and `largest_support` of `BudgetWatch`.
 
     names: of the joints (n,).
     bridge: its parameter values.
@@ -75,5 +77,7 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
         rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
         joints = budget(robot, load, support, bounds, rated, peak)
     except ParameterError as error:
-        return f"unknown: can_bridge has {error}", "unknown"
-    return overload(names, joints) or WITHIN, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else "none"
+        return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
+    overloaded = overload(names, joints)
+    result = Reason(Budget.ABOVE_RATED, overloaded) if overloaded else Reason(Budget.WITHIN_RATED, WITHIN)
+    return result, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else NONE

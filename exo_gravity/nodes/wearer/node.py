@@ -28,8 +28,9 @@ from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
+from exo_gravity.core.vocabulary import NO_REASON, NONE, Adapts, NoEstimate, Reason, WearerState
 from exo_gravity.lab.observer.share import PERIOD
-from exo_gravity.lab.observer.watch import WearerWatch
+from exo_gravity.lab.observer.watch import WearerWatch, values_of
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
@@ -100,7 +101,7 @@ class WearerNode(Node):
         # Of the compensator: its parameters, what never changes of them, and why they cannot be used.
         self._settings: Settings | None = None
         self._fixed: tuple[object, ...] = ()
-        self._refusal = ""
+        self._refusal = NO_REASON
         # What is read and reported, once the parameters are known.
         self._names: list[str] = []
         self._joint_states: PolledSubscription | None = None
@@ -109,7 +110,7 @@ class WearerNode(Node):
         self._lock = threading.Lock()  # guards the watch
         self._due = 0.0  # monotonic s
         self._newest: tuple[float, JointState | None] = (-math.inf, None)  # monotonic s of its arrival
-        self._problem = "waiting for joint_states"  # with the newest sample
+        self._problem = NO_REASON  # with the newest sample
         self._last = -math.inf  # monotonic s of the newest sample
         self.create_timer(PARAMETER_PERIOD, self._follow_compensator)
         self.create_timer(REPORT_PERIOD, self._report)
@@ -142,12 +143,14 @@ class WearerNode(Node):
     def _on_parameters(self, _name: str, values: dict[str, Any]) -> None:
         """Use the compensator's parameters, or note why they cannot be used."""
         if values["law"] == URDF_LAW:
-            self._settings, self._refusal = None, f"law {URDF_LAW}: there is no wearer to estimate"
+            no_wearer = f"law {URDF_LAW}: there is no wearer to estimate"
+            self._settings, self._refusal = None, Reason(NoEstimate.NO_WEARER, no_wearer)
             return
         try:
             settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
         except ParameterError as error:
-            self._settings, self._refusal = None, f"the compensator has {error}"
+            self._settings = None
+            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {error}")
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -160,13 +163,13 @@ class WearerNode(Node):
             self._watch = WearerWatch(self._names, settings)
         if fixed != self._fixed:
             refusal = "the compensator has other joints or another trunk than before: restart this node"
-            self._settings, self._refusal = None, refusal
+            self._settings, self._refusal = None, Reason(NoEstimate.REFUSED_PARAMETERS, refusal)
             return
         with self._lock:
             self._watch.apply(settings)
         if self._trunk:
             self._trunk.apply(settings)
-        self._settings, self._refusal = settings, ""
+        self._settings, self._refusal = settings, NO_REASON
 
     def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
         age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
@@ -191,16 +194,17 @@ class WearerNode(Node):
         joints, trunk = self._joints(message), self._trunk_at(taken, settings)
         with self._lock:
             estimate = watch.update(taken, joints, trunk)
-        self._problem = ""
+        self._problem = NO_REASON
         if estimate:
             for publisher, values in ((self._efforts, estimate.torque), (self._deviations, estimate.deviation)):
                 statement = JointState(name=self._names, effort=values)
                 statement.header.stamp = message.header.stamp
                 publisher.publish(statement)
         elif trunk is None:
-            self._problem = "no fresh tilt of the trunk"
+            self._problem = Reason(NoEstimate.NO_TILT, "no fresh tilt of the trunk")
         else:
-            self._problem = "joint_states have no positions, velocities and efforts of these joints"
+            incomplete = "joint_states have no positions, velocities and efforts of these joints"
+            self._problem = Reason(NoEstimate.INCOMPLETE_JOINT_STATES, incomplete)
         self._ask_for_support()
 
     def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
@@ -223,31 +227,35 @@ class WearerNode(Node):
         request.header.stamp = self.get_clock().now().to_msg()
         self._requests.publish(request)
 
-    def _silence(self) -> str:
-        """Return who is silent, '' if the compensator is not."""
+    def _silence(self) -> Reason:
+        """Return who is silent, false if the compensator is not."""
         is_heard = self._statuses.within(COMPENSATOR_SILENCE, self._status_name)
-        return "" if is_heard else f"waiting for {self._status_name}"
+        return NO_REASON if is_heard else Reason(NoEstimate.NO_COMPENSATOR, f"waiting for {self._status_name}")
 
-    def _headline(self, now: float) -> tuple[bytes, str]:
+    def _why_not(self, now: float) -> tuple[bytes, WearerState, Reason]:
+        """Return level, state, and why nothing is estimated."""
         if problem := self._silence() or self._refusal:
-            return WARN, problem
+            return WARN, WearerState.WAITING, problem
         if not self._settings:
-            return WARN, f"waiting for the parameters of {self._status_name}"
+            waiting = f"waiting for the parameters of {self._status_name}"
+            return WARN, WearerState.WAITING, Reason(NoEstimate.NO_PARAMETERS, waiting)
         if now - self._last > SILENCE:
-            return (STALE if math.isfinite(self._last) else WARN), "waiting for joint_states"
-        return (WARN, self._problem) if self._problem else (OK, "estimating the wearer's torque")
+            no_states = Reason(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
+            has_stopped = math.isfinite(self._last)
+            return (STALE, WearerState.STOPPED, no_states) if has_stopped else (WARN, WearerState.WAITING, no_states)
+        return (WARN, WearerState.WAITING, self._problem) if self._problem else (OK, WearerState.ESTIMATING, NO_REASON)
 
     def _report(self) -> None:
-        now = time.monotonic()
-        values: dict[str, object] = {"budget": self._budget.text, "largest support": self._budget.largest_support}
-        is_known = self._settings and not self._silence()
-        if self._watch and is_known:
+        now, budget = time.monotonic(), self._budget
+        level, state, why_not = self._why_not(now)
+        values: dict[str, object] = {"state": state, "reason": why_not.word, "budget": budget.result.word}
+        values |= {"budget text": budget.result, "largest support": budget.largest_support}
+        if self._watch and self._settings and not self._silence():
             with self._lock:
                 values |= self._watch.values(now)
         else:
-            values |= {"wearer (Nm)": "unknown", "share of the wearer (%)": "unknown", "contact": "none"}
-            values["support adapts"] = "off"
-        self._diagnostics.report(*self._headline(now), values)
+            values |= {**values_of(self._names, None, None), "support adapts": Adapts.OFF, "support asked for": NONE}
+        self._diagnostics.report(level, why_not or "estimating the wearer's torque", values)
 
 
 def main() -> None:

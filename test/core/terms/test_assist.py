@@ -211,7 +211,7 @@ def test_with_a_largest_effort_of_zero_efforts_are_ignored():
     loop = OuterLoop()
     loop.input.assist = Assist()
     assert loop.run(2.0) == (0.0,) * 4
-    assert loop.input.report == "off"
+    assert loop.input.state == "off"
 
 
 number = st.one_of(st.floats(-50.0, 50.0), st.sampled_from([math.nan, math.inf]))

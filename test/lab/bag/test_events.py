@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from exo_gravity.lab.bag.content import NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
 
 from ...support import synthetic_bags as made
@@ -55,7 +56,8 @@ def parameter_event(seconds, name, number):
 
 def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
     snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
-    silent = [made.status(seconds, "motor 2 is silent", level=2) for seconds in (3.0, 3.5)]
+    keys = {"fault": "motor_silent", "fault text": "elbow: no reply for 0.05 s"}
+    silent = [made.status(seconds, "motor 2 is silent", level=2, **keys) for seconds in (3.0, 3.5)]
     found = read(
         content, tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
         made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5),
@@ -66,4 +68,9 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content,
         (5.0, "/right/compensator: support = 0.5"),
     ]
     assert found.events[-1].setting == ("/right/compensator", "support", 0.5)
+    statuses = [event.status for event in found.events[:2]]
+    assert statuses == [
+        NodeStatus("right/can_bridge", 2, "motor 2 is silent", *keys.values()),
+        NodeStatus("right/can_bridge", 0, "fine", "none", ""),
+    ]
     assert found.parameters == {"/right/compensator": snapshot}

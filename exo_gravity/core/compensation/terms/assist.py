@@ -18,6 +18,7 @@ from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
 from exo_gravity.core.safety.limits import MAX_COMMAND
+from exo_gravity.core.vocabulary import NO_REASON, AssistProblem, Reason
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class AssistTuning:
 
 
 ASSIST = AssistTuning()
+NOTHING_YET = Reason(AssistProblem.NO_MESSAGES, "no assist_efforts yet")
 
 
 @dataclass(frozen=True)
@@ -48,12 +50,12 @@ class Assist(TermParameters):
 class AssistInput:
     """Follows one stream of efforts. Every time is in s on the caller's monotonic clock.
 
-    reason: why there is no full assistance, or ''.
+    reason: why there is no full assistance.
     """
 
     def __init__(self, names: Sequence[str], assist: Assist | None = None) -> None:
         self.assist = assist or Assist()
-        self.reason = "no assist_efforts yet"
+        self.reason = NOTHING_YET
         self._names = list(names)
         self._target: Torque = (0.0,) * len(self._names)  # the newest efforts
         self._begin = math.inf  # s, since when they are followed
@@ -75,11 +77,6 @@ class AssistInput:
     def idle(self) -> bool:
         """Whether `torque` returns nothing, and will until the next message."""
         return not self.assist.on
-
-    @property
-    def report(self) -> str:
-        """The state, and the reason if there is one."""
-        return f"{self.state}: {self.reason}" if self.state in ("waiting", "refused") else self.state
 
     @property
     def valid(self) -> float:
@@ -106,17 +103,20 @@ class AssistInput:
         self._stamp = stamp
         self._target = tuple(float(efforts[names.index(name)]) for name in self._names)
 
-    def _problem(self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool) -> str:
-        """Return what is wrong with a message, without a measured value; '' if nothing is."""
+    def _problem(
+        self, now: float, names: Sequence[str], efforts: Sequence[float], stamp: float, second: bool
+    ) -> Reason:
+        """Return what is wrong with a message, without a measured value; false if nothing is."""
         if sorted(names) != sorted(self._names) or len(efforts) != len(names):
-            return f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
+            unnamed = f"assist_efforts must name {', '.join(self._names)}, each once, with one effort each"
+            return Reason(AssistProblem.INVALID, unnamed)
         if not all(-MAX_COMMAND <= tau <= MAX_COMMAND for tau in efforts):
-            return f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm"
+            return Reason(AssistProblem.INVALID, f"assist_efforts must be numbers within {MAX_COMMAND:g} Nm")
         if second:
-            return "more than one publisher of assist_efforts"
+            return Reason(AssistProblem.SECOND_PUBLISHER, "more than one publisher of assist_efforts")
         if not now - self.valid <= stamp <= now + ASSIST.max_lead:
-            return "assist_efforts are late by their stamp, or their clock differs"
-        return ""
+            return Reason(AssistProblem.LATE, "assist_efforts are late by their stamp, or their clock differs")
+        return NO_REASON
 
     def torque(self, now: float) -> Torque:
         """Return the torque (n,) in Nm at `now`; call it in every cycle."""
@@ -130,9 +130,10 @@ class AssistInput:
         if now - self._refused < ASSIST.recovery:
             return False  # `reason` says what was wrong
         if not self.assist.on:
-            self.reason = "assist.max_effort is 0"
+            self.reason = Reason(AssistProblem.OFF, "assist.max_effort is 0")
         elif now - self._stamp > self.valid:
-            self.reason = "no assist_efforts yet" if self._stamp == -math.inf else "assist_efforts stopped"
+            stopped = Reason(AssistProblem.STOPPED, "assist_efforts stopped")
+            self.reason = NOTHING_YET if self._stamp == -math.inf else stopped
         else:
-            self.reason = ""
+            self.reason = NO_REASON
         return not self.reason

@@ -1,0 +1,287 @@
+"""The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
+
+Each word stands here once; the states and the fault codes of an arm are in core/safety/drive.py. A `Reason` is a
+sentence together with its word, so that what decides on a torque tells both at once.
+"""
+
+from enum import Enum
+
+INTERFACE = 1  # the version of the keys and words: docs/stability.md
+NONE, UNKNOWN = "none", "unknown"  # nothing to tell; something that the node does not know
+TEXT = " text"  # a key that ends so has a sentence, which no program may read
+
+
+class Word(str, Enum):
+    """A word of one key. As text it is the word itself."""
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+class Reason(str):
+    """A sentence for people, and its word for programs. It is false where there is nothing to tell."""
+
+    word: str
+
+    def __new__(cls, word: str, sentence: str) -> "Reason":
+        """Create a reason from its word and its sentence."""
+        reason = super().__new__(cls, sentence)
+        reason.word = str(word)
+        return reason
+
+    def __getnewargs__(self) -> tuple[str, str]:  # type: ignore[override]
+        """Return what a copy is made of."""
+        return self.word, str(self)
+
+
+NO_REASON = Reason(NONE, "")
+
+
+# can_bridge
+
+
+INACTIVE = "inactive"  # `state` while the lifecycle node is not active
+
+
+class Source(Word):
+    """Where the readings of an arm come from."""
+
+    SIMULATED = "simulated"
+    REAL = "real"
+    UNKNOWN = "unknown"
+
+
+class Motors(Word):
+    """Whether motors of an arm may be on."""
+
+    OFF = "off"
+    ON = "on"
+    UNREACHED = "unreached"
+
+
+class Wait(Word):
+    """What a start waits for, or why it ended; also the code of a fault that is waited out."""
+
+    REPLIES = "replies"
+    WATCHDOG = "watchdog"
+    BOARD_SETUP = "board_setup"
+    JOINT_LIMITS = "joint_limits"
+    REST = "rest"
+    EFFORTS = "efforts"
+    MOTORS_OFF = "motors_off"
+    POSE = "pose"
+    CALM = "calm"
+    HOLD_STILL = "hold_still"
+    MOTOR_ON = "motor_on"  #: not waited for: it ended the start
+
+
+class Resume(Word):
+    """Whether an arm can be carried on after its fault."""
+
+    POSSIBLE = "possible"
+    NO_FAULT = "no_fault"
+    HAS_CAUSE = "has_cause"
+    ZEROS_UNSURE = "zeros_unsure"
+
+
+class Answer(Word):
+    """How a request to an arm ended."""
+
+    NONE = "none"
+    DONE = "done"
+    REFUSED = "refused"
+    INACTIVE = "inactive"
+    LEAVING = "leaving"
+    TOO_OLD = "too_old"
+    OVERTAKEN = "overtaken"
+    BUS_ERROR = "bus_error"
+    NO_RESPONSE = "no_response"
+
+
+class BridgeWarning(Word):
+    """What a bridge works with although it is not as it should be."""
+
+    LIMITED = "limited"
+    LATE_EFFORTS = "late_efforts"
+    ABOVE_RATED_TORQUE = "above_rated_torque"
+    ODD_TEMPERATURE = "odd_temperature"
+    SLOW_LOOP = "slow_loop"
+
+
+class RefusedEfforts(Word):
+    """Why an effort command was refused."""
+
+    SECOND_PUBLISHER = "second_publisher"
+    UNKNOWN_STAMP = "unknown_stamp"
+    INVALID = "invalid"
+
+
+# compensator
+
+
+class CompensatorState(Word):
+    """What a compensator does."""
+
+    WAITING = "waiting"
+    COMPENSATING = "compensating"
+    WITHDRAWN = "withdrawn"
+    STOPPED = "stopped"
+    FAULTED = "faulted"
+
+
+class Withdrawal(Word):
+    """Why a compensator has no efforts."""
+
+    NO_TILT = "no_tilt"
+    LATE_TILT = "late_tilt"
+    LATE_TILT_STAMP = "late_tilt_stamp"
+    REFUSED_TILT = "refused_tilt"
+    INVALID_JOINT_STATES = "invalid_joint_states"
+    IMPOSSIBLE_ANGLES = "impossible_angles"
+    LAW_NOT_FINITE = "law_not_finite"
+    SECOND_PUBLISHER = "second_publisher"
+    OUTPUT_FAULT = "output_fault"
+
+
+class CompensatorWarning(Word):
+    """What a compensator works with although it is not as it should be."""
+
+    LATE_TILT = "late_tilt"
+    EXACT_LAW = "exact_law"
+    TERMS_REFUSED = "terms_refused"
+    CHANGING_LOAD = "changing_load"
+    CLAMPED = "clamped"
+
+
+class AssistProblem(Word):
+    """Why the efforts of the outer loop are not used, or not in full."""
+
+    OFF = "off"
+    NO_MESSAGES = "no_messages"
+    STOPPED = "stopped"
+    INVALID = "invalid"
+    SECOND_PUBLISHER = "second_publisher"
+    LATE = "late"
+
+
+class SupportRequested(Word):
+    """What a compensator makes of requests for support."""
+
+    NONE = "none"
+    FRESH = "fresh"
+    SECOND_PUBLISHER = "second_publisher"
+    INVALID = "invalid"
+    LATE = "late"
+
+
+class WeighingPhase(Word):
+    """How far a weighing is."""
+
+    NONE = "none"
+    TAKING_OVER = "taking_over"
+    SWEEPING = "sweeping"
+    DONE = "done"
+    FAILED = "failed"
+
+
+class WeighingRefused(Word):
+    """Why a weighing does not begin."""
+
+    TERMS = "terms"
+    SUPPORT = "support"
+    SLOW = "slow"
+    UNDER_WAY = "under_way"
+    CHANGING_LOAD = "changing_load"
+    NO_HAND = "no_hand"
+
+
+class WeighingTrouble(Word):
+    """Why a weighing has no result."""
+
+    HANGS_DOWN = "hangs_down"
+    MOVES = "moves"
+    SETTINGS_CHANGED = "settings_changed"
+    NO_JOINT_STATES = "no_joint_states"
+    MOVED_AWAY = "moved_away"
+    HAND_ON_ARM = "hand_on_arm"
+    TOO_HEAVY = "too_heavy"
+    RESTLESS = "restless"
+    NOT_FOLLOWED = "not_followed"
+    NO_LOAD = "no_load"
+
+
+# wearer
+
+
+class WearerState(Word):
+    """What the estimate of the wearer's torque does."""
+
+    WAITING = "waiting"
+    STOPPED = "stopped"
+    ESTIMATING = "estimating"
+
+
+class NoEstimate(Word):
+    """Why the wearer's torque is not estimated."""
+
+    NO_COMPENSATOR = "no_compensator"
+    NO_PARAMETERS = "no_parameters"
+    REFUSED_PARAMETERS = "refused_parameters"
+    NO_WEARER = "no_wearer"
+    NO_JOINT_STATES = "no_joint_states"
+    INCOMPLETE_JOINT_STATES = "incomplete_joint_states"
+    NO_TILT = "no_tilt"
+
+
+class Budget(Word):
+    """Whether the motors hold an arm in every pose."""
+
+    WITHIN_RATED = "within_rated"
+    ABOVE_RATED = "above_rated"
+    UNKNOWN = "unknown"
+
+
+class Adapts(Word):
+    """Whether the support adapts."""
+
+    OFF = "off"
+    ON = "on"
+    HELD = "held"
+
+
+# imu and the other nodes
+
+
+class ImuState(Word):
+    """What the node `imu` does."""
+
+    WAITING = "waiting"
+    PUBLISHING = "publishing"
+    SETTLING = "settling"
+    STOPPED = "stopped"
+    REFUSING = "refusing"
+    SECOND_PUBLISHER = "second_publisher"
+    NO_DEVICE = "no_device"
+
+
+class NodeState(Word):
+    """What a node beside the path does."""
+
+    WAITING = "waiting"
+    RUNNING = "running"
+    PUBLISHING = "publishing"
+    MEASURING = "measuring"
+    WITHDRAWN = "withdrawn"
+    DONE = "done"
+
+
+class SimulatorWarning(Word):
+    """What makes a simulated arm differ from a sound real one."""
+
+    STALLED = "stalled"
+    DISCONNECTED = "disconnected"
+
+
+def words(*found: object) -> str:
+    """Return words, names or reasons as one value: separated by commas, `none` for none."""
+    return ", ".join(map(str, found)) or NONE
