@@ -143,7 +143,9 @@ class TrunkEstimator:
         """Why there is no orientation yet; empty once there is."""
         if self._agreement.is_suspect:
             return f"until its measurements agree on a turn of the trunk; {self._why}"
-        return "" if self._uncertainty.sigma <= MODEL.limit else self._why
+        if self._uncertainty.sigma <= MODEL.limit:
+            return ""
+        return "gyroscope and accelerometer show different turns" if self._agreement.contradiction else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.

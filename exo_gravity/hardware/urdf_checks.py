@@ -34,7 +34,7 @@ class UrdfLimits:
     share: float = 0.03  #: of the arm's largest torque, by which what is not known may change a torque
     poses: int = 100  #: that are tried
     gyration: float = 0.3  #: m, radius of gyration of a link about its own joint that no link of an arm has
-    strong: float = 20.0  #: times gravity's largest torque: an effort limit that limits nothing
+    strong: float = 50.0  #: times gravity's largest torque: an effort limit that limits nothing, also of a worn arm
     weak: float = 0.5  #: share of gravity's largest torque at the joint, which an effort limit must reach
 
 
@@ -177,7 +177,9 @@ class UrdfJoints:
 
     def _placed(self, positions: np.ndarray, at: Sequence[float] | np.ndarray = ()) -> np.ndarray:
         """Return the configuration for the positions of the arm's joints and, `at`, of the others."""
-        moved = self._coupling @ np.concatenate((positions, at)) + self._offset
+        moved: np.ndarray = self._coupling @ np.concatenate((positions, at)) + self._offset
+        if self.model.nq == self.model.nv:  # no continuous joint, which has two numbers in a configuration
+            return moved
         return np.asarray(self._pin.integrate(self.model, self._neutral, moved))
 
     def _torque(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:

@@ -82,8 +82,11 @@ def test_without_a_gyroscope_an_orientation_that_never_turns_is_refused_in_the_b
     assert np.nanmax(outcome.errors) < 6.0 and np.isnan(outcome.errors[motion.times > BOW[1]]).all()
 
 
-def test_without_a_gyroscope_a_filters_orientation_is_followed() -> None:
-    motion = by_vqf(worn(day(4, 20.0), 30.0, 100.0, 4))
+def test_without_a_gyroscope_a_filters_orientation_is_followed_however_the_imu_is_mounted() -> None:
+    motion = worn(day(4, 20.0), 30.0, 100.0, 4)
+    turn = Rotation.from_euler("xyz", (1.0, -2.0, 0.5))
+    vectors = ("gyroscope", "accelerometer", "gravity")
+    motion = by_vqf(replace(motion, **{name: turn.apply(getattr(motion, name)) for name in vectors}))
     outcome = follow(replace(motion, gyroscope=np.zeros_like(motion.gyroscope)))
     assert not any(outcome.refusals) and np.isfinite(outcome.errors[motion.times > SETTLED]).all()
 

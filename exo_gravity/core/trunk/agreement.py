@@ -240,15 +240,16 @@ class ConstantOrientation:
     """An orientation that stays exactly the same while gravity turns by the accelerometer is filled in."""
 
     limits = ConstantLimits()
-    _up = ZERO  # since it last changed
-    _force = _first = UPWARD  # the acceleration now and when it last changed
+    _up: Floats3 | None = None  # since it last changed
+    _force = _first = ZERO  # the acceleration now and when it last changed, in 1 g
     _since = 0.0  # s
 
     def check(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
         """Take the orientation at the end of the next `dt` s; the rest is as for `Agreement`. Raises Contradiction."""
-        limits, change = self.limits, plus(acceleration, self._force, -1.0)
-        self._force = plus(self._force, change, min(1.0, dt / limits.smooth_time))
-        if math.dist(up, self._up) > limits.same:
+        limits = self.limits
+        share = 1.0 if self._up is None else min(1.0, dt / limits.smooth_time)
+        self._force = plus(self._force, plus(acceleration, self._force, -1.0), share)
+        if self._up is None or math.dist(up, self._up) > limits.same:
             self._up, self._first, self._since = up, self._force, 0.0
             return
         self._since += dt

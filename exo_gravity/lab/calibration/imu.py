@@ -249,8 +249,9 @@ def check_as_imu(record: ImuRecord, phases: Sequence[Phase], found: Mounting, va
         answer = None
         try:
             answer = estimator.update(ImuSample(*row))
+            problem = "" if answer else problem
         except ParameterError as error:
-            problem = f"{error.name} must be {error.expected}"
+            problem = problem or f"{error.name} must be {error.expected}"  # the first since the last tilt
         if k not in ends or record.time[k] < SETTLED:
             continue
         if answer is None:
