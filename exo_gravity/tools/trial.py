@@ -45,6 +45,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
     folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
     guided = options.attach == "guided" if options.attach else is_guided(params)
+    if not options.attach:
+        check_bridges(params)
     trial = Trial(path, script, None if options.attach else params, guided, session, folder)
     tell: Callable[..., None] = _print_json if options.attach else lambda **values: None
     stopped = stop_on_signals()
@@ -55,8 +57,6 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
             from exo_gravity.lab.trial.from_file import record_offline
         end = record_offline(trial, console, stopped.is_set)
     else:
-        if trial.params:
-            check_bridges(trial.params)
         trial.prepare()
         tell(folder=str(folder))
         end = run_attempts(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))

@@ -211,6 +211,17 @@ def test_a_trial_ends_by_keys_whatever_the_sentences_say(name):
     assert (NO_SENTENCE if why == MOTOR else why) in screen.end_of_trial(exit_code)
 
 
+@pytest.mark.parametrize("guided", [False, True])
+def test_a_start_that_has_ended_ends_a_trial_unless_a_person_may_start_it_again(guided):
+    screen = Screen(guided=guided, lead=LEAD if guided else None)
+    refused = {**status("disabled", 1, message=NO_SENTENCE), "refusal": "joint_limits"}
+    screen.at(0.0, bridge=refused)
+    stopped = threading.Event()
+    threading.Timer(0.2, stopped.set).start()
+    found = follow(screen, stopped, lambda: None, Future())
+    assert found == ("stopped by the operator" if guided else f"right/can_bridge: {NO_SENTENCE}")
+
+
 def test_a_trial_on_running_nodes_ends_after_a_few_seconds_without_a_bridge():
     screen = Screen(bridges=())
     line = {"right": {"position": [0.0] * 4, "effort": [0.0] * 4}, "status": {"right/compensator": ACTIVE}}

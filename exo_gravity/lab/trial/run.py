@@ -23,6 +23,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import Launcher, Stopping
 from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
@@ -58,9 +59,10 @@ def is_guided(params: Path) -> bool:
 
 
 def check_bridges(params: Path) -> None:
-    """Raise ParameterError if no node of the parameter file carries an arm: a trial would wait for it in vain."""
-    if not stages(load(params))[0]:
-        expected = "a file with a can_bridge, which carries the arm: a trial begins once it is active"
+    """Raise ParameterError unless the parameter file has a can_bridge: a trial follows the arm that it carries."""
+    nodes = load(params)
+    if not stages(nodes)[0]:
+        expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
         raise ParameterError("params", str(params), expected)
 
 
@@ -174,7 +176,7 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
             return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
         if screen.has_no_bridge:
             return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
-        if message := fault_of(screen.status)[1]:
+        if message := fault_of(screen.status)[1] or ("" if screen.guided else refusal_of(screen.status)):
             return message
         if screen.done:
             stopped.wait(GRACE)
@@ -194,9 +196,15 @@ def is_falling(status: Status) -> bool:
 def fault_of(status: Status) -> tuple[str, str]:
     """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
     for name, values in status.items():
-        if values.get("fault", "none") != "none":
+        if values.get("fault", NONE) != NONE:
             return str(values["fault"]), f"{name}: {values['message']}"
     return "", ""
+
+
+def refusal_of(status: Status) -> str:
+    """Return the message of a bridge whose start has ended without a fault, or '': only a person starts it again."""
+    ended = (name for name, values in status.items() if values.get("refusal", NONE) != NONE)
+    return next((f"{name}: {status[name]['message']}" for name in ended), "")
 
 
 def too_busy(status: Status) -> str:
