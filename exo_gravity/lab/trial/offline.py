@@ -115,7 +115,7 @@ class OfflineTrial:
         """Give the samples to the compensator, and record them with the efforts that they follow."""
         effort = self._controller.efforts(now).effort
         if not any(self.arm.limits.is_silent(now, sample) for sample in samples):
-            position, velocity, measured, *_, times = zip(*samples, strict=True)
+            position, velocity, measured, _, _, times, *_ = zip(*samples, strict=True)
             for values in ((min(times),), position, velocity, measured, effort or NO_EFFORT):
                 self._rows.extend(values)
         self._controller.take(now, samples)
