@@ -86,6 +86,7 @@ class TurnLimits:
     shown: float = 2.0  #: and at most this many times the change of the acceleration, which a swing shows, too
     steady_time: float = 0.3  #: s over which the acceleration is averaged, from which its change is taken
     shown_time: float = 0.5  #: s for which such a change counts
+    start_time: float = 2.0  #: s from the start on in which no swing is taken for an explanation
     velocity: float = 0.009  #: s 1 g, that a movement may add beyond this; at most 0.0082 in 30 of 32 random days
     notice: float = 0.0003  #: s 1 g, from which on the whole difference counts as uncertainty
     memory: float = 2.0  #: s, after which differences are forgotten
@@ -151,7 +152,9 @@ class Turns:
     ) -> None:
         """Compare a clear turn, `size` of `turned`, with the accelerometer's, which differs by `difference`."""
         limits = self.limits
-        explained = min(limits.most, limits.lever * swing, limits.shown * self._shown)
+        explained = 0.0  # before and just after the first tilt nothing is lost by a refusal
+        if self._age > limits.start_time:
+            explained = min(limits.most, limits.lever * swing, limits.shown * self._shown)
         excess = difference - limits.unlike * size - explained - unmeasured
         if difference < limits.alike * size:
             self._agreed += dt
