@@ -21,7 +21,7 @@ COPY package.xml src/exo_gravity/package.xml
 RUN apt-get update \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src --rosdistro jazzy --default-yes --dependency-types exec \
-    && apt-get install --yes --no-install-recommends python3-matplotlib python3-pip python3-scipy \
+    && apt-get install --yes --no-install-recommends python3-pip \
     && rm -rf /var/lib/apt/lists/*
 
 # From PyPI: the simulator, the reports, the operator's page, orientation filter and I2C. NumPy stays
@@ -29,7 +29,7 @@ RUN apt-get update \
 COPY .ci/constraints/ros.txt constraints.txt
 RUN python3 -m pip install --no-cache-dir --break-system-packages --constraint constraints.txt \
     adafruit-circuitpython-icm20x adafruit-circuitpython-lsm6ds adafruit-circuitpython-mpu6050 adafruit-extended-bus \
-    mcap mujoco rich rosbags starlette uvicorn vqf websockets
+    mcap mujoco rosbags starlette uvicorn vqf websockets
 
 COPY . src/exo_gravity
 RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select exo_gravity

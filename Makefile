@@ -45,7 +45,7 @@ faults:  # the whole fault matrix on the simulated device, 40 minutes; a table a
 	@$(SETUP) @test
 	$(BIN)/python -m test.faults.run
 
-bench:  # the laws, the loop and the tools against peers, 15 minutes on a quiet machine; QUICK=1: part of it
+bench:  # the laws, the loop and the tools against peers, 20 minutes on a quiet machine; QUICK=1: part of it
 	@$(SETUP) @test
 	$(BIN)/python -m bench $(if $(QUICK),--quick)
 

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 from setuptools import find_packages, setup
 
 package_name = "exo_gravity"
-here = Path(__file__).parent
+here = Path(__file__).resolve().parent  # `colcon build --symlink-install` runs a link to this file
 # The version, the description and the maintainer are those of package.xml, and nowhere else.
 declared = ElementTree.parse(here / "package.xml").getroot()
 # The one list of executables. The launcher reads the nodes from the entry points. A large node is a folder.
@@ -56,6 +56,7 @@ extras = {
         "zstandard>=0.22",
     ],
     "analysis": ["pandas>=2.1"],  # Bag.to_frame
+    "cluster": ["dask[distributed]>=2024.5"],  # report --scheduler
     "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
     "validate": [
         "imufusion>=1.3",
@@ -109,6 +110,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", glob("config/*.yaml")),
+        (f"share/{package_name}/config/arms", glob("config/arms/*.urdf")),
         (f"share/{package_name}/config/trials", glob("config/trials/*.yaml")),
         (f"share/{package_name}/config/sros2", glob("config/sros2/*.xml")),
         (f"share/{package_name}/config/rviz", glob("config/rviz/*.rviz")),

@@ -30,23 +30,27 @@ from test.support.document_commands import DOCUMENTS, ROS2, commands_of  # noqa:
 
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|lab|panel|nodes|tools|.ci|.github"
 CORE_ENTRIES = 12  # at most, in the first floor of core
+COPYRIGHT = "# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0"
 PACKAGE = ElementTree.parse(ROOT / "package.xml").getroot()
 # Keys of rosdep's python.yaml that install Ubuntu's packages, each with the module it provides.
 ROSDEP = {
     "can": "python3-can",
     "hypothesis": "python3-hypothesis",
+    "matplotlib": "python3-matplotlib",
     "numpy": "python3-numpy",
     "pytest": "python3-pytest",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
     "serial": "python3-serial",
     "yaml": "python3-yaml",
 }
 # Needed although no module imports them: by python-can's udp_multicast, the launch files.
-INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch", "rviz2"}
+INDIRECT = {"python3-msgpack", "robot_state_publisher", "ros2launch"}
 # From PyPI alone, by an extra of setup.py; a tool that misses one names it.
 FROM_PYPI = {
-    "PIL", "axe_playwright_python", "httpx", "imageio", "imufusion", "lz4", "matplotlib", "mcap", "mcap_ros2",
-    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "rich", "roboticstoolbox", "rosbags", "rtbdata",
-    "scipy", "sklearn",
+    "PIL", "axe_playwright_python", "distributed", "httpx", "imageio", "imufusion", "lz4", "mcap", "mcap_ros2",
+    "mpl_toolkits", "mujoco", "pandas", "pinocchio", "playwright", "roboticstoolbox", "rosbags", "rtbdata",
+    "sklearn",
     "adafruit_extended_bus", "adafruit_icm20x", "adafruit_lsm6ds", "adafruit_mpu6050", "spatialmath", "starlette",
     "threadpoolctl", "uvicorn", "vqf", "websockets", "zstandard",
 }  # fmt: skip
@@ -97,7 +101,7 @@ def generated_tables() -> Iterator[str]:
         places |= {found[2] for found in tables.TABLE.finditer(document)}
         for table in tables.stale_tables(document):
             yield f"{path.relative_to(ROOT)}: table {table} differs from the code; run {tables.COMMAND}"
-    if missing := {*tables.PARAMETERS, "faults", "firmwares", "topics"} - places:
+    if missing := {*tables.PARAMETERS, "faults", "firmwares", "motors", "topics"} - places:
         yield f"no document has a place for the tables {', '.join(sorted(missing))}"
     if text_of(states.PICTURE) != states.drawing():
         yield "docs/states.svg differs from the transitions; run python docs/states.py"
@@ -166,6 +170,16 @@ def modules() -> Iterator[str]:
         yield f"exo_gravity/core has more than {CORE_ENTRIES} entries"
 
 
+def copyright_lines() -> Iterator[str]:
+    """Yield each source file without the copyright line near its top."""
+    tracked = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for path in filter(lambda path: (ROOT / path).is_file(), tracked.splitlines()):
+        with (ROOT / path).open("rb") as file:
+            first = [next(file, b"").decode(errors="replace").rstrip() for _ in range(2)]
+        if (path.endswith(".py") or re.match(r"#!.*\b(ba|da)?sh\b", first[0])) and COPYRIGHT not in first:
+            yield f"{path}: no copyright line; run .ci/headers"
+
+
 def package_xml() -> Iterator[str]:
     """Yield each dependency that package.xml misses, or names without need."""
 
@@ -230,6 +244,7 @@ RULES = (
     safety_case,
     troubleshooting,
     modules,
+    copyright_lines,
     package_xml,
     release_files,
 )

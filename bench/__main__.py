@@ -1,12 +1,14 @@
-"""python -m bench [--quick] [--only law,loop,work] [--output build/bench.json]: print one table and write it as JSON.
+"""python -m bench [--quick] [--only PARTS] [--output build/bench.json]: print one table and write it as JSON.
 
-It takes 15 minutes on two quiet cores. A disturbed run is repeated once, and then says so.
+PARTS are some of law,loop,work,recordings,starts. It takes 20 minutes on two quiet cores. A disturbed run is repeated
+once, and then says so.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -16,15 +18,26 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 from .laws import measure_laws
 from .loops import measure_loops
+from .recordings import measure_recordings
+from .starts import measure_starts
 from .table import Row, save, show
 from .work import measure_work
+
+Progress = Callable[[str], None]
+PARTS: dict[str, Callable[[bool, Progress], Iterator[Row]]] = {
+    "law": lambda quick, progress: measure_laws(quick),
+    "loop": measure_loops,
+    "work": lambda quick, progress: measure_work(quick),
+    "recordings": lambda quick, progress: measure_recordings(quick),
+    "starts": lambda quick, progress: measure_starts(quick),
+}
 
 
 def main() -> None:
     """Run the chosen parts."""
     parser = argparse.ArgumentParser(prog="bench", description="Measure the laws, the loop and the tools.")
     parser.add_argument("--quick", action="store_true", help="fewer rates and shorter runs, for development")
-    parser.add_argument("--only", default="law,loop,work", metavar="PARTS", help="parts to run (%(default)s)")
+    parser.add_argument("--only", default=",".join(PARTS), metavar="PARTS", help="parts to run (%(default)s)")
     parser.add_argument("--output", type=Path, default=Path("build/bench.json"), metavar="FILE", help="(%(default)s)")
     options = parser.parse_args()
     console = Console(width=None if Console().is_terminal else 150, highlight=False)
@@ -36,14 +49,9 @@ def main() -> None:
             if not console.is_terminal:
                 console.print(text)
 
-        parts = {
-            "law": lambda: measure_laws(options.quick),
-            "loop": lambda: measure_loops(options.quick, progress),
-            "work": lambda: measure_work(options.quick),
-        }
         for part in options.only.split(","):
             progress(part)
-            for row in parts[part]():
+            for row in PARTS[part](options.quick, progress):
                 rows.append(row)
                 save(rows, options.output)  # an interrupted run keeps its figures
     show(rows, console)

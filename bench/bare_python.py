@@ -13,7 +13,7 @@ import time
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.clock import favour
 
@@ -35,7 +35,7 @@ def main() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NO_TORQUE
-        send = switching.step() if all_replied else OFF.send
+        send = switching.step() if all_replied else (Send.POLL,) * len(bus.replies)
         bus.exchange(Drive(effort, NO_TORQUE, send, all_replied), now + REPLY_SHARE * period)
 
     try:

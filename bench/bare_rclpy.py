@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import OFF, Drive
+from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine
@@ -46,7 +46,12 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
 
     def cycle() -> None:
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        drive = Drive(newest["effort"], NO_TORQUE, switching.step() if all_replied else OFF.send, all_replied)
+        drive = Drive(
+            newest["effort"],
+            NO_TORQUE,
+            switching.step() if all_replied else (Send.POLL,) * len(bus.replies),
+            all_replied,
+        )
         bus.exchange(drive, time.monotonic() + REPLY_SHARE * period)
         if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)

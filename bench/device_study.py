@@ -24,10 +24,12 @@ def as_markdown(rows: Sequence[Row]) -> str:
 
 
 def options_of(program: str, description: str, output: Path) -> argparse.Namespace:
-    """Return `devices`, `first` and `output` of the command line; output: without its suffix."""
+    """Return `seeds` and `output` of the command line; output: without its suffix."""
     parser = argparse.ArgumentParser(prog=program, description=description)
     option = parser.add_argument
     option("--devices", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
     option("--first", type=int, default=0, metavar="SEED", help="of the first one (default: %(default)s)")
     option("--output", type=Path, default=output, metavar="FILE", help="(default: %(default)s)")
-    return parser.parse_args()
+    options = parser.parse_args()
+    options.seeds = range(options.first, options.first + options.devices)
+    return options

@@ -12,7 +12,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.lab.inputs.arms import read_arm
+from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 
@@ -24,18 +24,18 @@ class DirectArm:
 
     def __init__(self, params: str | Path, namespace: str) -> None:
         nodes = load(params)
-        arm = read_arm(nodes, namespace)
-        self.joint_names = arm.joint_names
+        arm = carried_arm(nodes, namespace)
+        self.joint_names = arm.limits.joint_names
         self.motors = arm.motors
         self.interface, self.channel = str(arm.can_bridge["can.interface"]), str(arm.can_bridge["can.channel"])
         self.options = can_options(nodes[f"{namespace}/can_bridge"])
         address = self.interface, self.channel, self.options
         self._on_bus = ArmOnBus(address, arm.motors, arm.limits, 1.0 / arm.can_bridge["rate"])
-        settings = arm.settings()
+        settings = arm.settings
         self._law, self._tilt = settings.chosen, Tilt.of(settings.side)
 
     def law(self, theta: Sequence[float]) -> Torque:
-        """Return the torque (4,) in Nm for joint angles (4,) in rad."""
+        """Return the torque (n,) in Nm for joint angles (n,) in rad."""
         return self._law.torque(theta, self._tilt)
 
     def open(self) -> MotorBus:

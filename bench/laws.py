@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.params import values_of
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
-from .table import Row, race
+from .table import Row, race, range_of
 
 POSES = 100_000
 LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
@@ -51,11 +52,26 @@ def measure_laws(quick: bool) -> Iterator[Row]:
         for pose in poses[: LOOP // 100]:
             robot.gravload(pose)
 
-    ours, pinocchio, toolbox = race(
-        ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (toolbox_loop, 1)), blocks
+    pool, columns = pin.ModelPool(model, 1), np.asfortranarray(poses.T)
+    still = np.zeros_like(columns)
+
+    def compiled_loop() -> Any:
+        return pin.rneaInParallel(1, pool, columns, still, still)
+
+    np.testing.assert_allclose(gravity_torque(arm, poses), compiled_loop().T, atol=1e-12)
+    ours, pinocchio, compiled, toolbox = race(
+        ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (compiled_loop, 1), (toolbox_loop, 1)), blocks
     )
     each, spread = ours.median / POSES * 1e6, ours.text(1e6 / POSES)
     yield Row("law, 100,000 poses, per pose: Pinocchio in a loop", each, pinocchio.median / LOOP * 1e6, "us", spread)
+    ratios = [one / other for one, other in zip(ours.blocks, compiled.blocks, strict=True)]
+    yield Row(
+        "law, 100,000 poses, per pose: Pinocchio's compiled loop, one thread",
+        each,
+        compiled.median / POSES * 1e6,
+        "us",
+        f"{spread}, x{range_of(ratios)}",
+    )
     yield Row(
         "law, 100,000 poses, per pose: Robotics Toolbox in a loop",
         each,

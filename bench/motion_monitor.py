@@ -29,8 +29,8 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import Limits
@@ -41,6 +41,8 @@ from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
 from exo_gravity.sim.virtual_wearer import path_between
+
+from .parts import play
 
 RATE = 100.0  # Hz
 MOTOR_NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
@@ -269,7 +271,8 @@ class Lively(Compensator):
 def settings_of(body_mass: float = 0.0, **changes: Any) -> Settings:
     """Return the compensator's settings: One-G, or Zero-G for a wearer of `body_mass` kg."""
     load = Wearer(body_mass or BODY_MASS).on_links(LENGTH)
-    worn = {"mode": "zero_g", "wearer_mass": tuple(load.mass), "wearer_cog": tuple(load.cog)} if body_mass else {}
+    load_of_wearer = {"wearer_mass": tuple(load.mass), "wearer_cog": tuple(load.cog)}
+    worn = {"mode": "zero_g", "support": 1.0, **load_of_wearer} if body_mass else {}
     return replace(Settings("right", ROBOT), **{**worn, **changes})
 
 
@@ -338,6 +341,13 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
     yield "Zero-G, 75 kg", Compensator(full), moment, NO_TORQUE
     yield "with changes of load", Lively(full, (half, settings_of())), moment, NO_TORQUE
     yield "with all terms, assistance, `inertial`", everything, moment, addition
+
+
+def used(part: tuple[int, float, int]) -> Quiet:
+    """Return what `quiet` sees. part: the number of a compensator among `sound`, for how many s, the seed."""
+    number, duration, seed = part
+    _, compensator, moment, addition = list(sound())[number]
+    return quiet(compensator, duration, seed, moment, addition)
 
 
 class Caught(NamedTuple):
@@ -450,8 +460,10 @@ def main() -> int:
             f"| {name} | {seen.fault or 'none'} | {seen.time:.2f} | {seen.until:.2f} | {seen.speed:.2f} | {without} |",
             flush=True,
         )
-    for seed, (name, compensator, moment, addition) in enumerate(sound(), arguments.seed):
-        run = quiet(compensator, 900.0 * arguments.hours, seed, moment, addition)
+    names = [name for name, *_ in sound()]
+    parts = [(number, 900.0 * arguments.hours, arguments.seed + number) for number in range(len(names))]
+    runs = play("motion-monitor", used, parts, lambda run: run.trouble or f"{run.duration:.0f} s, quiet")
+    for name, run in zip(names, runs, strict=True):
         failed += bool(run.trouble)
         figures = f"{run.duration:.0f} s | {run.speed:.1f} rad/s | {100.0 * run.share:.0f} %"
         print(f"| {name} | {run.trouble or 'none'} | {figures} |", flush=True)

@@ -33,6 +33,20 @@ class Row:
         """Ours as a multiple of the peer's."""
         return self.ours / self.peer if self.peer else float("inf") if self.ours else 1.0
 
+    @classmethod
+    def of_values(
+        cls, name: str, ours: Sequence[float], peer: Sequence[float], unit: str, more_is_better: bool = False
+    ) -> Row:
+        """Return the row of runs that took turns: medians, and the spread of ours and of the ratio."""
+        ratios = [one / other for one, other in zip(ours, peer, strict=True)]
+        spread = f"{range_of(ours)}, x{range_of(ratios)}"
+        return cls(name, statistics.median(ours), statistics.median(peer), unit, spread, more_is_better)
+
+    @classmethod
+    def of_times(cls, name: str, ours: Sequence[float], peer: Sequence[float]) -> Row:
+        """Return the row of runs in s that took turns."""
+        return cls.of_values(name, ours, peer, "s")
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -64,6 +78,16 @@ def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list
                 call()
             taken.append((time.perf_counter() - begin) / count)
     return [Timing(tuple(taken)) for taken in times]
+
+
+def seconds_in_turns(calls: Sequence[Callable[[], object]], repeats: int) -> list[list[float]]:
+    """Return how many s each call took, every time; they take turns."""
+    return [list(timing.blocks) for timing in race([(call, 1) for call in calls], repeats)]
+
+
+def range_of(values: Sequence[float]) -> str:
+    """Return the least and the largest value."""
+    return f"{min(values):.3g} to {max(values):.3g}"
 
 
 def show(rows: Sequence[Row], console: Console) -> None:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from exo_gravity.core.motors.frames import is_special
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import is_special
 
 DISTINCT = 8  # cycles before, from whose answers an answer must differ
 GIVE_UP = 0.1  # s after which an answer is treated as lost

@@ -7,6 +7,7 @@ A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
@@ -18,8 +19,10 @@ from xml.etree import ElementTree
 import numpy as np
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import MIT_V3
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT_V3
+from exo_gravity.core.motors.families import MOTORS, OURS
+from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
@@ -36,10 +39,12 @@ POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it w
 TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
+OF_URDF = urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"})
+OF_PAPER = [param.for_joints(1) for param in COMPENSATOR]
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,
     "compensator": COMPENSATOR,
-    "urdf_arm": urdf_table(1, ["command_interface"]),
+    "urdf_arm": [param for param in OF_URDF if param not in OF_PAPER],
     "imu": IMU,
     "simulator": SIMULATOR,
     "recorder": RECORDER,
@@ -50,6 +55,18 @@ PARAMETERS = {
 BASES = ("can_bridge", "compensator")
 # Their tables name the parameters that they share with one of BASES, and leave them out.
 REPEATING = ("simulator", "calibrator", "urdf_arm")
+RANGES = ("position_range", "velocity_range", "torque_range")
+MOTOR_HEAD = (
+    "`motor`",
+    "`wire_format`",
+    "on the wire: rad / rad/s / Nm",
+    "rated / peak Nm",
+    "rated / no-load rad/s",
+    "gear",
+    "rotor kg m²",
+    "angle after power-up",
+    "shuts off, degC",
+)
 HEAD = ("parameter", "default", "range", "change", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
@@ -188,6 +205,40 @@ def firmware_table() -> str:
     return markdown(("", *(f"`{name}`" for name in FIRMWARES)), rows)
 
 
+def motor_table() -> str:
+    """Return the Markdown table of our motors; what no source states is marked."""
+    rows = []
+    for family in OURS:
+        for spec in family.motors.values():
+            star = {name: "*" if name in spec.assumed else "" for name in MotorSpec.__dataclass_fields__}
+            speeds = (f"{getattr(spec, name):.3g}{star[name]}" for name in ("rated_speed", "no_load_speed"))
+            on_wire = (f"{getattr(spec, name):g}{star[name]}" for name in RANGES)
+            formats = [name for name, board in family.formats.items() if _has_ranges(board, spec)]
+            encoder = "output" if spec.output_encoder else f"rotor: {math.degrees(spec.rotor_turn):.3g} deg"
+            rows.append(
+                (
+                    f"`{spec.name}`",
+                    ", ".join(f"`{name}`" for name in formats) + (", FD" if spec.can_fd else ""),
+                    " / ".join(on_wire),
+                    f"{spec.rated_torque:g} / {spec.peak_torque:g}",
+                    " / ".join(speeds),
+                    f"{spec.gear_ratio:g}",
+                    f"{spec.rotor_inertia:.2g}",
+                    encoder + star["output_encoder"],
+                    f"{spec.shuts_off_at:g}{star['shuts_off_at']}",
+                )
+            )
+    return markdown(MOTOR_HEAD, rows)
+
+
+def _has_ranges(board: WireFormat, spec: MotorSpec) -> bool:
+    try:
+        board.ranged(spec)
+    except ParameterError:
+        return False
+    return True
+
+
 def topic_table() -> str:
     """Return the Markdown table of the policy's publishers and subscribers of each topic.
 
@@ -222,6 +273,7 @@ def renewed(text: str) -> str:
     tables = {node: parameter_table(node) for node in PARAMETERS} | {
         "faults": fault_table(),
         "firmwares": firmware_table(),
+        "motors": motor_table(),
         "topics": topic_table(),
     }
     return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)

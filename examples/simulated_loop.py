@@ -9,8 +9,9 @@ from math import degrees
 import matplotlib.pyplot as plt
 
 from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 
 PERIOD = 0.004  # s

@@ -5,6 +5,7 @@ Starts robot_model, robot_state_publisher and RViz, and no arm. `rviz:=false` le
 
 from pathlib import Path
 
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
 from launch.conditions import IfCondition
@@ -16,7 +17,17 @@ from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools.urdf import urdf_of
 
 
+def _check_rviz() -> None:
+    """Raise RuntimeError if RViz is not installed: a robot's computer does without it."""
+    try:
+        get_package_prefix("rviz2")
+    except PackageNotFoundError:
+        raise RuntimeError("RViz is not installed: apt install ros-jazzy-rviz2, or start with rviz:=false") from None
+
+
 def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    if LaunchConfiguration("rviz").perform(context).lower() in ("true", "1"):
+        _check_rviz()
     meshes = LaunchConfiguration("meshes").perform(context)
     # Read before any node starts: a file that is refused leaves none behind.
     description = urdf_of(Path(LaunchConfiguration("params").perform(context)), meshes=meshes)

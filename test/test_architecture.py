@@ -42,6 +42,7 @@ ROOMS = {
         "ownership",
         "trunk_estimator",
         "imu_sources",
+        "urdf_checks",
         "urdf_arm",
     ),
 }

@@ -7,9 +7,26 @@ from __future__ import annotations
 
 import argparse
 import sys
+from typing import NamedTuple
 
-from .cases import INNOCENT, WRONG, felt, play
+from ..parts import play as part_by_part
+from .cases import INNOCENT, WRONG, Motion, felt, play
 from .rules import RULES
+
+CASES = {case.name: case for case in (*WRONG, *INNOCENT)}
+
+
+class CaseUnderRule(NamedTuple):
+    """A case under a rule. rate: of the loop, Hz."""
+
+    case: str
+    rule: str
+    rate: float
+
+
+def played(part: CaseUnderRule) -> tuple[CaseUnderRule, Motion]:
+    """Play a part."""
+    return part, play(CASES[part.case], RULES[part.rule], part.rate)
 
 
 def main() -> int:
@@ -19,23 +36,23 @@ def main() -> int:
     parser.add_argument("--case", nargs="*", default=[""], help="how names of cases begin (default: all)")
     parser.add_argument("--rate", type=float, default=250.0, help="of the loop, Hz (default: %(default)s)")
     arguments = parser.parse_args()
-    chosen = tuple(arguments.case)
+    rules = dict.fromkeys(("none", *arguments.rule))
+    chosen = [case for case in CASES.values() if case.name.startswith(tuple(arguments.case))]
+    parts = [CaseUnderRule(case.name, rule, arguments.rate) for case in chosen for rule in rules]
+    found = dict(part_by_part("barrier", played, parts, lambda one: f"{one[0].case}, {one[0].rule}"))
     print("| arm | rule | fastest joint (rad/s) | driven (rad/s) | by a motor (J) | (Nm/s) | fault |")
     print("|---|---|---|---|---|---|---|")
-    for case in (case for case in WRONG if case.name.startswith(chosen)):
-        for name in arguments.rule:
-            run = play(case, RULES[name], arguments.rate)
+    for part, run in found.items():
+        if not CASES[part.case].is_innocent and part.rule in arguments.rule:
             figures = f"{run.speed:.1f} | {run.driven:.1f} | {run.energy:.1f} | {run.rate:.0f} | {run.fault}"
-            print(f"| {case.name} | {name} | {figures} |", flush=True)
+            print(f"| {part.case} | {part.rule} | {figures} |")
     print("\n| wearer | rule | fastest joint (rad/s) | their largest torque (Nm) | mean brake (Nm) | more work (J) |")
     print("|---|---|---|---|---|---|")
-    for case in (case for case in INNOCENT if case.name.startswith(chosen)):
-        free = play(case, RULES["none"], arguments.rate)
-        for name in arguments.rule:
-            run = play(case, RULES[name], arguments.rate)
-            cost = felt(run, free)
+    for part, run in found.items():
+        if CASES[part.case].is_innocent and part.rule in arguments.rule:
+            cost = felt(run, found[part._replace(rule="none")])
             figures = f"{run.speed:.1f} | {cost.largest:.1f} | {cost.brake:.2f} | {cost.work:.2f}"
-            print(f"| {case.name} | {name} | {figures} |", flush=True)
+            print(f"| {part.case} | {part.rule} | {figures} |")
     return 0
 
 

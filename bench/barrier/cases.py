@@ -18,8 +18,9 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
 from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
@@ -188,7 +189,9 @@ def play(case: Case, make: Callable[[Limits, Sequence[float]], Barrier] | None, 
     device.arm.carry(case.extra)
     limits = Limits(JOINTS, max_effort=case.max_effort, sign_check_torque=0.0)
     compensator = Compensator(
-        Settings("right", ROBOT, mode=case.mode, wearer_mass=mass, wearer_cog=cog, max_effort=case.max_effort)
+        Settings(
+            "right", ROBOT, mode=case.mode, support=1.0, wearer_mass=mass, wearer_cog=cog, max_effort=case.max_effort
+        )
     )
     motion = Motion()
     begin = math.inf

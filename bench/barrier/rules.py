@@ -95,7 +95,9 @@ class Observed(Barrier):
 
     def __init__(self, limits: Limits, peak_damping: Sequence[float]) -> None:
         super().__init__(limits, peak_damping)
-        settings = Settings("right", ROBOT, mode="zero_g", wearer_mass=MASS, wearer_cog=COG, max_effort=PEAK)
+        settings = Settings(
+            "right", ROBOT, mode="zero_g", support=1.0, wearer_mass=MASS, wearer_cog=COG, max_effort=PEAK
+        )
         self._observer = MomentumObserver(settings)
 
     def brake(self, dt: float, joints: Sequence[JointSample], effort: Sequence[float]) -> Sequence[float]:

@@ -1,7 +1,7 @@
 """python -m bench.calibration [--devices 20] [--first 0] [--output build/calibration]: the study of `calibrate`.
 
-Random simulated devices go through the whole procedure, offline and on one core, about a minute each. It prints a line
-per device and a table, writes both as JSON and Markdown, and exits with 1 if a limit is missed.
+Random simulated devices go through the whole procedure, offline, about a minute each, one on each core. It prints a
+line per device and a table, writes both as JSON and Markdown, and exits with 1 if a limit is missed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import json
 import os
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,26 +19,28 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 
 from ..device_study import as_markdown, options_of
+from ..parts import play
 from .device import draw
 from .verdict import progress, verdict
 from .way import Result, WayError, go
 
 
+def calibrated(seed: int) -> Result | str:
+    """Return the result of a device, or the sentence that says why it has none."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        try:
+            return go(draw(seed, folder), folder)
+        except WayError as error:
+            return f"device {seed}: {error}"
+
+
 def main() -> int:
     """Run the study; return the exit code."""
     options = options_of("bench.calibration", "Calibrate random simulated devices.", Path("build/calibration"))
-    results: list[Result] = []
-    failed: list[str] = []
-    begin = time.monotonic()
-    for seed in range(options.first, options.first + options.devices):
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            try:
-                results.append(go(draw(seed, folder), folder))
-                print(f"{progress(results[-1])} ({time.monotonic() - begin:.0f} s)", flush=True)
-            except WayError as error:
-                failed.append(f"device {seed}: {error}")
-                print(failed[-1], flush=True)
+    found = play("calibration", calibrated, options.seeds, lambda one: one if isinstance(one, str) else progress(one))
+    results = [one for one in found if not isinstance(one, str)]
+    failed = [one for one in found if isinstance(one, str)]
     rows = verdict(results, failed)
     text = f"{as_markdown(rows)}\n"
     print(text)

@@ -13,8 +13,8 @@ import yaml
 from bench.calibration.random_device import off_axis_of
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
@@ -23,6 +22,7 @@ from exo_gravity.lab.calibration.live import LiveTour
 from exo_gravity.lab.calibration.tour import CALIBRATOR, Tour, TourController, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
 from exo_gravity.sim.params import SIMULATOR, device_of, imu_of
@@ -74,8 +74,8 @@ class Player:
 
 
 def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -> Player:
-    """Return what plays the tour that `nodes`, the content of a parameter file, describe; `path`: where to write it."""
-    path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
+    """Return what plays the tour that `nodes`, each with its parameters, describe; `path`: where to write them."""
+    path.write_text(text_of(nodes), encoding="utf-8")
     content = load(path)
     values = node_values(content, f"{namespace}/calibrator", CALIBRATOR)
     bridge = node_values(content, f"{namespace}/can_bridge", CAN_BRIDGE)

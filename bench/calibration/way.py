@@ -127,9 +127,9 @@ def _offline(players: list[Player], leant: Sequence[float] = ()) -> Iterator[Non
     play = run_tour(players)
 
     def run(options: argparse.Namespace, nodes: Mapping[str, Any], *more: object) -> LiveTour:
-        simulator = nodes[SIMULATOR_NODE]["ros__parameters"]
-        if leant and "wearer" in simulator:
-            simulator["trunk"] = dict(zip(("pitch", "roll"), leant, strict=True))
+        simulator = nodes[SIMULATOR_NODE]
+        if leant and "wearer.mass" in simulator:
+            simulator["trunk.pitch"], simulator["trunk.roll"] = leant
         return play(options, nodes, *more)
 
     with patch.object(live, "run_tour", run):

@@ -11,9 +11,16 @@ from pathlib import Path
 
 from rich.console import Console
 
-from .exertion import RATE
+from ..parts import play
+from .exertion import RATE, Exertion
 from .report import Results, comparisons, figure, tables, write_csv
-from .study import Study
+from .study import Study, TaskUnderSetting, played
+
+
+def line(found: tuple[TaskUnderSetting, Exertion]) -> str:
+    """Return what is printed of a part."""
+    part, exertion = found
+    return f"{part.setting}, {part.task}: {exertion.total:.2f} Nm"
 
 
 def main() -> None:
@@ -26,9 +33,9 @@ def main() -> None:
     options = parser.parse_args()
     console, study = Console(width=None if Console().is_terminal else 180, highlight=False), Study.of(options.params)
     results = Results({}, {(setting, share): reached for setting, share, reached in study.workspaces()})
-    for setting, task, exertion in study.exertions(options.quick, options.rate):
-        console.print(f"{setting}, {task}: {exertion.total:.2f} Nm", markup=False)
-        results.exertions[setting, task] = exertion
+    parts, files = study.parts(options.quick, options.rate, options.params), [options.params] if options.params else []
+    for part, exertion in play("effort", played, parts, line, files=files):
+        results.exertions[part.setting, part.task] = exertion
     for table in tables(results):
         console.print(table)
     for sentence in comparisons(results):

@@ -17,8 +17,8 @@ import numpy as np
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER
 from exo_gravity.sim import STEP, SimulatedDevice, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_wearer import Path, path_between

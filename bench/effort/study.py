@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -105,12 +105,10 @@ class Study:
         friction = ([IDENTIFIED * value for value in simulator[f"friction.{part}"]] for part in ("coulomb", "viscous"))
         return cls(arm, simulator, settings_by_name(base, *friction))
 
-    def exertions(self, quick: bool, rate: float) -> Iterator[tuple[str, str, Exertion]]:
-        """Yield setting, task and exertion, on a new device each; quick: a reach under the settings `QUICK`."""
-        for name in QUICK if quick else self.settings:
-            for task in (REACH,) if quick else TASKS:
-                device = device_of(self.simulator)
-                yield name, task.name, measure(device, self.arm.motors, self.settings[name], task, rate)
+    def parts(self, quick: bool, rate: float, params: Path | None) -> list[TaskUnderSetting]:
+        """Return what is played: each task under each setting; quick: a reach under the settings `QUICK`."""
+        settings, tasks = (QUICK, (REACH,)) if quick else (self.settings, TASKS)
+        return [TaskUnderSetting(name, task.name, rate, params) for name in settings for task in tasks]
 
     def workspaces(self) -> Iterator[tuple[str, float, float]]:
         """Yield setting, strength of a weak wearer as a share, and the share of the workspace that they reach."""
@@ -135,3 +133,20 @@ class Study:
             for strength in STRENGTHS:
                 reached = np.all(needed <= np.maximum(LEAST, strength * most), axis=1)
                 yield name, strength, float(reached.mean())
+
+
+class TaskUnderSetting(NamedTuple):
+    """A task under a setting. rate: of the control loop, Hz. params: as `Study.of` takes it."""
+
+    setting: str
+    task: str
+    rate: float
+    params: Path | None
+
+
+def played(part: TaskUnderSetting) -> tuple[TaskUnderSetting, Exertion]:
+    """Play a part on a new device."""
+    study = Study.of(part.params)
+    task = next(task for task in TASKS if task.name == part.task)
+    device, settings = device_of(study.simulator), study.settings[part.setting]
+    return part, measure(device, study.arm.motors, settings, task, part.rate)

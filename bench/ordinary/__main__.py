@@ -9,13 +9,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from ..parts import play
 from .arm import Result
 from .rows import Row, all_rows
 
@@ -27,6 +27,17 @@ def is_quiet(result: Result) -> bool:
     return not result.refused_starts and not result.let_downs and result.without_tilt < LONGEST
 
 
+def played(item: tuple[Row, float]) -> Result:
+    """Play a row for so many s."""
+    row, duration = item
+    return row.play(duration)
+
+
+def causes(result: Result) -> str:
+    """Return what was raised without cause."""
+    return "; ".join(result.refused_starts + result.let_downs) or "quiet"
+
+
 def main() -> int:
     """Play the rows; return the exit code."""
     parser = argparse.ArgumentParser(prog="bench.ordinary", description="Watch for false alarms in virtual time.")
@@ -36,15 +47,9 @@ def main() -> int:
     options = parser.parse_args()
     console = Console(width=None if Console().is_terminal else 180, highlight=False)
     rows = [row for row in all_rows() if options.only in row.name]
-    results: dict[Row, Result] = {}
-    with ProcessPoolExecutor(options.workers) as pool:
-        share = 60.0 * options.minutes / len(rows)
-        played = {pool.submit(row.play, share): row for row in rows}
-        for future in as_completed(played):
-            row, result = played[future], future.result()
-            results[row] = result
-            causes = "; ".join(result.refused_starts + result.let_downs) or "quiet"
-            console.print(f"{len(results)} of {len(rows)}: {row.name}: {causes}", markup=False)
+    share = 60.0 * options.minutes / len(rows)
+    found = play("ordinary", played, [(row, share) for row in rows], causes, options.workers)
+    results = dict(zip(rows, found, strict=True))
     table = Table(
         "", "minutes", "starts", "refused", "let down", "rides", "samples %", "no tilt s", "error Nm", box=None
     )

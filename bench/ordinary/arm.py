@@ -19,8 +19,8 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.control_loop import Controller

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 
 JOINTS = range(len(USUAL_MOTORS))
 RATES = (100.0, 250.0)  # Hz

@@ -124,7 +124,7 @@ class Stage:
         self.load = Wearer(BODY_MASS).on_links(robot.length)
         worn = {"wearer_mass": self.load.mass.tolist(), "wearer_cog": self.load.cog.tolist()}
         mode = "zero_g" if case.worn else "one_g"
-        self.settings: Settings = replace(settings, mode=mode, **worn)
+        self.settings: Settings = replace(settings, mode=mode, support=1.0, **worn)
         friction = (case.friction,) * len(configured.motors)
         device_arm = SimulatedArm(ArmConfig(coulomb_friction=friction, **(worn if case.worn else {})))
         device_arm.carry(case.payload)

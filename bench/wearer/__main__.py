@@ -1,8 +1,8 @@
 """python -m bench.wearer [--devices 20] [--first 0] [--output build/wearer]: the study of `wearer_efforts`.
 
 Random calibrated devices with a virtual wearer go through one trial each, weigh loads in the hand, and adapt to one who
-tires, offline and on one core, 1 to 2 minutes each. It prints a table, writes it and a picture of the first trial, and
-exits with 1 if a limit is missed.
+tires, offline, 1 to 2 minutes each, one on each core. It prints a table, writes it and a picture of the first trial,
+and exits with 1 if a limit is missed.
 """
 
 from __future__ import annotations
@@ -10,34 +10,48 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import numpy as np
+
 from ..device_study import as_markdown, options_of
+from ..parts import play as part_by_part
 from . import payload, tiring, ways
 from .devices import draw
 from .report import picture, points, verdict
 from .study import Trial, judge, play
 
 
+class Judged(NamedTuple):
+    """What was seen of one wearer. tired: with and without `support_adapts`."""
+
+    trial: Trial
+    weighed: payload.Weighings
+    left: np.ndarray
+    tired: tuple[tiring.Tired, tiring.Tired]
+
+    @property
+    def line(self) -> str:
+        """What is printed of it."""
+        share = float(self.trial.share.value)
+        off = points(share - self.trial.true_share)
+        return f"device {self.trial.seed}: share {share:.1%}, off by {off} {self.trial.trouble}"
+
+
+def judged(seed: int) -> Judged:
+    """Play and judge one wearer."""
+    worn = draw(seed)
+    tired = tiring.tire(worn, adapts=True), tiring.tire(worn, adapts=False)
+    return Judged(judge(play(worn)), payload.weigh(worn), ways.left_over(worn), tired)
+
+
 def main() -> int:
     """Run the study; return the exit code."""
     options = options_of("bench.wearer", "Judge the estimate of the wearer's torque.", Path("build/wearer"))
-    trials: list[Trial] = []
-    weighed: list[tuple[payload.Balance, str]] = []
-    tired: list[tuple[tiring.Tired, tiring.Tired]] = []
-    left = []
-    for seed in range(options.first, options.first + options.devices):
-        worn = draw(seed)
-        trial = judge(play(worn))
-        trials.append(trial)
-        weighed.append(payload.weigh(worn))
-        left.append(ways.left_over(worn))
-        tired.append((tiring.tire(worn, adapts=True), tiring.tire(worn, adapts=False)))
-        error = float(trial.share.value) - trial.true_share
-        print(
-            f"device {seed}: share {float(trial.share.value):.1%}, off by {points(error)} {trial.trouble}", flush=True
-        )
+    found = part_by_part("wearer", judged, options.seeds, lambda one: one.line)
+    trials, weighed, left, tired = zip(*found, strict=True)
     rows = [*verdict(trials), *payload.verdict(weighed), *tiring.verdict(tired), *ways.verdict(left)]
     text = as_markdown(rows)
     print(text)

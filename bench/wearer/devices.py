@@ -25,8 +25,8 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.tours import moments_from, wearer_from
@@ -108,7 +108,7 @@ def draw(seed: int) -> Worn:
     bare = moments_from(nominal, seen)
     left = turn - identify(seen, LENGTH).tilt
     values: dict[str, Any] = {change.name: change.value for change in bare.changes}
-    found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g"}
+    found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g", "support": 1.0}
     found |= {name: value for name, value in values.items() if name != "torque_scale"}
     # With the new scales, and the relaxed wearer
     true.scale = scale / values["torque_scale"]

@@ -30,6 +30,8 @@ DELAY, MOVE, HOLD = 2.0, 2.5, 25.0  # s
 RELEASE = 0.5  # s after which the hand lets go of an arm that is weighed
 LEAST_ERROR, LARGEST_SHARE = 0.03, 0.05  # kg, and of the mass
 
+Weighings = list[Weighed | None]  # of the empty hand, then of MASSES
+
 
 class Balance(Compensator):
     """A compensator that weighs at `times`, s after the motors of `trial` are on.
@@ -41,7 +43,7 @@ class Balance(Compensator):
         super().__init__(settings)
         self.times: list[float] = []
         self.trial: OfflineTrial | None = None
-        self.results: list[Weighed | None] = []
+        self.results: Weighings = []
         self.texts: list[str] = []
         self._weighing: Weighing | None = None
 
@@ -60,8 +62,8 @@ class Balance(Compensator):
         return answer
 
 
-def weigh(worn: Worn) -> tuple[Balance, str]:
-    """Weigh the empty hand and each of MASSES; return the compensator, and what went wrong."""
+def weigh(worn: Worn) -> Weighings:
+    """Weigh the empty hand and each of MASSES; return what was found, None for a weighing without a result."""
     pose = (POSE + np.random.default_rng(worn.seed).uniform(-SPREAD, SPREAD, 4)).tolist()
     rest: list[dict[str, Any]] = [{"move": pose, "over": MOVE}, {"hold": HOLD}]
     steps = [*rest, *(step for mass in MASSES for step in ({"load": mass, "over": 0.1}, *rest))]
@@ -77,14 +79,14 @@ def weigh(worn: Worn) -> tuple[Balance, str]:
     compensator.times = [first + n * cycle for n in range(1 + len(MASSES))]
     compensator.trial = trial
     trial.run()
-    return compensator, trial.trouble
+    return compensator.results
 
 
-def verdict(found: Sequence[tuple[Balance, str]]) -> list[Row]:
+def verdict(found: Sequence[Weighings]) -> list[Row]:
     """Return the rows of the table."""
     rows = []
     for number, mass in enumerate(MASSES, start=1):
-        pairs = [(balance.results[0], balance.results[number]) for balance, _ in found if len(balance.results) > number]
+        pairs = [(results[0], results[number]) for results in found if len(results) > number]
         errors = [loaded.mass - empty.mass - mass for empty, loaded in pairs if empty and loaded]
         refused = len(found) - len(errors)
         most = max(LEAST_ERROR, LARGEST_SHARE * mass)
@@ -92,6 +94,6 @@ def verdict(found: Sequence[tuple[Balance, str]]) -> list[Row]:
         within = sum(abs(error) <= most for error in errors)
         shown = f"{1000.0 * worst:.0f} g at most; {within} of {len(errors)} within, {refused} refused"
         rows.append(Row(f"load of {mass:g} kg, error", shown, f"{1000.0 * most:.0f} g", within == len(errors) > 0))
-    empty = [balance.results[0] for balance, _ in found if balance.results and balance.results[0]]
+    empty = [results[0] for results in found if results and results[0]]
     rows.append(Row("empty hand", f"{1000.0 * max(abs(one.mass) for one in empty):.0f} g at most", "", True))
     return rows

@@ -14,6 +14,7 @@ import numpy as np
 from exo_gravity.core.numbers import COVER
 
 from ..device_study import options_of
+from ..parts import play as part_by_part
 from .devices import Worn, draw
 from .report import points
 from .strapped_arm import RHYTHM, StrappedArm
@@ -46,17 +47,25 @@ def table(found: Sequence[Sequence[Trial]]) -> str:
     return "\n".join(lines)
 
 
+def tied(seed: int) -> list[Trial]:
+    """Return the `trials` of a device."""
+    return trials(draw(seed))
+
+
 def main() -> int:
     """Run the study; print its table, and write it."""
     options = options_of("bench.wearer.straps", "What straps and a shoulder that moves do.", Path("build/straps"))
-    found = []
-    for seed in range(options.first, options.first + options.devices):
-        found.append(trials(draw(seed)))
-        print(f"device {seed}: {[trial.trouble for trial in found[-1]]}", flush=True)
-        print(table(found), flush=True)
+    found = part_by_part("straps", tied, options.seeds, lambda device: f"device {device[0].seed}: {troubles(device)}")
+    text = table(found)
+    print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".md").write_text(f"{table(found)}\n", encoding="utf-8")
-    return int(any(trial.trouble for device in found for trial in device))
+    options.output.with_suffix(".md").write_text(f"{text}\n", encoding="utf-8")
+    return int(any(troubles(device) for device in found))
+
+
+def troubles(device: Sequence[Trial]) -> str:
+    """Return what went wrong in the trials of a device, or ''."""
+    return "; ".join(trial.trouble for trial in device if trial.trouble)
 
 
 if __name__ == "__main__":

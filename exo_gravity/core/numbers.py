@@ -1,7 +1,7 @@
 """Numbers in joint order, their checks, and the rate of a counter."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -9,13 +9,24 @@ from exo_gravity.core.errors import ParameterError
 
 Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the components of a vector
 
-JOINT_COUNT = 4
+JOINT_COUNT = 4  # of the paper's arm, whose values are the defaults
+MAX_JOINTS = 32  # of one arm
 COVER = 1.96  # standard deviations of a 95 % band
 
 
 def limited(wanted: float, last: float, step: float) -> float:
     """Return `wanted` within `step` of `last`."""
     return max(last - step, min(last + step, wanted))
+
+
+def for_joints(
+    tuning: Sequence[float], count: int, chosen: Callable[[Sequence[float]], float] = min
+) -> tuple[float, ...]:
+    """Return `tuning` for an arm of `count` joints: as it is if it has so many, else its least for every joint.
+
+    chosen: what every joint has in place of the least.
+    """
+    return tuple(tuning) if len(tuning) == count else (chosen(tuning),) * count
 
 
 def four_floats(name: str, values: Vector, low: float, high: float, unit: str = "") -> np.ndarray:

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import MAX_JOINTS
 
 # ROS declares these on every node, and `ros2 param dump` writes them to files.
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
 ROS_QOS_PREFIX = "qos_overrides."
+COUNTED = ("joint_names", "can_id")  # lists that say how many joints an arm has
 KINDS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
 # Parameters that were valid at a47959f4 and are gone: what to write for such a value, by the names in force.
 GONE: dict[str, Callable[[list[Any]], dict[str, Any]]] = {
@@ -39,8 +41,29 @@ class Param:
     fixed: bool = False  #: read-only while the node runs
     required: bool = False  #: the user must give a non-empty value
     expert: bool = False  #: only an expert changes it; the documents list it apart, and the panel does not show it
-    #: a list may have another length than its default; otherwise it has one entry per joint, and keeps its length
-    any_length: bool = False
+    any_length: bool = False  #: a list may have another length than its default
+    #: a list keeps the length of its default on any arm, as a vector does; otherwise it has one entry per joint
+    vector: bool = False
+
+    @property
+    def is_per_joint(self) -> bool:
+        """Whether the value is a list with one entry per joint."""
+        return isinstance(self.default, list) and bool(self.default) and not (self.any_length or self.vector)
+
+    @property
+    def omitted(self) -> Any:
+        """What a file has that leaves this parameter out: the default, or an empty list that `check` refuses."""
+        return [] if self.required and isinstance(self.default, list) else self.default
+
+    def for_joints(self, count: int) -> "Param":
+        """Return this parameter for an arm of `count` joints.
+
+        A default that is the same for all joints is kept. One that tells the joints of the paper's arm apart is no
+        default for another arm: its file must give the list.
+        """
+        if not self.is_per_joint or len(self.default) == count:
+            return self
+        return replace(self, default=self.default[:1] * count, required=self.required or len(set(self.default)) > 1)
 
     def check(self, value: Any) -> Any:
         """Return `value` in this parameter's type; other numbers are converted if the type is float.
@@ -86,7 +109,7 @@ class Param:
         kind, count = self._kind_and_count
         text = KINDS[kind] if kind is bool else f"a {KINDS[kind]}"
         if isinstance(self.default, list):
-            text = f"{count or 'a list of'} {KINDS[kind]}s"
+            text = f"{count or 'a list of'} {KINDS[kind]}{'' if count == 1 else 's'}"
         return f"{text}{', ' if self.choices else ' '}{self.range}".rstrip()
 
 
@@ -109,16 +132,23 @@ def params_of(owner: type, fixed: bool = False) -> tuple[Param, ...]:
     return tuple(param_of(owner, f.name, fixed) for f in fields(owner) if "param" in f.metadata)
 
 
-def check_owned(instance: Any) -> None:
+def check_owned(instance: Any, count: int | None = None) -> None:
     """Check every owned field of a frozen dataclass instance, and convert its numbers; a list becomes a tuple.
 
-    Raises ParameterError that names the field.
+    count: of the arm's joints; None: as many as the longest list with one entry per joint has. A default that is the
+    same for all joints has as many. Raises ParameterError that names the field.
     """
-    for param in params_of(type(instance)):
-        value = getattr(instance, param.name)
-        plain = value.tolist() if isinstance(value, np.ndarray) else value
-        checked = param.check(plain)
-        object.__setattr__(instance, param.name, tuple(checked) if isinstance(checked, list) else checked)
+    params = {param.name: param for param in params_of(type(instance))}
+    given = {name: getattr(instance, name) for name in params}
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in given.items()}
+    if count is None:
+        lists = [plain[name] for name, param in params.items() if param.is_per_joint]
+        count = max([len(value) for value in lists if isinstance(value, list | tuple)], default=0)
+    defaults = {field.name: field.default for field in fields(instance)}
+    for name, param in params.items():
+        sized = param.for_joints(count)
+        checked = sized.check(sized.omitted if given[name] is defaults[name] else plain[name])
+        object.__setattr__(instance, name, tuple(checked) if isinstance(checked, list) else checked)
 
 
 def in_force(name: str, value: Any) -> dict[str, Any]:
@@ -128,12 +158,29 @@ def in_force(name: str, value: Any) -> dict[str, Any]:
     return GONE[name](list(value) if isinstance(value, Sequence) else [])
 
 
+def joint_count(given: Mapping[str, Any]) -> int:
+    """Return of how many joints `given` has the names, or else the motors' IDs; else how many the paper's arm has."""
+    lists = (given[name] for name in COUNTED if isinstance(given.get(name), list | tuple))
+    count = len(next(lists, ()))
+    return count if 1 <= count <= MAX_JOINTS else len(JOINT_NAMES.default)
+
+
+def table_for(table: Sequence[Param], given: Mapping[str, Any]) -> Sequence[Param]:
+    """Return `table` for an arm of as many joints as `given` has; unchanged if it is for one arm only."""
+    if not any(param.name in COUNTED and param.is_per_joint for param in table):
+        return table
+    count = joint_count(given)
+    return [param.for_joints(count) for param in table]
+
+
 def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str = "") -> dict[str, Any]:
     """Return the value of every parameter of the table by name: the given value, or the default.
 
-    Names that start with `free_prefix` and names that ROS declares are ignored. Raises ParameterError for an invalid
-    value and for a name that is not in the table.
+    Names that start with `free_prefix` and names that ROS declares are ignored. A list with one entry per joint has as
+    many as the arm has joints (`table_for`). Raises ParameterError for an invalid value and for a name that is not in
+    the table.
     """
+    table = table_for(table, given)
     names = {param.name for param in table}
     prefixes = (ROS_QOS_PREFIX, free_prefix) if free_prefix else (ROS_QOS_PREFIX,)
     for name, value in given.items():
@@ -142,7 +189,7 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
                 written = ", ".join(f"{new}: {plain}" for new, plain in in_force(name, value).items())
                 raise ParameterError(name, value, f"written in other parameters: {written}")
             raise ParameterError(name, value, f"one of {', '.join(sorted(names))}")
-    return {param.name: param.check(given.get(param.name, param.default)) for param in table}
+    return {param.name: param.check(given.get(param.name, param.omitted)) for param in table}
 
 
 # Shared by several nodes.
@@ -150,7 +197,7 @@ def values_of(table: Sequence[Param], given: Mapping[str, Any], free_prefix: str
 JOINT_NAMES = Param(
     "joint_names",
     ["right_shoulder_rotation", "right_shoulder_abduction", "right_shoulder_flexion", "right_elbow_flexion"],
-    "the four joints from the shoulder to the elbow, as in joint_states", fixed=True)
+    "the joints from the shoulder on, as in joint_states", fixed=True)
 REAL_TIME_PARAMETERS = (
     Param("thread_priority", 0,
           "above 0: SCHED_FIFO priority of the control loop's threads, and locked memory, where permitted", (0, 99),

@@ -192,6 +192,7 @@ class WeighingRefused(Word):
     SLOW = "slow"
     UNDER_WAY = "under_way"
     CHANGING_LOAD = "changing_load"
+    NO_HAND = "no_hand"
 
 
 class WeighingTrouble(Word):

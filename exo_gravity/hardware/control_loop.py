@@ -20,10 +20,11 @@ from typing import Any, Protocol
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
-from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, OFF, Drive, Efforts, FaultCode, Send, State
+from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Drive, Efforts, FaultCode, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.monitors import RestTracker
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 from exo_gravity.hardware.can.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
@@ -107,6 +108,8 @@ class ControlLoop:
         self.cycle_errors, self.cycle_error = 0, ""
         #: The exception that ended the control, if any.
         self.failure: BaseException | None = None
+        #: What a start waits for besides the boards of the motors, set from outside; '' for nothing.
+        self.hindrance = NO_REASON
         #: s, of the owner's last sign of life; inf if it gives none. One that stands still could not let the arm down.
         self.attended = math.inf
         #: Its counts may be read, and it may be used within a `call`.
@@ -119,7 +122,7 @@ class ControlLoop:
             safety.probe(self._now())
         self._due = self._now()  # of the next cycle
         self._errors = 0  # in a row
-        self._drive = OFF  # last decided
+        self._drive = Drive.off(len(bus.samples))  # last decided
         self._foreign_commands = 0  # so far
         self._suspended = bus.clock.suspended()  # s, so far
         self._work = period  # s per cycle, without waiting for efforts; smoothed
@@ -226,6 +229,9 @@ class ControlLoop:
             self.safety.trip(FaultCode.INTERNAL_ERROR, reason, now)
         if self._is_stopping:
             self.safety.disable(now)
+        if self.safety.state is State.CHECKING:
+            boards = self.bus.boards.hindrance(now, 1.0 / self.period)
+            self.safety.hindrance = self.hindrance or (Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON)
         drive = self._drive = self.safety.step(now, tuple(self.bus.samples), efforts)
         try:
             complete = self.bus.exchange(drive, now + REPLY_SHARE * self.period)
@@ -272,7 +278,7 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
     before it hangs. No motor is switched on. No exception ends this.
     """
     clock, start, exits = bus.clock, bus.clock.monotonic(), 0
-    rest = RestTracker()
+    rest = RestTracker(len(bus.samples))
     confirmed = [False] * len(drive.effort)
     while not all(confirmed):
         now, joints = clock.monotonic(), tuple(bus.samples)
@@ -295,4 +301,4 @@ def lower(bus: MotorBus, drive: Drive, period: float) -> None:
             confirmed = [was or sample.time >= now for was, sample in samples]
         clock.sleep(max(0.0, now + period - clock.monotonic()))
     with contextlib.suppress(Exception):
-        bus.exchange(OFF, clock.monotonic() + period)
+        bus.exchange(Drive.off(len(effort)), clock.monotonic() + period)

@@ -1,7 +1,8 @@
 """Samples of an inertial measurement unit (IMU) on the trunk -> gravity in the trunk's axes, and how sure that is.
 
-An orientation that the IMU reports is used as it is. Without one, VQF (D. Laidig, T. Seel, Information Fusion 91, 2023)
-fuses gyroscope and accelerometer. Without a magnetometer the heading drifts, on which gravity does not depend.
+An orientation that the IMU reports is used as it is, while gyroscope and accelerometer confirm it. Without one, VQF
+(D. Laidig, T. Seel, Information Fusion 91, 2023) fuses these two. Without a magnetometer the heading drifts, on which
+gravity does not depend.
 
 Only a sample that no working IMU gives is refused, with the reason; the estimate goes on over it. What was not
 measured, in a gap or in saturation, makes the estimate less certain (`core.trunk.uncertainty`). While it may be off by
@@ -23,7 +24,6 @@ from exo_gravity.core.arm.rotation import (
     Quaternion,
     plus,
     product,
-    three_floats,
     unit_quaternion,
     up_in_body,
 )
@@ -31,7 +31,8 @@ from exo_gravity.core.arm.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.trunk import imu_checks
-from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range
+from exo_gravity.core.trunk.agreement import Agreement
+from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range, reported_orientation
 from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
 
 try:
@@ -111,7 +112,8 @@ class TrunkEstimator:
         self._strongest = one_float("accelerometer_range", accelerometer_range, *ranges, "m/s^2")
         self._fusion = VqfFusion(self._period) if VQF else None
         self._equal, self._clock = imu_checks.EqualValues(), imu_checks.ClockCheck()
-        self._agreement = imu_checks.Agreement()
+        self._seldom, self._agreement = imu_checks.RateCheck(), Agreement()
+        self._has_turned = False  # whether the gyroscope has shown anything but zeros, which some drivers fill in
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
         self._restart("no sample yet")
@@ -122,13 +124,14 @@ class TrunkEstimator:
             self._fusion.restart()
         self._why = why  # there is no orientation yet
         self._uncertainty = TiltUncertainty(self._period)
-        self._agreement = imu_checks.Agreement(is_suspect or self._agreement.is_suspect)
+        self._agreement = Agreement(is_suspect or self._agreement.is_suspect)
         self._quaternion: Quaternion | None = None  # of the IMU by the last sample, world from IMU
         self._force: Floats3 | None = None  # m/s^2, of the last sample
         self._speed = 0.0  # rad/s, the highest in the last second
         self._judged = self._time  # s, of the sample of the last judgement
         self._rates: list[Floats3] = []  # rad/s, at it and since then
         self._total, self._count = ZERO, 0  # m/s^2, sum of the forces since then, and how many they are
+        self._turn, self._jolt = ZERO, 0.0  # rad, by the gyroscope since then, and what it may have missed
 
     @property
     def gyroscope_bias(self) -> np.ndarray:
@@ -139,8 +142,10 @@ class TrunkEstimator:
     def settling(self) -> str:
         """Why there is no orientation yet; empty once there is."""
         if self._agreement.is_suspect:
-            return f"until gyroscope and accelerometer agree on a turn of the trunk; {self._why}"
-        return "" if self._uncertainty.sigma <= MODEL.limit else self._why
+            return f"until its measurements agree on a turn of the trunk; {self._why}"
+        if self._uncertainty.sigma <= MODEL.limit:
+            return ""
+        return "gyroscope and accelerometer show different turns" if self._agreement.contradiction else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
@@ -150,6 +155,8 @@ class TrunkEstimator:
         Raises ParameterError if the sample is impossible, frozen or not later than the last one (it is then ignored),
         or if what it measures contradicts itself or the samples before it.
         """
+        if sample.orientation is not None and reported_orientation(sample.orientation, 0.0) is None:
+            sample = sample._replace(orientation=None)
         try:
             quaternion = self._fused(sample) if sample.orientation is None else self._reported(sample)
             if arrival is not None:
@@ -158,21 +165,39 @@ class TrunkEstimator:
             self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
         sigma = self._uncertainty.sigma
-        is_sure = sigma <= MODEL.limit and not self._agreement.is_suspect
+        is_sure = sigma <= MODEL.limit and self._agreement.has_seen_gravity and not self._agreement.is_suspect
         return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma) if is_sure else None
 
     def _reported(self, sample: ImuSample) -> Quaternion:
         """Return the orientation that the IMU reports, world from IMU."""
         quaternion, last = unit_quaternion("orientation", sample.orientation), self._quaternion
-        turning, force = (ZERO if given is None else given for given in sample[1:3])
-        rate, force = three_floats("angular_velocity", turning), three_floats("linear_acceleration", force)
+        if sample.acceleration is None:
+            expected = "reported, with gravity in it: an orientation is used only while the accelerometer confirms it"
+            raise ParameterError("linear_acceleration", None, expected)
+        force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
+        imu_checks.check_unit(force, self._force)
+        rate = ZERO
+        if sample.angular_velocity is not None:
+            rate, _ = in_range("angular_velocity", sample.angular_velocity, self._fastest)
         dt, up = self._step(sample, rate + force, None), up_in_body(quaternion)
         reach = TUNING.fastest_report * max(dt, self._period) + TUNING.report_rounding
         if last and angle_between(up, up_in_body(last)) > reach:
             self._restart("orientation jumped")
+        self._force = None if is_cut else force
         self._quaternion = quaternion
         self._uncertainty.report(dt)
-        self._agreement.check_reported(dt, up, force)
+        self._has_turned = self._has_turned or any(rate)
+        before = self._rates[-1] if self._rates else rate
+        self._turn = plus(self._turn, plus(rate, before), 0.5 * dt)
+        self._jolt = max(self._jolt, math.dist(rate, before) * dt)
+        self._collect(rate, force, is_cut)
+        elapsed = self._time - self._judged
+        if elapsed >= TUNING.judgement_period:
+            if self._count:
+                mean = plus(ZERO, self._total, 1.0 / (self._count * STANDARD_GRAVITY))
+                turn = self._turn if self._has_turned else None
+                self._agreement.check_reported(elapsed, quaternion, mean, turn, self._jolt)
+            self._begin_judgement(rate)
         return quaternion
 
     def _fused(self, sample: ImuSample) -> Quaternion:
@@ -189,9 +214,7 @@ class TrunkEstimator:
             self._restart("too much rotation was not measured")
         self._force = None if is_cut else force
         quaternion = self._quaternion = self._fusion.advance(dt, rate, last, self._force)
-        self._rates.append(rate)
-        if not is_cut:
-            self._total, self._count = plus(self._total, force), self._count + 1
+        self._collect(rate, force, is_cut)
         is_fast = math.hypot(*rate) >= TUNING.fast
         if self._time - self._judged >= (TUNING.fast_period if is_fast else TUNING.judgement_period):
             self._judge(quaternion, force, self._fusion.bias_sigma)
@@ -204,11 +227,23 @@ class TrunkEstimator:
         spin_up, speed = (math.dist(first, middle) + math.dist(middle, rate)) / dt, math.hypot(*rate)
         if self._count:
             share, length = 1.0 / (self._count * STANDARD_GRAVITY), math.hypot(*force) / STANDARD_GRAVITY
-            agreement.check(dt, quaternion, plus(ZERO, self._total, share), length, spin_up + speed * speed)
+            unmeasured, swing = self._uncertainty.unmeasured, spin_up + speed * speed
+            agreement.check(dt, quaternion, plus(ZERO, self._total, share), length, swing, unmeasured)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
         contradiction = agreement.contradiction + self._speed * self._clock.offset
         self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
+        self._begin_judgement(rate)
+
+    def _collect(self, rate: Floats3, force: Floats3, is_cut: bool) -> None:
+        """Take a sample for the next judgement; is_cut: whether the force is saturated."""
+        self._rates.append(rate)
+        if not is_cut:
+            self._total, self._count = plus(self._total, force), self._count + 1
+
+    def _begin_judgement(self, rate: Floats3) -> None:
+        """Begin to collect for the next judgement; rate: rad/s, of the newest sample."""
         self._judged, self._rates, self._total, self._count = self._time, [rate], ZERO, 0
+        self._turn, self._jolt = ZERO, 0.0
 
     def _step(self, sample: ImuSample, values: tuple[float, ...], quaternion: Quaternion | None) -> float:
         """Return the time in s since the last sample, 0 if the estimate begins with this one; check both."""
@@ -218,6 +253,11 @@ class TrunkEstimator:
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
         self._equal.check(time, values, quaternion)
         self._time = time
+        try:
+            self._seldom.check(dt)
+        except ParameterError as error:
+            self._restart(f"{error.name} must be {error.expected}")
+            raise
         if 0.0 < dt <= TUNING.longest_gap and is_fused is self._is_fused:
             return dt
         self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")

@@ -1,62 +1,324 @@
-"""The gravity torques of any serial arm, from its URDF, by Pinocchio (extra `urdf`).
+"""Any serial arm, from its URDF, by Pinocchio (extra `urdf`).
 
-A URDF gives each link's mass and centre of gravity and each joint's place and axis. With the joint velocities and
-accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`). Gravity
-comes as a vector in the root link's axes, so that the base may tilt.
+A URDF gives each link's mass, centre of gravity and inertia, and each joint's place and axis. With the joint velocities
+and accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`).
+Gravity comes as a vector in the root link's axes, so that the base may tilt. The root link has the trunk's axes
+(REP-103).
+
+What the arm holds, a load or a wearer, are points of mass on its links. A wearer's segment lies on the line from its
+link's joint to the next joint, or from the last joint to the hand.
 """
 
+from __future__ import annotations
+
+import copy
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from exo_gravity import packaged
+from exo_gravity.core.arm.arm import (
+    MAX_GAIN,
+    MAX_GRAVITY,
+    MAX_MASS,
+    MAX_PAYLOAD,
+    MAX_REACH,
+    NO_PAYLOAD,
+    STANDARD_GRAVITY,
+)
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
+from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 
-TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
+PACKAGE = "package://"
+LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
+POSES = 500  # at random, for the least inertia
+
+
+def read_urdf(path: str) -> str:
+    """Return the text of a URDF file, whose path may begin with package://NAME/. Raises ParameterError."""
+    try:
+        return _located(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+
+
+def _located(path: str) -> Path:
+    if not path.startswith(PACKAGE):
+        return Path(path).expanduser()
+    name, _, rest = path.removeprefix(PACKAGE).partition("/")
+    if name == "exo_gravity" and (own := packaged(rest.removeprefix("config/"))):
+        return own
+    shares = [Path(prefix, "share", name) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if prefix]
+    found = (file for share in shares if (file := share / rest).exists())
+    return next(found, Path(path))
 
 
 class UrdfArm:
-    """The arm that `joint_names` (n,) move in the URDF `text`; the URDF's other joints are fixed at 0.
+    """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
-    A `GravityModel` of `core.compensation.laws`: max_effort (n,) Nm are the joints' effort limits in the URDF, 0 where
-    it has none; mass in kg is that of all links that they move. Raises ParameterError if the text is not a URDF, its
-    links have no mass, Pinocchio is missing, or a joint is missing or does not turn.
+    It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm.
+
+    hand: the link that holds a load, '' if there is none.
+    rotors: inertia of the motors' rotors at the joints, (n,) kg m^2, which a URDF does not state; () for none.
+
+    Raises ParameterError if the text is not a URDF, its links have no mass, Pinocchio is missing, the hand is no link,
+    a joint is missing or does not turn, or a description is incomplete (`urdf_checks`).
+
+    max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
+    notes: sentences on what is doubtful in the URDF, for the log.
+    length: (n,) m from each joint to the next one, and from the last one to the hand; 0 if there is no hand.
     """
 
-    def __init__(self, text: str, joint_names: Sequence[str]) -> None:
-        try:
-            import pinocchio as pin
-        except ImportError:
-            raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
-        try:
-            self._model = pin.buildModelFromXML(text)
-        except (RuntimeError, ValueError) as error:
-            expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
-            raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
+    def __init__(self, text: str, joint_names: Sequence[str], hand: str = "", rotors: Sequence[float] = ()) -> None:
+        self._pin, names = _pinocchio(), list(joint_names)
+        if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
+            raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
+        self._moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
+        self._model = self._moves.model
+        if hand and not self._model.existBodyName(hand):
+            links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
+            raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
+        self._joints = [self._model.getJointId(name) for name in names]
+        self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
+        self.payload = NO_PAYLOAD
+        self._hand = hand
+        self._rotors = tuple(rotors) or (0.0,) * len(names)
+        self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
+        self._identity = text, tuple(names)
+        self._bare = self._model  # without load and wearer
         self._data = self._model.createData()
-        self._pin, self._neutral = pin, pin.neutral(self._model)
-        numbers = dict(zip(self._model.names, range(self._model.njoints), strict=True))
-        turning = [name for name, n in numbers.items() if n and self._model.joints[n].shortname().startswith(TURNING)]
-        for name in joint_names:
-            if name not in turning:
-                expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
-                raise ParameterError("joint_names", name, expected)
-        self._order = [self._model.joints[numbers[name]].idx_v for name in joint_names]
-        limits = (float(self._model.effortLimit[index]) for index in self._order)
-        self.max_effort = tuple(limit if 0.0 < limit < math.inf else 0.0 for limit in limits)
-        pin.computeSubtreeMasses(self._model, self._data)
-        self.mass = max(self._data.mass[numbers[name]] for name in joint_names)
-        if not self.mass > 0.0:
-            raise ParameterError("mass of the URDF's links", self.mass, "above 0 kg: it lacks inertial elements")
+        self._pin.computeSubtreeMasses(self._model, self._data)
+        self._own_mass = max(self._data.mass[joint] for joint in self._joints)
+        if not self._own_mass > 0.0:
+            raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
+        self.max_effort, unused = usable_efforts(self._moves)
+        self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
+        self._along = self._ways()
+        self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
-    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> tuple[float, ...]:
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, UrdfArm) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        return (*self._identity, self._hand, self._rotors, self.scale, self.payload, self._worn, self._own_mass)
+
+    @cached_property
+    def scale(self) -> tuple[float, ...]:
+        """(n,) m/s^2, gain times gravity."""
+        return tuple((self.gain * self.gravity).tolist())
+
+    @property
+    def total_mass(self) -> float:
+        """Kg of the links that the joints move, and of what they hold."""
+        return float(self._own_mass + self.given_mass)
+
+    @property
+    def given_mass(self) -> float:
+        """Kg of load and wearer: the URDF states the rest."""
+        return self.payload[0] + sum(mass for mass, _ in self._worn)
+
+    @property
+    def has_hand(self) -> bool:
+        """Whether it is known where a load is held."""
+        return bool(self._hand)
+
+    @property
+    def facts(self) -> Mapping[str, Sequence[float] | None]:
+        """The mass of the links."""
+        return {"mass (kg)": (self._own_mass,)}
+
+    @cached_property
+    def links(self) -> UrdfLinks:
+        """The inertia of links, load, wearer and rotors."""
+        return UrdfLinks(self._pin, self._model, self._moves, self._rotors)
+
+    def worn_links(self, mass: Vector, cog: Vector) -> UrdfLinks:
+        """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
+        return self.with_wearer(mass, cog).links
+
+    @property
+    def fixed(self) -> tuple[str, ...]:
+        """The joints that are not the arm's, change its torque, and are taken to be at 0: none is reported."""
+        return self._moves.fixed
+
+    def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take the positions (m,) of all joints that are reported, by their names (m,), for all copies of this arm.
+
+        Raises ParameterError if one that changes the torque is missing or not finite.
+        """
+        self._moves.follow(names, positions)
+
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
 
-        gravity: (3,) m/s^2 in the axes of the URDF's root link.
+        Raises ParameterError while a joint on which it depends is not known (`follow`).
         """
-        moved = np.zeros(self._model.nv)
-        moved[self._order] = theta
-        q = self._pin.integrate(self._model, self._neutral, moved)
-        self._model.gravity.linear = np.array(gravity)
-        torque = self._pin.computeGeneralizedGravity(self._model, self._data, q)
-        return tuple(float(torque[index]) for index in self._order)
+        felt = self.gravity * tilt.magnitude
+        return self._holding(theta, [felt * component for component in tilt.gravity_in_trunk], ZERO)
+
+    def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.
+
+        angular_acceleration: of the trunk, (3,) rad/s^2 in its own axes, which the root link has on either side.
+        """
+        return self._holding(theta, ZERO, [-component for component in angular_acceleration])
+
+    def scaled(self, gain: Sequence[float], gravity: float) -> UrdfArm:
+        """Return this arm with other gains, (n,), and another gravity, m/s^2. Raises ParameterError."""
+        arm = copy.copy(self)
+        arm.gain = floats("gain", gain, len(self.gain), 0.0, MAX_GAIN)
+        arm.gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
+        arm._anew().__dict__["links"] = self.links  # what takes long to compute, the least inertia, is computed once
+        return arm
+
+    def massless(self, gravity: float) -> UrdfArm:
+        """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
+        arm = self.scaled(np.ones(len(self.gain)).tolist(), gravity)
+        arm.payload, arm._worn, arm._own_mass = NO_PAYLOAD, (), 0.0
+        arm._bare = self._bare.copy()
+        for joint in range(arm._bare.njoints):
+            arm._bare.inertias[joint] = self._pin.Inertia.Zero()
+        return arm._held()
+
+    def with_payload(self, mass: float, cog: Vector = ZERO) -> UrdfArm:
+        """Return this arm with a load of `mass` kg in its hand, instead of any other. Raises ParameterError.
+
+        cog: (3,) m, its centre of gravity in the frame of the link `hand`.
+        """
+        mass = one_float("payload.mass", mass, 0.0, MAX_PAYLOAD, "kg")
+        if mass and not self._hand:
+            raise ParameterError("payload.mass", mass, "0 without urdf.hand, which says where a load is held")
+        arm = copy.copy(self)
+        x, y, z = floats("payload.cog", cog, 3, -MAX_REACH, MAX_REACH, "m").tolist()
+        arm.payload = mass, x, y, z
+        return arm._held()
+
+    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> UrdfArm:
+        """Return this arm plus a share `support` (0..1) of the wearer's arm. Raises ParameterError.
+
+        mass, cog: of the wearer's segment on each link, (n,) kg, and (n,) m from the link's joint along the link.
+        """
+        count = len(self.gain)
+        carried = floats("wearer.mass", mass, count, 0.0, MAX_MASS, "kg") * one_float("support", support, 0.0, 1.0)
+        distance = floats("wearer.cog", cog, count, 0.0, math.inf, "m")
+        if any(distance > self.length):
+            raise ParameterError("wearer.cog", cog, f"within its link, at most {[round(x, 3) for x in self.length]} m")
+        for number, (own, length) in enumerate(zip(carried, self.length, strict=True), start=1):
+            if own and length < LEAST_LENGTH:
+                raise ParameterError("wearer.mass", mass, f"0 on link {number}, which has no length and no direction")
+        arm = copy.copy(self)
+        arm._worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
+        return arm._held()
+
+    def _anew(self) -> UrdfArm:
+        """Forget what was computed for the arm that this is a copy of."""
+        for name in ("scale", "links"):
+            self.__dict__.pop(name, None)
+        self._data = self._model.createData()
+        return self
+
+    def _held(self) -> UrdfArm:
+        """Put load and wearer on the links."""
+        self._model, load = self._bare.copy(), self.payload
+        if load[0]:
+            frame = self._model.frames[self._model.getBodyId(self._hand)]
+            self._add(frame.parentJoint, load[0], frame.placement.act(np.array(load[1:])))
+        for joint, (mass, cog), way in zip(self._joints, self._worn, self._along, strict=False):
+            if mass:
+                self._add(joint, mass, way * (cog / np.linalg.norm(way)))
+        return self._anew()
+
+    def _add(self, joint: int, mass: float, place: np.ndarray) -> None:
+        """Add a point of `mass` kg to the link of `joint`, at `place` (3,) m in the joint's frame."""
+        point = self._pin.Inertia(mass, place, np.zeros((3, 3)))
+        self._model.appendBodyToJoint(joint, point, self._pin.SE3.Identity())
+
+    def _holding(self, theta: Sequence[float], gravity: Sequence[float], turning: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm where gravity is `gravity` (3,) m/s^2, as the root link feels it.
+
+        turning: (3,) rad/s^2, less the root link's angular acceleration.
+        """
+        model = self._model
+        model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
+        torque = self._pin.computeGeneralizedGravity(model, self._data, self._moves.configuration(theta))
+        return tuple((self.gain * self._moves.folded(torque)).tolist())
+
+    def _ways(self) -> list[np.ndarray]:
+        """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
+        pin, model = self._pin, self._model
+        pin.forwardKinematics(model, self._data, pin.neutral(model))
+        pin.updateFramePlacements(model, self._data)
+        places = self._data.oMi
+        ways = []
+        for joint in self._joints:
+            following = [other for other in self._joints if model.parents[other] == joint]
+            if len(following) == 1:
+                ways.append(places[joint].actInv(places[following[0]].translation))
+                continue
+            hand = self._hand and model.frames[model.getBodyId(self._hand)]
+            is_held = hand and hand.parentJoint == joint
+            ways.append(hand.placement.translation.copy() if is_held else np.zeros(3))
+        return ways
+
+
+class UrdfLinks:
+    """The inertia of an arm by Pinocchio: `Links` of core/arm/interface.py.
+
+    moves: how the joints of `model` move.
+    rotors: (n,) kg m^2 at the joints.
+    """
+
+    def __init__(self, pin: Any, model: Any, moves: UrdfJoints, rotors: Sequence[float]) -> None:
+        self._pin, self._moves, self._rotors = pin, moves, np.array(rotors)
+        self._model, self._data = model, model.createData()
+
+    def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
+        self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
+        rates = (self._moves.spread(values) for values in (velocity, acceleration))
+        torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
+        return tuple((self._moves.folded(torque) + self._rotors * acceleration).tolist())
+
+    def momentum(
+        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
+    ) -> tuple[Torque, Torque]:
+        """Return the generalized momentum p = M v, (n,) kg m^2/s, and C^T v, (n,) Nm, with M' = C + C^T.
+
+        turning: angular velocity of the base, (3,) rad/s, whose part is neglected.
+        """
+        speed, at = self._moves.spread(velocity), self._moves.configuration(theta)
+        momentum = self.matrix(theta) @ np.asarray(velocity)
+        coriolis = self._pin.computeCoriolisMatrix(self._model, self._data, at, speed)
+        return tuple(momentum.tolist()), tuple(self._moves.folded(coriolis.T @ speed).tolist())
+
+    def matrix(self, theta: Sequence[float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
+        upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
+        return np.asarray(self._moves.folded_matrix(upper + np.triu(upper, 1).T) + np.diag(self._rotors))
+
+    @cached_property
+    def least(self) -> tuple[float, ...]:
+        """The least inertia (n,) in kg m^2 that each joint feels, the other joints being free, in poses at random."""
+        poses = np.random.default_rng(0).uniform(-math.pi, math.pi, (POSES, len(self._moves.names)))
+        return tuple(np.min([1.0 / np.diag(np.linalg.inv(self.matrix(pose))) for pose in poses], axis=0).tolist())
+
+
+def _pinocchio() -> Any:
+    try:
+        import pinocchio
+    except ImportError:
+        raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
+    return pinocchio

@@ -21,11 +21,12 @@ from typing import Any
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.motors.boards import CHECK
-from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES, JointMotor, JointSample
+from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_of_bus
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -306,12 +307,12 @@ def accept(bench: Bench, say: Callable[[str], None]) -> list[BenchStep]:
     return results
 
 
-def record(results: Sequence[BenchStep], arm: str, is_simulated: bool) -> dict[str, Any]:
+def record(results: Sequence[BenchStep], arm: str, source: Source) -> dict[str, Any]:
     """Return the record of an acceptance, for a JSON file."""
     passed = [result.name for result in results if result.passed] == [step.__name__ for step in STEPS]
     date = datetime.now().astimezone().isoformat(timespec="seconds")
     steps = [asdict(result) for result in results]
-    return {"arm": arm, "date": date, "simulated": is_simulated, "passed": passed, "steps": steps}
+    return {"arm": arm, "date": date, "source": source.value, "passed": passed, "steps": steps}
 
 
 def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, person: Any) -> bool:
@@ -332,7 +333,7 @@ def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, p
         held.callback(loop.stop)
         bench = Bench(loop, lift, arm.motors, arm.robot, weight, time.sleep, person.wait, COMPUTER_CLOCK)
         results = accept(bench, person.say)
-    written = record(results, arm.name, interface in SIMULATED_BUSES)
+    written = record(results, arm.name, source_of_bus(interface, channel))
     output.write_text(json.dumps(written, indent=2, default=float) + "\n", encoding="utf-8")
     person.say(f"Written: {output}")
     return bool(written["passed"])

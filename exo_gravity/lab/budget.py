@@ -16,7 +16,8 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.ak import AK
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
@@ -28,26 +29,19 @@ CHUNK = 2_000  # poses, about 1 ms of computation
 TOLERANCE = 1e-3  # Nm, or support; smaller differences are irrelevant to a motor
 STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 comes first, so that the search stays put at a tie
 
-# Rated and peak torque in Nm. Source for motors other than the two that the package drives: the maker's product pages
-# of February 2024, collected in gatech-epic-power/epically-powerful (actuation/motor_data.py); AK10-9 is V2.0.
-FAMILY = {
-    **{spec.name: (spec.rated_torque, spec.peak_torque) for spec in MOTORS.values()},
-    "AK70-10": (10.0, 24.8),
-    "AK10-9": (18.0, 48.0),
-    "AK80-64": (48.0, 120.0),
-}
-
 
 def motor_for(torque: float) -> str | None:
-    """Return the motor with the smallest rated torque that covers `torque` Nm, or None if no motor does."""
-    return min((name for name in FAMILY if FAMILY[name][0] >= torque), key=lambda name: FAMILY[name][0], default=None)
+    """Return the AK motor with the smallest rated torque that covers `torque` Nm, or None if no motor does."""
+    strong = [spec for spec in AK.motors.values() if spec.rated_torque >= torque]
+    return min(strong, key=lambda spec: spec.rated_torque).name if strong else None
 
 
 def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
     """Return rated and peak torque (2, 4) in Nm of `motors` whose real torque is `torque_scale` times the command."""
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
     scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
-    return np.asarray(scale * np.transpose([FAMILY[motor] for motor in motors]))
+    torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in motors]
+    return np.asarray(scale * np.transpose(torques))
 
 
 def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np.ndarray:

@@ -13,7 +13,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor, wait
-from enum import IntEnum
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,12 +20,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import named
-from exo_gravity.core.motors.joint_motor import REPLY_SHARE, Traffic, motors_of, traffic_of
+from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, check_bridge, limits_of
+from exo_gravity.hardware.can.adapter import serials_of
+from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour, request_real_time
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
+from exo_gravity.lab.adapters import of_opening
+from exo_gravity.lab.findings import Finding, Level, judged
 from exo_gravity.lab.inputs.arms import node_values
+from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, stages
+from exo_gravity.lab.packages import MissingPackageError, check_packages
 
 LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
 SLOW_WAKE = 0.1  # of a period, for which a CPU may wake from its deepest idle state
@@ -49,39 +54,12 @@ REMEDIES = {  # the command for each finding about the computer
 }
 
 
-class Level(IntEnum):
-    """How bad a finding is."""
-
-    FINE = 0
-    UNKNOWN = 1  #: the computer does not state it
-    NOTE = 2  #: could be better, without an effect that was seen
-    WARNING = 3
-    FAULT = 4  #: no one may wear an arm that this computer controls
-
-
-class Finding(NamedTuple):
-    """One row. remedy: the command that fixes it, '' for none."""
-
-    what: str
-    found: str
-    wanted: str
-    level: Level = Level.FINE
-    remedy: str = ""
-
-
 class Wakeups(NamedTuple):
     """Wake-ups of a thread like the control loop's."""
 
     lateness: np.ndarray  #: s after each cycle was due
     nice: int  #: the nice value that it got
     refused: tuple[str, ...] = ()  #: a sentence for each real-time setting that was asked for and is not permitted
-
-
-def judged(what: str, found: str, wanted: str, is_fine: bool, otherwise: Level, remedy: str) -> Finding:
-    """Return a finding: FINE or `otherwise`; UNKNOWN where nothing was found."""
-    if not found:
-        return Finding(what, "not stated", wanted, Level.UNKNOWN)
-    return Finding(what, found, wanted) if is_fine else Finding(what, found, wanted, otherwise, remedy)
 
 
 def _text(path: Path) -> str:
@@ -255,6 +233,24 @@ def _link(name: str) -> Mapping[str, Any]:
     return dict(links[0]) if links else {}
 
 
+def of_use_sim_time(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
+    """Judge each node that waits for /clock. bridges: those with a real bus refuse it."""
+    for node, given in nodes.items():
+        if given.get("use_sim_time") is True:
+            is_real = node in bridges and bridges[node]["can.interface"] not in SIMULATED_BUSES
+            level, wanted = Level.FAULT if is_real else Level.WARNING, "false, or a program that publishes /clock"
+            yield Finding(f"{node}: use_sim_time", "true", wanted, level, "remove use_sim_time from the file")
+
+
+def of_packages(nodes: Nodes) -> Iterator[Finding]:
+    """Judge whether the Python packages are installed without which a node does not start."""
+    for node in nodes:
+        try:
+            check_packages((node.rpartition("/")[2],))
+        except MissingPackageError as error:
+            yield Finding(f"{node}: packages", "missing", "installed", Level.WARNING, str(error))
+
+
 def of_port(port: str, root: Path) -> Finding:
     """Judge a serial port, whose USB adapter may keep bytes for some time."""
     device = (root / port.partition("@")[0].lstrip("/")).resolve()
@@ -276,6 +272,10 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
             rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
             for bus in buses.values():
                 check_bridge(rate, motors_of(values), limits, bus.status_rate)
+            serials = serials_of(values["can.serial"], values["can.channel"])
+            address = values["can.interface"], values["can.channel"], can_options(nodes[node])
+            arm = ArmOnBus(address, motors_of(values), limits, 1.0 / rate, serials=serials)
+        yield from (of_opening(node, part) for part in arm.parts)
         for channel, bus in buses.items():
             yield of_load(f"{node} {channel}", bus, rate)
             if values["can.interface"] == "socketcan":
@@ -290,6 +290,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
 def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     """Return every finding; seconds: for which wake-ups are measured. Raises ParameterError."""
     check_buses(nodes)
+    check_nodes(nodes)
     bridges = {node: node_values(nodes, node, CAN_BRIDGE) for node in stages(nodes)[0]}
     buses = list(of_buses(nodes, bridges, root))
     settings = list(bridges.values()) or [{param.name: param.default for param in CAN_BRIDGE}]
@@ -304,5 +305,7 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
         *of_computer(root, wakeups, period, late.level > Level.FINE, priority),
         *of_middleware(middleware or MIDDLEWARE, reach, open_to_others()),
         of_multicast(any(s["can.interface"] == "udp_multicast" for s in settings)),
+        *of_packages(nodes),
+        *of_use_sim_time(nodes, bridges),
         *buses,
     ]

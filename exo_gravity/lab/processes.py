@@ -12,6 +12,7 @@ arm down and nothing else.
 import _thread
 import contextlib
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,13 +25,13 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 
-import yaml
-
-from exo_gravity.core.compensation.settings import URDF_LAW
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
-from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, check_buses, load, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, check_buses, load, stages
+from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.lab.packages import check_packages
 
 NODES_PACKAGE = "exo_gravity.nodes."
 ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
@@ -123,14 +124,32 @@ def wearers(nodes: Nodes) -> list[str]:
     return found
 
 
-def in_namespace(params: Path, namespace: str) -> Path:
-    """Return a parameter file whose nodes are in `namespace` ('/lab'): `params` itself if that is ''."""
-    if not namespace:
-        return params
-    content = yaml.load(params.read_text(encoding="utf-8"), Loader)
-    path = Path(tempfile.mkdtemp(prefix="exo_gravity_"), params.name)
-    path.write_text(yaml.safe_dump({f"{namespace}{node}": entry for node, entry in content.items()}), encoding="utf-8")
-    return path
+def node_arguments(node: str, params: Path, namespace: str, log_level: str) -> list[str]:
+    """Return the arguments of a node's executable; node: its full name, in `namespace` ('/lab', '' for none)."""
+    space, name = node.rsplit("/", 1)
+    topics = [f"{topic}:={namespace}{topic}" for topic in ABSOLUTE_TOPICS if namespace]
+    remaps = [word for rule in (f"__node:={name}", f"__ns:={space or '/'}", *topics) for word in ("-r", rule)]
+    return ["--ros-args", *remaps, "--enclave", node, "--params-file", str(params), "--log-level", log_level]
+
+
+def planned(
+    params: str | Path, only: Sequence[str] = (), more: Sequence[str] = ()
+) -> tuple[Nodes, list[str], list[str]]:
+    """Return what to start for a parameter file: the nodes with their parameters, those to start, and who asks.
+
+    The last are the bridges whose start asks a person whether the arm hangs as it is drawn.
+
+    only, more: as in `Launcher`. Raises ParameterError, MissingPackageError.
+    """
+    nodes = {**{node: {} for node in more}, **load(params)}
+    check_buses(nodes)
+    nodes |= {node: {} for node in wearers(nodes)}
+    names = chosen(nodes, only)
+    for node in names:
+        command_of(node)
+    check_packages(node.rpartition("/")[2] for node in names)
+    asking = [node for node in stages(names)[0] if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
+    return nodes, names, asking
 
 
 class Launcher:
@@ -139,7 +158,7 @@ class Launcher:
     on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
     starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
     in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
-    compensator of an arm share one. Raises ParameterError.
+    compensator of an arm share one. Raises ParameterError, MissingPackageError.
     """
 
     def __init__(
@@ -152,12 +171,12 @@ class Launcher:
         log_level: str = "info",
         one_process: bool = False,
     ) -> None:
-        self._path = Path(params).resolve()
-        nodes = {**{node: {} for node in more}, **load(self._path)}
-        check_buses(nodes)
-        nodes |= {node: {} for node in wearers(nodes)}
-        self._path, self._namespace, self._log_level = in_namespace(self._path, namespace), namespace, log_level
-        names = chosen(nodes, only)
+        nodes, names, asking = planned(params, only, more)
+        self._namespace, self._log_level = namespace, log_level
+        #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
+        self.params = Path(tempfile.mkdtemp(prefix="exo_gravity_"), Path(params).name)
+        content = text_of({f"{namespace}{node}": values for node, values in nodes.items()})
+        self.params.write_text(content, encoding="utf-8")
         pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
         # The compensator that shares the process of its can_bridge
         self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}
@@ -168,7 +187,7 @@ class Launcher:
         self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
         #: The bridges whose start asks a person whether the arm hangs as it is drawn.
-        self.asking = [f"{namespace}{node}" for node in pairs if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
+        self.asking = [f"{namespace}{node}" for node in asking]
 
     def start(self) -> None:
         """Start every node."""
@@ -218,6 +237,7 @@ class Launcher:
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
         self._terminate(recorders, STOP_TIMEOUT)
+        shutil.rmtree(self.params.parent, ignore_errors=True)
 
     def _terminate(self, nodes: list[str], timeout: float) -> None:
         """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""
@@ -271,12 +291,7 @@ class Launcher:
         return [*command_of(node), *self._words(node)]
 
     def _words(self, node: str) -> list[str]:
-        node = f"{self._namespace}{node}"
-        namespace, name = node.rsplit("/", 1)
-        topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
-        remaps = [word for rule in (f"__node:={name}", f"__ns:={namespace or '/'}", *topics) for word in ("-r", rule)]
-        options = ("--enclave", node, "--params-file", str(self._path), "--log-level", self._log_level)
-        return ["--ros-args", *remaps, *options]
+        return node_arguments(f"{self._namespace}{node}", self.params, self._namespace, self._log_level)
 
     def _read(self, node: str, process: subprocess.Popen[str]) -> None:
         names = (node, self._guests[node]) if node in self._guests else ()

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
+from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
@@ -43,6 +44,7 @@ DEPTH = 50
 WATCH_PERIOD = 0.1  # s
 POLLS_A_SAMPLE = 2.0  # of a device
 MIN_POLL_PERIOD = 0.002  # s
+REFUSAL_TIME = 0.25  # s for which a refusal is reported: slow samples, each of which is refused, are 0.1 s apart
 LOG_PERIOD = 1.0  # s between two warnings of lost samples
 SAME_CLOCK = 5.0  # s between stamp and arrival
 UNKNOWN_HEADING = math.pi**2  # rad^2, its variance
@@ -64,8 +66,8 @@ class ImuNode(Node):
         self._driver = Publishers()
         self._received = self._published = self._refused = 0
         self._rate = Rate()
-        self._refusal: ParameterError | None = None  # since the last report
-        self._last_refusal = ""
+        self._refusal: ParameterError | None = None  # the last one,
+        self._refused_at = -math.inf  # monotonic s
         self._diagnostics = Diagnostics(self)
         self._pitch_yaw = self.create_publisher(Vector3Stamped, PITCH_YAW, DEPTH)
         self._data = self.create_publisher(Imu, DATA, DEPTH)
@@ -93,18 +95,21 @@ class ImuNode(Node):
             self._refused += 1
             return
         sample, now = sample_of(message), self.get_clock().now().nanoseconds * 1e-9
+        if message.angular_velocity_covariance[0] == NOT_REPORTED and sample.angular_velocity is not None:
+            sentence = "angular_velocity_covariance[0] = -1 says that it is not measured, but it is there: it is used"
+            self.get_logger().warning(sentence, once=True)
         try:
             # The stamps of a record that is played back are not this computer's: the compensator refuses their age.
             orientation = self._estimator.update(sample, now if abs(now - sample.time) < SAME_CLOCK else None)
         except ParameterError as error:
             self._refused += 1
-            self._refusal, self._last_refusal = error, str(error)
+            self._refusal, self._refused_at = error, self._arrived
             return
         if orientation is not None:
             self._published += 1
-            self._publish(message, orientation)
+            self._publish(message, sample, orientation)
 
-    def _publish(self, message: Imu, orientation: TrunkOrientation) -> None:
+    def _publish(self, message: Imu, sample: ImuSample, orientation: TrunkOrientation) -> None:
         tilt = Vector3Stamped()
         tilt.header.stamp, tilt.header.frame_id = message.header.stamp, "trunk"
         tilt.vector.x, tilt.vector.y = orientation.roll, orientation.pitch
@@ -115,16 +120,18 @@ class ImuNode(Node):
         variance = orientation.uncertainty**2
         data.orientation_covariance = np.diag((variance, variance, UNKNOWN_HEADING)).ravel()
         # In the trunk's axes. A covariance of zeros means unknown, one of -1 means not reported (REP-145).
-        rotation = self._estimator.rotation
-        rate.x, rate.y, rate.z = (rotation @ _vector(message.angular_velocity)).tolist()
-        acceleration.x, acceleration.y, acceleration.z = (rotation @ _vector(message.linear_acceleration)).tolist()
-        data.angular_velocity_covariance[0] = min(message.angular_velocity_covariance[0], 0.0)
-        data.linear_acceleration_covariance[0] = min(message.linear_acceleration_covariance[0], 0.0)
+        for vector, covariance, values in (
+            (rate, data.angular_velocity_covariance, sample.angular_velocity),
+            (acceleration, data.linear_acceleration_covariance, sample.acceleration),
+        ):
+            covariance[0] = NOT_REPORTED if values is None else 0.0
+            if values is not None:
+                vector.x, vector.y, vector.z = (self._estimator.rotation @ values).tolist()
         self._data.publish(data)
 
     def _report(self) -> None:
         now = time.monotonic()
-        age, refusal, self._refusal = now - self._arrived, self._refusal, None
+        age, refusal = now - self._arrived, self._refusal
         values: dict[str, object] = {
             "rate (Hz)": f"{self._rate.update(now, self._received):.0f}",
             "age of samples (ms)": milliseconds(age),
@@ -132,7 +139,7 @@ class ImuNode(Node):
             "missed": self._driver.missed,
             "published": self._published,
             "refused": self._refused,
-            "refusal text": self._last_refusal,
+            "refusal text": refusal or NONE,
             "gyroscope bias (rad/s)": row(self._estimator.gyroscope_bias, 4),
         }
         if self._device:
@@ -141,12 +148,12 @@ class ImuNode(Node):
             level, state, message = ERROR, ImuState.NO_DEVICE, self._device.reopening.problem
         elif not self._received:
             level, state, message = WARN, ImuState.WAITING, f"waiting for {self._topic}"
+        elif refusal and now - self._refused_at < REFUSAL_TIME:
+            level, state, message = ERROR, ImuState.REFUSING, f"refused: {refusal.name} must be {refusal.expected}"
         elif age > self._timeout:
             level, state, message = ERROR, ImuState.STOPPED, f"no samples on {self._topic}"
         elif self._driver.are_several:
             level, state, message = ERROR, ImuState.SECOND_PUBLISHER, f"more than one publisher of {self._topic}"
-        elif refusal:
-            level, state, message = ERROR, ImuState.REFUSING, f"refused: {refusal.name} must be {refusal.expected}"
         elif self._estimator.settling:
             level, state, message = WARN, ImuState.SETTLING, f"settling: {self._estimator.settling}"
         else:
@@ -209,13 +216,13 @@ class ImuDevice(PeriodicThread):
 
 
 def sample_of(message: Imu) -> ImuSample:
-    """Return the message's sample; a quantity whose covariance says 'not reported' (-1, REP-145) becomes None."""
+    """Return the message's sample; a quantity that the driver does not measure is None."""
     q = message.orientation
     return ImuSample(
         to_nanoseconds(message.header.stamp) * 1e-9,
-        None if message.angular_velocity_covariance[0] == NOT_REPORTED else _vector(message.angular_velocity),
-        None if message.linear_acceleration_covariance[0] == NOT_REPORTED else _vector(message.linear_acceleration),
-        None if message.orientation_covariance[0] == NOT_REPORTED else (q.x, q.y, q.z, q.w),
+        reported_vector(_vector(message.angular_velocity), message.angular_velocity_covariance[0]),
+        reported_vector(_vector(message.linear_acceleration), message.linear_acceleration_covariance[0]),
+        reported_orientation((q.x, q.y, q.z, q.w), message.orientation_covariance[0]),
     )
 
 

@@ -18,20 +18,23 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of
+from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, is_fd
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.vocabulary import NodeState, SimulatorWarning, words
 from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.lab.packages import extras
 from exo_gravity.nodes.imu import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
-from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare
+from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED
-from exo_gravity.sim import SimulatedImu, VirtualWearer
-from exo_gravity.sim.device import MAX_CATCH_UP
-from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
-from exo_gravity.sim.script import IDLE, Step, TrialScript
-from exo_gravity.sim.trunk_motion import TrunkState
+
+with extras("simulator", "sim"):
+    from exo_gravity.sim import SimulatedImu, VirtualWearer
+    from exo_gravity.sim.device import MAX_CATCH_UP
+    from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
+    from exo_gravity.sim.script import IDLE, Step, TrialScript
+    from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
 
@@ -55,12 +58,13 @@ class Simulator(Node):
 
     def __init__(self) -> None:
         super().__init__("simulator", automatically_declare_parameters_from_overrides=True)
-        values = declare(self, SIMULATOR, free_prefix=OPTIONS)
+        table = simulator_table(given_to(self))
+        values = declare(self, table, free_prefix=OPTIONS)
         self._device = device_of(values)
         set_faults(self._device, values)
         # The script that starts next, and how many s after the motors are on; None for one that is set live: at once.
         self._queued = deque[tuple[TrialScript, float | None]](maxlen=1)
-        if script := script_of(values["trial"]):
+        if script := self._script_of(values["trial"]):
             self._queued.append((script, values["trial_delay"]))
         self._trunk_target = (values["trunk.pitch"], values["trunk.roll"])
         self._published_step: int | None = None
@@ -71,12 +75,15 @@ class Simulator(Node):
         self._imu_publisher = self.create_publisher(Imu, topic, qos_profile_sensor_data) if topic else None
         self._trunk_period = 1.0 / self._imu.config.rate
         self._trunk_due = 0.0  # monotonic s
-        accept_changes(self, SIMULATOR, lambda values: (values, script_of(values["trial"])), self._apply)
+        accept_changes(self, table, lambda values: (values, self._script_of(values["trial"])), self._apply)
         self.failure: Exception | None = None
         self._stopping = threading.Event()
-        interface, channel, options = bus_of(self, values)
-        buses = {name: open_bus(interface, name, own) for name, (_, own) in buses_of(channel, options).items()}
-        self._buses = [buses[name] for name in channels_of(channel)]  # of each motor
+        (interface, channel, options), count = bus_of(self, values), len(self._device.motors)
+        of_bus = {name: own for name, (_, own) in buses_of(channel, options, count).items()}
+        buses = {name: open_bus(interface, name, own) for name, own in of_bus.items()}
+        channels = channels_of(channel, count)
+        self._buses = [buses[name] for name in channels]  # of each motor
+        self._device.is_fd = [is_fd(of_bus[name]) for name in channels]
         names = " and ".join(str(bus.channel_info) for bus in buses.values())
         self.get_logger().info(f"simulated {values['side']} arm on {names}")
         self._thread = threading.Thread(target=self._play, name="device", daemon=True)
@@ -99,6 +106,13 @@ class Simulator(Node):
             self._device.run(self._buses, self._stopping.is_set, self._on_idle)
         except Exception as error:
             self.failure = error
+
+    def _script_of(self, path: str) -> TrialScript | None:
+        """Return the script in a file for this arm, None if `path` is empty. Raises ParameterError."""
+        script = script_of(path)
+        if script:
+            script.check(len(self._device.motors))
+        return script
 
     def _on_idle(self, now: float) -> None:
         if now >= self._trunk_due:

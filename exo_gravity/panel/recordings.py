@@ -23,6 +23,7 @@ import yaml
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
+from exo_gravity.lab.inputs.ros_yaml import dumped
 from exo_gravity.lab.trial.session import Session, check_text
 from exo_gravity.panel.view import OF_SUBJECT
 from exo_gravity.sim.script import TrialScript
@@ -260,7 +261,7 @@ class Recordings:
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
     """Write a parameter file. Raises OSError."""
-    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), "utf-8")
+    path.write_text(dumped(content), "utf-8")
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.control import Control, Page
 
 FOLDER = Path(__file__).parent
@@ -89,6 +89,7 @@ class PanelServer:
             Route("/action", self._on_action, methods=["POST"]),
             Route("/report/{name:path}", self._on_report),
             Route("/sessions", lambda request: JSONResponse(control.files.past())),
+            Route("/settings/{arm:path}", self._on_settings),
             Route("/parameters", lambda request: JSONResponse(control.arms.parameters())),
             WebSocketRoute("/live", self._on_live),
             Route("/login", self._on_login, methods=["GET", "POST"]),
@@ -167,6 +168,16 @@ class PanelServer:
         secret = request.headers.get("x-panel-page", "")
         status, text = await self._control.perform(content, secret, address_of(request))
         return JSONResponse({"error": text}, status)
+
+    async def _on_settings(self, request: Request) -> Response:
+        """Answer with the arm's settings at this moment: a question to its operator must not be about older ones."""
+        arm = request.path_params["arm"]
+        if arm not in self._control.arms.names:
+            return JSONResponse({"error": f"there is no arm {arm}"}, 404)
+        try:
+            return JSONResponse({"settings": await self._control.arms.settings_of(arm)})
+        except ExoGravityError as error:
+            return JSONResponse({"error": str(error)}, 503)
 
     async def _on_login(self, request: Request) -> Response:
         return await self.access.login(request) if request.method == "POST" else RedirectResponse("/")

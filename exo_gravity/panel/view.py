@@ -8,8 +8,8 @@ from typing import Any
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.params import Param
+from exo_gravity.lab.source import source_of
 from exo_gravity.lab.view.urdf import described, urdf
 
 # fmt: off
@@ -22,6 +22,8 @@ PANEL = (
     Param("language", "auto", "language of the page until its user chooses another; auto: the browser's",
           choices=("auto", "en", "de"), fixed=True),
     Param("trials", "", "folder with trial scripts; empty: those of the package", fixed=True),
+    Param("markers", ["begin", "end", "rest", "fatigue", "pain", "artefact"], "texts of the buttons that set a marker",
+          any_length=True, fixed=True),
     Param("output", "recordings", "folder for recordings, trials and saved parameters", fixed=True),
 )
 # fmt: on
@@ -111,5 +113,5 @@ def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     return {
         "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},
-        "simulated": bridge.get("can.interface") in SIMULATED_BUSES,
+        "source": source_of(bridge, False).value,
     }

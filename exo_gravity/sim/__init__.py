@@ -1,4 +1,4 @@
-"""The simulated device: a MuJoCo arm, four AK motors that exchange real CAN frames, a trunk IMU and a virtual wearer.
+"""The simulated device: a MuJoCo arm, motors that exchange real CAN frames, a trunk IMU and a virtual wearer.
 
 It knows nothing of the compensator: CAN frames and IMU samples are the only connection. `SimulatedDevice.run` plays it
 in real time on any python-can bus. `virtual_arm.VirtualArm` carries it in virtual time, with the loop of a real arm.

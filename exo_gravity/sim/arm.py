@@ -1,8 +1,10 @@
 """The mechanics of the simulated device: a MuJoCo arm on a moving base, with its own masses, friction and joint stops.
 
-Standard Denavit-Hartenberg, Table 1 of the paper: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint offsets
-(0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity of
-link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
+It is the paper's arm (`ArmConfig`), or one from a URDF (`UrdfConfig`, sim/urdf.py).
+
+The paper's, in standard Denavit-Hartenberg, Table 1: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint
+offsets (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity
+of link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
 these and not from the laws of `core.arm.gravity`, so that it can contradict them.
 
 In the axes of an accelerated base, gravity is g - a: turned and scaled. If the base also turns, the Euler, centrifugal
@@ -18,6 +20,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJoCo's search for a display
 import mujoco
@@ -29,7 +32,7 @@ from exo_gravity.core.arm.kinematics import ROTORS
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, four_floats
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, floats
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState
 
@@ -48,22 +51,29 @@ _ZEROS = (0.0,) * JOINT_COUNT
 DEFAULT_LINKS = ArmModel((0.05, 0.13, 0.30, 0.30), (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.20))
 
 _BALL = '<joint type="ball"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-_FRICTION_STIFFNESS = 'solreffriction=".002 1" solimpfriction=".9999 .9999 .001"'
-_STOP_STIFFNESS = 'solreflimit=".004 1" solimplimit=".99 .999 .001"'
+
+
+class Stiffness(NamedTuple):
+    """How stiff a soft constraint of MuJoCo is."""
+
+    reference: tuple[float, float]  #: solref: s, and the damping ratio
+    impedance: tuple[float, float, float]  #: solimp: least, most, and the width over which it rises
+
+
+FRICTION, STOP = Stiffness((0.002, 1.0), (0.9999, 0.9999, 0.001)), Stiffness((0.004, 1.0), (0.99, 0.999, 0.001))
 
 
 def _radians(*degrees: float) -> tuple[float, ...]:
     return tuple(map(math.radians, degrees))
 
 
-@dataclass(frozen=True, eq=False)
-class ArmConfig:
-    """The simulated arm. Sequences have one entry per joint (4,), shoulder to elbow.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JointConfig:
+    """The joints of a simulated arm, and who wears it. Sequences have one entry per joint (n,), shoulder to elbow.
 
     Raises ParameterError that names the offending value.
     """
 
-    links: ArmModel = DEFAULT_LINKS
     #: The passive arm of a wearer: the upper arm on link 3, forearm and hand on link 4.
     wearer_mass: Sequence[float] = owned(_ZEROS, "mass of the wearer's passive arm on each link", (0.0, MAX_MASS), "kg")
     wearer_cog: Sequence[float] = owned(_ZEROS, "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m")
@@ -73,24 +83,55 @@ class ArmConfig:
     viscous_friction: Sequence[float] = owned((0.02, 0.05, 0.02, 0.02), "viscous friction", (0.0, 10.0), "Nm s/rad")
     #: On top at standstill; it fades with speed v as exp(-(v / stribeck_speed)^2).
     stribeck_friction: Sequence[float] = owned(_ZEROS, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
-    stribeck_speed: Sequence[float] = owned((0.05,) * 4, "speed at which it fades", (0.001, 10.0), "rad/s")
-    #: Beside the link in the frames of Table 1.
-    cog_y: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
-    cog_z: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
+    stribeck_speed: Sequence[float] = owned((0.05,) * JOINT_COUNT, "speed at which it fades", (0.001, 10.0), "rad/s")
     #: The paper's motor mounts turn 190 degrees.
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
 
     def __post_init__(self) -> None:
         check_owned(self)
+        if np.any(np.greater_equal(self.position_min, self.position_max)):
+            expected = f"below position_max = {list(self.position_max)} rad"
+            raise ParameterError("position_min", self.position_min, expected)
+
+    def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+        """Return the arm, and the same on a base that can turn about its origin.
+
+        payload: kg in the hand, and (3,) m, its place in the frame of the hand.
+        """
+        raise NotImplementedError
+
+    def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
+        """Return what the base of the `side` arm feels, in its own axes, as for `SimulatedArm.move_base`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class ArmConfig(JointConfig):
+    """The paper's arm. Raises ParameterError that names the offending value."""
+
+    links: ArmModel = DEFAULT_LINKS
+    #: Beside the link in the frames of Table 1.
+    cog_y: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
+    cog_z: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
         self.links.check_masses("the simulated arm")
         if np.any(self.links.mass < _MIN_MASS):
             raise ParameterError("links.mass", self.links.mass, f"at least {_MIN_MASS:g} kg each")
         if np.any(np.greater(self.wearer_cog, self.links.length)):
             raise ParameterError("wearer_cog", self.wearer_cog, f"at most length = {self.links.length.tolist()} m")
-        if np.any(np.greater_equal(self.position_min, self.position_max)):
-            expected = f"below position_max = {list(self.position_max)} rad"
-            raise ParameterError("position_min", self.position_min, expected)
+
+    def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+        """Return the arm, and the same on a base that can turn about its origin."""
+        xml = _mjcf(self, payload)
+        on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
+        return mujoco.MjModel.from_xml_string(xml), mujoco.MjModel.from_xml_string(on_ball)
+
+    def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
+        """Return what the base of the `side` arm feels, in its own axes."""
+        return felt_in_base(side, state, self.links.gravity)
 
 
 def in_base(side: str, vector: Sequence[float], turning: bool = False) -> Floats3:
@@ -115,19 +156,19 @@ def felt_in_base(side: str, state: TrunkState, gravity: float) -> tuple[Floats3,
 
 
 class SimulatedArm:
-    """Four joints that move under motor and wearer torques, gravity and friction.
+    """Joints that move under motor and wearer torques, gravity and friction.
 
     model, data: MuJoCo's structures, for inspection.
     """
 
-    def __init__(self, config: ArmConfig | None = None) -> None:
+    def __init__(self, config: JointConfig | None = None) -> None:
         self.config = config or ArmConfig()
         self._load(NO_PAYLOAD)
         self._coulomb, self._stribeck, self._speed = map(
             np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
         )
-        self.move_base((0.0, 0.0, self.config.links.gravity))
-        self.reset(_ZEROS)
+        self.move_base(self.config.felt("left", TrunkState())[0])
+        self.reset(np.zeros(len(self._theta)))
 
     def carry(self, mass: float, cog: Sequence[float] = ZERO) -> None:
         """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.
@@ -143,30 +184,27 @@ class SimulatedArm:
 
     def _load(self, payload: Sequence[float]) -> None:
         """Make MuJoCo's structures for the arm with a load in its hand: kg, and (3,) m in frame 4."""
-        xml = _mjcf(self.config, payload)
-        self.model = mujoco.MjModel.from_xml_string(xml)
-        self.data = mujoco.MjData(self.model)
         # The same arm on a base that can turn: its torques for a given motion of the base.
-        on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
-        self._turning_model = mujoco.MjModel.from_xml_string(on_ball)
+        self.model, self._turning_model = self.config.models(payload)
+        self.data = mujoco.MjData(self.model)
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
 
     @property
     def positions(self) -> list[float]:
-        """Joint angles (4,) in rad."""
+        """Joint angles (n,) in rad."""
         return list(self._theta.tolist())
 
     @property
     def velocities(self) -> list[float]:
-        """Joint velocities (4,) in rad/s."""
+        """Joint velocities (n,) in rad/s."""
         return list(self._velocity.tolist())
 
-    def reset(self, theta: Sequence[float]) -> None:
-        """Put the arm at rest at `theta`, (4,) rad."""
+    def reset(self, theta: Vector) -> None:
+        """Put the arm at rest at `theta`, (n,) rad."""
         mujoco.mj_resetData(self.model, self.data)
-        self._theta[:] = four_floats("theta", theta, -math.pi, math.pi, "rad")
+        self._theta[:] = floats("theta", theta, len(self._theta), -math.pi, math.pi, "rad")
         mujoco.mj_forward(self.model, self.data)
 
     def move_base(
@@ -185,7 +223,7 @@ class SimulatedArm:
         self._turning_data.qvel[:3], self._turning_data.qacc[:3] = angular_velocity, angular_acceleration
 
     def step(self, torque: Sequence[float], count: int = 1) -> None:
-        """Apply `torque`, (4,) Nm of motors and wearer together, for `count` times STEP."""
+        """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP."""
         self._torque[:] = torque
         if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
@@ -199,12 +237,12 @@ class SimulatedArm:
             mujoco.mj_step2(self.model, self.data)
 
     def _turning_bias(self) -> np.ndarray:
-        """Return the torque (4,) in Nm of gravity and inertia at constant joint velocities, on a base that turns."""
+        """Return the torque (n,) in Nm of gravity and inertia at constant joint velocities, on a base that turns."""
         model, data = self._turning_model, self._turning_data
         data.qpos[4:], data.qvel[3:] = self._theta, self._velocity
         for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
             compute(model, data)
-        bias = np.empty(3 + JOINT_COUNT)
+        bias = np.empty(3 + len(self._theta))
         mujoco.mj_rne(model, data, 1, bias)
         return bias[3:]
 
@@ -226,8 +264,8 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
               <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
-                frictionloss="{config.coulomb_friction[n]}" {_FRICTION_STIFFNESS}
-                range="{config.position_min[n]} {config.position_max[n]}" {_STOP_STIFFNESS}/>
+                frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
+                range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>
               {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}
             </body>"""
     return f"""
@@ -236,6 +274,11 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
           <option timestep="{STEP}"><flag contact="disable"/></option>
           <worldbody>{body}</worldbody>
         </mujoco>"""
+
+
+def _attributes(stiffness: Stiffness, of: str) -> str:
+    reference, impedance = (" ".join(map(str, values)) for values in stiffness)
+    return f'solref{of}="{reference}" solimp{of}="{impedance}"'
 
 
 def _centre(config: ArmConfig, n: int) -> str:

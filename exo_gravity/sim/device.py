@@ -1,4 +1,4 @@
-"""The simulated device: the arm, its four motors and the wearer. CAN frames are its only connection to a controller.
+"""The simulated device: the arm, its motors and the wearer. CAN frames are its only connection to a controller.
 
 `run` plays it in real time on python-can buses. `advance` and `exchange` play it without a bus, as fast as possible.
 Physics catches up with the clock in steps of 1 ms before a frame is processed, so a motor always replies with the
@@ -20,10 +20,9 @@ from collections.abc import Callable, Collection, Sequence
 import can
 
 from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.motors.frames import EXTENDED, Frame
 from exo_gravity.hardware.can.can_port import POLL_TIME, message_of
-from exo_gravity.sim.arm import STEP, SimulatedArm, felt_in_base
+from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
@@ -35,22 +34,23 @@ IDLE_PERIOD = 0.005  # s after which physics advances even without a frame
 
 
 class SimulatedDevice:
-    """An arm with four motors, on a trunk that moves, and optionally a wearer who moves both.
+    """An arm with one motor per joint, on a trunk that moves, and optionally a wearer who moves both.
 
     motors: shoulder to elbow, with different CAN IDs. side: 'left' or 'right'. The trunk's tilt and the faults, also
     those of each motor, may be set from any thread.
     """
 
     def __init__(self, arm: SimulatedArm, motors: Sequence[SimulatedMotor], side: str = "right") -> None:
-        ids = [motor.joint.can_id for motor in motors]
-        if len(ids) != JOINT_COUNT or len(set(ids)) != JOINT_COUNT:
-            raise ParameterError("can_id", ids, f"{JOINT_COUNT} different IDs, one per joint")
+        ids, count = [motor.joint.can_id for motor in motors], len(arm.positions)
+        if not len(ids) == len(set(ids)) == count:
+            raise ParameterError("can_id", ids, f"{count} different IDs, one per joint")
         self.arm, self.motors, self.side = arm, tuple(motors), side
         self.pitch = self.roll = 0.0  #: rad, of the trunk
+        self.is_fd: Sequence[bool] = (False,) * len(motors)  #: whether each motor sends CAN FD frames
         self.bus_silent = False  #: frames pass in neither direction, and the motors keep their last commands
-        self.cut_off: Sequence[bool] = (False,) * JOINT_COUNT  #: the same for each motor
-        self.mute: Sequence[bool] = (False,) * JOINT_COUNT  #: whether a motor's replies are lost, while it obeys
-        self.encoder_error: Sequence[float] = (0.0,) * JOINT_COUNT  #: rad, added to the angle that a motor reads
+        self.cut_off: Sequence[bool] = (False,) * count  #: the same for each motor
+        self.mute: Sequence[bool] = (False,) * count  #: whether a motor's replies are lost, while it obeys
+        self.encoder_error: Sequence[float] = (0.0,) * count  #: rad, added to the angle that a motor reads
         self.truth: Truth | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
@@ -67,7 +67,7 @@ class SimulatedDevice:
         self._script_start = math.inf  # simulated s
         self._trunk_step: int | None = None  # the step that `trunk_motion` belongs to
         self._base = TrunkState()  # the arm's base moves like this
-        self._frames = [0] * JOINT_COUNT  # received by each motor
+        self._frames = [0] * count  # received by each motor
         self._power_returns = [math.inf] * len(motors)  # simulated s
 
     @property
@@ -117,14 +117,14 @@ class SimulatedDevice:
         replies = self.replies(can_id, data)
         return replies[0][1] if replies else None
 
-    def replies(self, can_id: int, data: bytes, among: Collection[int] = range(JOINT_COUNT)) -> list[tuple[int, Frame]]:
-        """Pass a frame to the motors that obey its ID; return those that reply (0..3), each with (ID, data).
+    def replies(self, can_id: int, data: bytes, among: Collection[int] | None = None) -> list[tuple[int, Frame]]:
+        """Pass a frame to the motors that obey its ID; return those that reply, each with (ID, data).
 
-        among: the motors (0..3) that the frame reaches.
+        among: the motors, from 0 on, that the frame reaches; None for all.
         """
         replies, arm = [], self.arm
         for joint in self._joints_of_id.get(can_id, ()):
-            if joint not in among or self.bus_silent or self.cut_off[joint]:
+            if (among is not None and joint not in among) or self.bus_silent or self.cut_off[joint]:
                 continue
             motor = self.motors[joint]
             self._frames[joint] += 1
@@ -150,10 +150,10 @@ class SimulatedDevice:
     ) -> None:
         """Play the device in real time until `should_stop()`. Raises BusError when a bus fails.
 
-        bus: of all motors, or that of each (4,). on_idle(now), `now` in monotonic s, is called whenever no reply is
+        bus: of all motors, or that of each (n,). on_idle(now), `now` in monotonic s, is called whenever no reply is
         due, at the latest 5 ms after the last frame.
         """
-        bus_of = list(bus) if isinstance(bus, Sequence) else [bus] * JOINT_COUNT
+        bus_of = list(bus) if isinstance(bus, Sequence) else [bus] * len(self.motors)
         buses = list(dict.fromkeys(bus_of))
         reached = {bus: [joint for joint, own in enumerate(bus_of) if own is bus] for bus in buses}
         outbox: list[tuple[float, int, Frame]] = []  # a heap of replies: when due, joint, frame
@@ -183,13 +183,13 @@ class SimulatedDevice:
                 heapq.heappush(outbox, (now + delay, joint, reply))
             while outbox and outbox[0][0] <= time.monotonic():
                 _, joint, reply = heapq.heappop(outbox)
-                _send(bus_of[joint], reply)
+                _send(bus_of[joint], reply, self.is_fd[joint])
             for joint, period in periods.items():
                 if reports[joint] <= last:
                     following = reports[joint] + period
                     reports[joint] = following if following > last else last + period  # missed ones are not made up
                     if frame := self.status(joint):
-                        _send(bus_of[joint], frame)
+                        _send(bus_of[joint], frame, self.is_fd[joint])
             if not outbox:
                 on_idle(last)
 
@@ -202,7 +202,7 @@ class SimulatedDevice:
             if error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
             return None, 0.0
-        if message is None or message.is_error_frame or message.is_fd:
+        if message is None or message.is_error_frame or (message.is_fd and not any(self.is_fd)):
             return None, 0.0
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
         if frame_id not in self._joints_of_id or list(message.data[:1]) == [frame_id]:
@@ -232,7 +232,7 @@ class SimulatedDevice:
     def _move_base(self, state: TrunkState) -> None:
         if state != self._base:
             self._base = state
-            self.arm.move_base(*felt_in_base(self.side, state, self.arm.config.links.gravity))
+            self.arm.move_base(*self.arm.config.felt(self.side, state))
 
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
         for joint, returns in enumerate(self._power_returns):
@@ -267,8 +267,8 @@ def _next(buses: list[can.BusABC], timeout: float) -> tuple[can.BusABC, float]:
     return (ready or buses)[0], 0.0
 
 
-def _send(bus: can.BusABC, frame: Frame) -> None:
+def _send(bus: can.BusABC, frame: Frame, is_fd: bool) -> None:
     try:
-        bus.send(message_of(frame))
+        bus.send(message_of(frame, is_fd))
     except can.CanError as error:
         raise BusError(f"sending on {bus.channel_info} failed: {error}") from error

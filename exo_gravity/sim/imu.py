@@ -26,7 +26,7 @@ class ImuConfig:
     """A small MEMS IMU. Raises ParameterError that names the offending value."""
 
     rotation_trunk_from_imu: Sequence[float] = owned(
-        (0.0, 0.0, 0.0, 1.0), "mounting of the IMU, unit quaternion x, y, z, w", (-1.0, 1.0)
+        (0.0, 0.0, 0.0, 1.0), "mounting of the IMU, unit quaternion x, y, z, w", (-1.0, 1.0), vector=True
     )
     rate: float = owned(100.0, "sample rate of the IMU", (10.0, 1000.0), "Hz")
     #: rad/s/sqrt(Hz) and m/s^2/sqrt(Hz): BMI160 data sheet, 0.007 deg/s and 180 ug.

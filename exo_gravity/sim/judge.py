@@ -15,7 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.numbers import for_joints
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
@@ -23,11 +25,13 @@ HAND_OFF = 0.1  # s after the wearer lets go
 MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
 MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
+COAST = 0.02  # s for which a motor may stop driving within a stretch: a light arm is thrown and caught by turns
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
-PEAK_TORQUE = np.array([MOTORS[name].peak_torque for name in USUAL_MOTORS])
-RATED_TORQUE = np.array([MOTORS[name].rated_torque for name in USUAL_MOTORS])
+# Nm, of the paper's arm; of another arm the least of them
+PEAK_TORQUE = tuple(MOTORS[name].peak_torque for name in USUAL_MOTORS)
+RATED_TORQUE = tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS)
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
 
 
@@ -35,10 +39,11 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    speed: rad/s, gained in the direction of the motor's whole torque, that of its damping included; of `joint` (1..n),
-    at `time` as in the records. energy: J in one stretch of such motion beyond SLOW, and power: W in it. A WEAK torque
-    drives nothing, and a stretch of LITTLE energy has no speed. damping: torque by damping alone as a multiple of the
-    motor's rated torque, also while a hand is on the arm.
+    A stretch is motion beyond SLOW in the direction of the motor's whole torque, that of its damping included, but for
+    COAST; a WEAK torque drives nothing. speed: rad/s that `joint` (1..n) gained within a stretch, at `time` as in the
+    records; what it had before is not the motor's, and a stretch of LITTLE energy has none. energy: J in one stretch,
+    and power: W in it. damping: torque by damping alone as a multiple of the motor's rated torque, also while a hand is
+    on the arm.
     """
 
     speed: float = 0.0
@@ -55,18 +60,36 @@ def driven(records: np.ndarray) -> Driven:
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
     power[np.abs(records["torque"]) < WEAK] = 0.0
     is_moved = (power > 0.0) & (gained > SLOW)
+    time = records["time"][:, None]
+    in_stretch = time - np.maximum.accumulate(np.where(is_moved, time, -np.inf), axis=0) <= COAST
     done = np.cumsum(np.where(is_moved, power, 0.0) * _lasting(records)[:, None], axis=0)
-    energy = done - np.maximum.accumulate(np.where(is_moved, 0.0, done), axis=0)
-    speed = np.where(energy > LITTLE, gained, 0.0)
+    energy = done - np.maximum.accumulate(np.where(in_stretch, 0.0, done), axis=0)
+    speed = np.where(energy > LITTLE, _gained_in(in_stretch, gained), 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
+    rated = for_joints(RATED_TORQUE, speed.shape[1])
     return Driven(
         speed=float(speed[when, joint]),
         energy=float(energy.max()),
         power=float(power[is_moved].max(initial=0.0)),
-        damping=float(np.abs(records["damping"] * records["velocity"] / RATED_TORQUE).max()),
+        damping=float(np.abs(records["damping"] * records["velocity"] / rated).max()),
         joint=int(joint) + 1,
         time=float(records["time"][when]),
     )
+
+
+def _gained_in(in_stretch: np.ndarray, speed: np.ndarray) -> np.ndarray:
+    """Return the speed (n, joints) in rad/s by which each joint exceeds the least that it has had in its stretch.
+
+    A joint that had at most twice SLOW before it counts as at rest then.
+    """
+    gained = np.zeros_like(speed)
+    for joint, flags in enumerate(in_stretch.T):
+        edges = np.flatnonzero(np.diff(flags, prepend=False, append=False))
+        for first, end in zip(edges[::2], edges[1::2], strict=True):
+            before = speed[max(0, first - 1), joint]
+            least = np.minimum(np.minimum.accumulate(speed[first:end, joint]), before if before > 2.0 * SLOW else 0.0)
+            gained[first:end, joint] = speed[first:end, joint] - least
+    return gained
 
 
 def _lasting(records: np.ndarray) -> np.ndarray:
@@ -162,7 +185,7 @@ def _gained_while(records: np.ndarray, is_free: np.ndarray) -> np.ndarray:
 
 def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:
     """Return the time in s until the last of the reached motors is off or applies damping."""
-    reached = [joint for joint in range(4) if joint not in unreached]
+    reached = [joint for joint in range(records["on"].shape[1]) if joint not in unreached]
     if not reached:
         return None
     safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & (since >= 0.0)
@@ -174,7 +197,8 @@ def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
     torque = records["torque"]
     effort = torque + records["damping"] * records["velocity"]  # the part that damping does not explain
     step = np.minimum(np.abs(np.diff(effort, axis=0)), np.abs(np.diff(torque, axis=0)))
-    at_peak = np.abs(torque) > PEAK_TORQUE - RESOLUTION  # there, damping explains less than its share
+    peak = np.array(for_joints(PEAK_TORQUE, torque.shape[1]))
+    at_peak = np.abs(torque) > peak - RESOLUTION  # there, damping explains less than its share
     step[at_peak[1:] | at_peak[:-1]] = 0.0
     on = records["on"]
     switched_off = on[:-1] & ~on[1:]

@@ -1,21 +1,25 @@
 """The parameters of `simulator`, and the device that they describe."""
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from exo_gravity.core.arm.arm import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.arm.tilt import SIDES
+from exo_gravity.core.compensation.settings import URDF_FILE, URDF_HAND
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, JointMotor, motors_of
 from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import Param, param_of, params_of
-from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+from exo_gravity.core.params import Param, param_of, params_of, table_for
+from exo_gravity.hardware.urdf_arm import read_urdf
+from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, JointConfig, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.imu import ImuConfig
-from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
-from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware, usual_firmware
+from exo_gravity.sim.motors import class_of, simulated
+from exo_gravity.sim.motors.ak import Heat
+from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 from exo_gravity.sim.truth import TruthLog
+from exo_gravity.sim.urdf import UrdfConfig
 
 # Parameters of the arm by the field of ArmConfig that owns each of them.
 ARM_FIELDS = {
@@ -41,7 +45,7 @@ FIRMWARE = (
     Param(
         "firmware.variant",
         [USUAL] * JOINT_COUNT,
-        "what the boards' firmware does, docs/motors.md; usual: ak, or v3",
+        "what the boards' firmware does, docs/motors.md; usual: ak, v3, or that of the motor's family",
         choices=(USUAL, *FIRMWARES),
         fixed=True,
     ),
@@ -85,39 +89,77 @@ SIMULATOR = (
     Param("trial", "", "script file of the virtual wearer, who starts at once if it is set live; empty ends it"),
     Param("trial_delay", 8.0, "time from the motors being on to the wearer's first step", (0.0, 60.0), "s", fixed=True),
     Param("truth", "", "file for the arm's true motion at 1 kHz (exo_gravity/sim/truth.py); empty: none", fixed=True),
-    Param("fault.unplugged", [False] * 4, "motors without power"),
+    Param("fault.unplugged", [False] * JOINT_COUNT, "motors without power"),
     Param("fault.unplugged_time", 0.0, "time until their power returns, motors off; 0: never", (0.0, 60.0), "s"),
-    Param("fault.cable", [False] * 4, "V3 boards with their configuration cable plugged in, which ignore commands"),
-    Param("fault.strength", [1.0] * 4, "share of its torque that a motor still gives, and does not report", (0.1, 1.0)),
-    Param("fault.cut_off", [False] * 4, "motors with power, but without connection to the bus"),
-    Param("fault.mute", [False] * 4, "motors that obey, but whose replies are lost"),
-    Param("fault.encoder_error", [0.0] * 4, "error of the joint angles that the motors read", (-7.0, 7.0), "rad"),
-    Param("fault.temperature", [30.0] * 4, "motor temperatures", (-40.0, 215.0), "degC"),
-    Param("fault.error", [0] * 4, "motor error codes", (0, 255)),
+    Param("fault.cable", [False] * JOINT_COUNT, "V3 boards with their cable plugged in, which ignore commands"),
+    Param("fault.strength", [1.0] * JOINT_COUNT, "share of its torque that a motor gives, unreported", (0.1, 1.0)),
+    Param("fault.cut_off", [False] * JOINT_COUNT, "motors with power, but without connection to the bus"),
+    Param("fault.mute", [False] * JOINT_COUNT, "motors that obey, but whose replies are lost"),
+    Param("fault.encoder_error", [0.0] * JOINT_COUNT, "error of the angles that the motors read", (-7.0, 7.0), "rad"),
+    Param("fault.temperature", [30.0] * JOINT_COUNT, "motor temperatures", (-40.0, 215.0), "degC"),
+    Param("fault.error", [0] * JOINT_COUNT, "motor error codes", (0, 255)),
     Param("fault.bus_silent", False, "the bus passes no frames"),
 )
+# What an arm from a URDF has in place of PAPER.
+URDF = (
+    replace(URDF_FILE, description="path of the URDF of another arm than the paper's", required=True),
+    URDF_HAND,
+    Param("joint_names", [""], "joints in the order of the URDF's chain", fixed=True, required=True, any_length=True),
+    Param("home", [0.0] * JOINT_COUNT, "angles in which the arm begins", (-math.pi, math.pi), "rad", fixed=True),
+)
+PAPER = {"link_length", "robot.mass", "robot.cog", "robot.cog_y", "robot.cog_z"}
+STOPS = {"stop.min", "stop.max"}
+
+
+def simulator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
+    """Return the parameters of `simulator` for a file with the parameters `given`."""
+    if URDF_FILE.name not in given:
+        return tuple(table_for(SIMULATOR, given))
+    table = [param for param in SIMULATOR if param.name not in PAPER]
+    of_urdf = {"default": [0.0] * JOINT_COUNT, "description": "joint stops; zeros: the URDF's limits"}
+    shared = [replace(param, **of_urdf) if param.name in STOPS else param for param in table]
+    return tuple(table_for((*shared, *URDF), given))
 
 
 def device_of(values: Mapping[str, Any]) -> SimulatedDevice:
     """Return the device that parameter values describe, with its trunk tilted. Raises ParameterError."""
-    links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
     joints = motors_of(values)
     given = zip(values[ROTOR_INERTIA.name], joints, strict=True)
     rotors = [inertia or joint.spec.rotor_inertia for inertia, joint in given]
-    arm = ArmConfig(links, rotor_inertia=rotors, **{field: values[name] for field, name in ARM_FIELDS.items()})
+    arm = SimulatedArm(_arm_of(values, rotors))
     heat = Heat(**{param.name: values[f"heat.{param.name}"] for param in params_of(Heat)})
     variants = zip(joints, values["firmware.variant"], strict=True)
-    motors = [SimulatedMotor(joint, firmware_of(joint, variant, values), heat) for joint, variant in variants]
-    device = SimulatedDevice(SimulatedArm(arm), motors, values["side"])
+    motors = [simulated(joint, firmware_of(joint, variant, values), heat) for joint, variant in variants]
+    device = SimulatedDevice(arm, motors, values["side"])
     device.pitch, device.roll = values["trunk.pitch"], values["trunk.roll"]
+    if "home" in values:
+        arm.reset(values["home"])
     if values["truth"]:
         device.truth = TruthLog(values["truth"])
     return device
 
 
+def _arm_of(values: Mapping[str, Any], rotors: Sequence[float]) -> JointConfig:
+    """Return the paper's arm, or that of the URDF. rotors: inertia (n,) in kg m^2. Raises ParameterError."""
+    given = {field: values[name] for field, name in ARM_FIELDS.items() if name in values}
+    if URDF_FILE.name not in values:
+        links = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"], gravity=values["gravity"])
+        return ArmConfig(links, rotor_inertia=rotors, **given)
+    if not any((*values["stop.min"], *values["stop.max"])):
+        del given["position_min"], given["position_max"]
+    return UrdfConfig(
+        text=read_urdf(values[URDF_FILE.name]),
+        joint_names=values["joint_names"],
+        hand=values[URDF_HAND.name],
+        gravity=values["gravity"],
+        rotor_inertia=rotors,
+        **given,
+    )
+
+
 def firmware_of(joint: JointMotor, variant: str, values: Mapping[str, Any]) -> Firmware:
     """Return the firmware of a motor: that of a variant, as parameter values change it. Raises ParameterError."""
-    firmware = usual_firmware(joint.wire_format) if variant == USUAL else FIRMWARES[variant]
+    firmware = class_of(joint.spec.family).usual_firmware(joint) if variant == USUAL else FIRMWARES[variant]
     timeout = values["firmware.timeout"]
     return replace(
         firmware,

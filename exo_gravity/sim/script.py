@@ -14,14 +14,22 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_PAYLOAD
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import four_floats, one_float
+from exo_gravity.core.numbers import MAX_JOINTS, floats, one_float
 
 MAX_DURATION = 3600.0  # s
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
-# Steps with one number or four: how these are checked, the least, the largest, and their unit.
+
+
+def _one_per_joint(name: str, values: Any, low: float, high: float, unit: str) -> np.ndarray:
+    """Return `values` as an array (n,); `TrialScript.check` compares n with an arm."""
+    count = len(values) if isinstance(values, list | tuple) and 1 <= len(values) <= MAX_JOINTS else 1
+    return floats(name, values, count, low, high, unit)
+
+
+# Steps with one number, or one per joint: how these are checked, the least, the largest, and their unit.
 VALUED: dict[str, tuple[Callable[..., Any], float, float, str]] = {
-    "move": (four_floats, -3.5, 3.5, "rad"),
-    "push": (four_floats, -20.0, 20.0, "Nm"),
+    "move": (_one_per_joint, -3.5, 3.5, "rad"),
+    "push": (_one_per_joint, -20.0, 20.0, "Nm"),
     "bow": (one_float, -1.6, 1.6, "rad"),
     "lean": (one_float, -0.8, 0.8, "rad"),
     "load": (one_float, 0.0, MAX_PAYLOAD, "kg"),
@@ -33,7 +41,7 @@ TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 class Step:
     """One step: an `action` and its `value`.
 
-    'move': the pose (4,) in rad; 'push': the torque (4,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'load': the mass
+    'move': the pose (n,) in rad; 'push': the torque (n,) in Nm; 'bow', 'lean': the angle (1,) in rad; 'load': the mass
     (1,) in kg; 'hold', 'walk', 'sit': ().
     """
 
@@ -54,8 +62,8 @@ class Step:
             value = np.ravel(checked(name, entry[action], low, high, unit)).tolist()
             return cls(action, one_float(f"{where}.over", entry["over"], 0.1, 60.0, "s"), tuple(value))
         expected = (
-            "{move: [4 rad], over: s}, {hold: s}, {push: [4 Nm], over: s}, {bow: rad, over: s}, {lean: rad, over: s}, "
-            "{walk: s}, {sit: s} or {load: kg, over: s}"
+            "{move: [rad per joint], over: s}, {hold: s}, {push: [Nm per joint], over: s}, {bow: rad, over: s}, "
+            "{lean: rad, over: s}, {walk: s}, {sit: s} or {load: kg, over: s}"
         )
         raise ParameterError(where, entry, expected)
 
@@ -76,6 +84,12 @@ class TrialScript:
         if not isinstance(steps, list) or not steps:
             raise ParameterError("steps", steps, "a list of at least one step")
         return cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+
+    def check(self, count: int) -> None:
+        """Raise ParameterError unless the script is for an arm of `count` joints."""
+        for i, step in enumerate(self.steps):
+            if step.action in ("move", "push") and len(step.value) != count:
+                raise ParameterError(f"steps[{i}].{step.action}", list(step.value), f"{count} numbers, one per joint")
 
     @property
     def duration(self) -> float:

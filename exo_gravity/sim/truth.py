@@ -1,7 +1,7 @@
 """The true motion of the simulated arm at every physics step: in a file, for a judge in another process, or in memory.
 
-The file is a sequence of `RECORD`, the only description of the format. Records leave the process every `FLUSH_PERIOD`;
-what was written stays when the process is frozen or killed.
+The file is a sequence of records, of which `record_of` is the only description. They leave the process every
+`FLUSH_PERIOD`; what was written stays when the process is frozen or killed.
 """
 
 import time
@@ -13,23 +13,29 @@ import numpy as np
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
 
+
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
 # damping: Nm s/rad, the part of that torque that is proportional to the velocity. wearer: Nm of the wearer on the
 # joints. frames: received by each motor so far. step: of the wearer's script, -1 before it. on: whether each motor is
 # on.
-RECORD = np.dtype(
-    [
-        ("time", "<f8"),
-        ("position", "<f4", JOINT_COUNT),
-        ("velocity", "<f4", JOINT_COUNT),
-        ("torque", "<f4", JOINT_COUNT),
-        ("damping", "<f4", JOINT_COUNT),
-        ("wearer", "<f4", JOINT_COUNT),
-        ("frames", "<u4", JOINT_COUNT),
-        ("step", "<i4"),
-        ("on", "?", JOINT_COUNT),
-    ]
-)
+def record_of(count: int) -> np.dtype:
+    """Return the type of a record of an arm with `count` joints."""
+    return np.dtype(
+        [
+            ("time", "<f8"),
+            ("position", "<f4", (count,)),
+            ("velocity", "<f4", (count,)),
+            ("torque", "<f4", (count,)),
+            ("damping", "<f4", (count,)),
+            ("wearer", "<f4", (count,)),
+            ("frames", "<u4", (count,)),
+            ("step", "<i4"),
+            ("on", "?", (count,)),
+        ]
+    )
+
+
+RECORD = record_of(JOINT_COUNT)  # of the paper's arm
 FLUSH_PERIOD = 0.02  # s
 
 
@@ -61,7 +67,7 @@ class TruthRecords:
     @property
     def records(self) -> np.ndarray:
         """All records so far, (n,) of RECORD."""
-        return np.array(self._rows, RECORD)
+        return np.array(self._rows, record_of(len(self._rows[0][1])) if self._rows else RECORD)
 
 
 class TruthLog:
@@ -73,6 +79,7 @@ class TruthLog:
         except OSError as error:
             raise ParameterError("truth", str(path), f"a file that can be written ({error.strerror})") from None
         self._rows = bytearray()
+        self._record: np.dtype | None = None
         self._offset = 0.0  # wall clock minus simulated time, s
         self._flushed = 0.0
 
@@ -83,7 +90,8 @@ class TruthLog:
     def note(self, now: float, *state: Any) -> None:
         """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
         stamp = now + self._offset
-        self._rows += np.array((stamp, *state), RECORD).tobytes()
+        self._record = self._record or record_of(len(state[0]))
+        self._rows += np.array((stamp, *state), self._record).tobytes()
         if abs(stamp - self._flushed) >= FLUSH_PERIOD:
             self._flushed = stamp
             self._file.write(self._rows)

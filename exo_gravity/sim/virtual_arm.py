@@ -77,7 +77,7 @@ class VirtualArm:
         self.clock = self.wire.clock
         if ports is None:
             self._played = self.wire.play(device, look) if look else self.wire.play(device, tick=None)
-            ports = [CanPort(self.wire.open(), self.clock, self.wire.open)] * len(motors)
+            ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
         self.safety = SafetyMachine(replace(limits, start_pose=start_pose), 1.0 / rate, motors)
         self.loop = ControlLoop(self.bus, self.safety, 1.0 / rate, controller, hand_over)

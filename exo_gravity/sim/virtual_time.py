@@ -19,7 +19,7 @@ from typing import Protocol
 import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 
-from exo_gravity.core.motors.wire_formats import EXTENDED, Frame
+from exo_gravity.core.motors.frames import EXTENDED, Frame
 from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.sim.arbitration import Arbitration
 from exo_gravity.sim.device import SimulatedDevice
@@ -159,7 +159,7 @@ class Played:
 
     def deliver(self, message: can.Message) -> None:
         """Let the device receive a frame, and send its reply."""
-        if message.is_error_frame or message.is_fd:
+        if message.is_error_frame or (message.is_fd and not any(self._device.is_fd)):
             return
         self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
@@ -182,7 +182,7 @@ class Played:
 
     def _send(self, joint: int, frame: Frame) -> None:
         motor = self._device.motors[joint]
-        self._wire.carry(self, message_of(frame), motor, motor.firmware.retransmits)
+        self._wire.carry(self, message_of(frame, self._device.is_fd[joint]), motor, motor.firmware.retransmits)
 
 
 class Wire:

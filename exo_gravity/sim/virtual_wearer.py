@@ -8,13 +8,13 @@ limited to the strength of a hand. Hold: no torque. Push: half a sine wave of th
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.numbers import for_joints
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import minimum_jerk
 
 # The hand's compliance in Nm/rad, Nm s/rad and Nm/(rad s): of the order of a human arm's; least damping where the arm
-# is lightest.
+# is lightest. Of the paper's arm; the least of each for another one.
 STIFFNESS, DAMPING, INTEGRAL = (60.0, 80.0, 60.0, 30.0), (3.0, 6.0, 5.0, 2.0), (120.0, 160.0, 150.0, 80.0)
 STRENGTH = 25.0  # Nm on any joint; an adult's arm and the robot, stretched out, need 15 to 20 Nm
 MOVING = 0.75  # share of a move's duration in which the hand moves; then it holds the arm still
@@ -33,25 +33,26 @@ class VirtualWearer:
         self.strength = strength
         self.step: int | None = None
         self._elapsed = 0.0
-        self._start: Sequence[float] = NO_TORQUE
-        self._weight = [0.0] * JOINT_COUNT
+        self._start: Sequence[float] = ()
+        self._weight: list[float] = []
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
-        """Return the wearer's torque (4,) in Nm on the joints, `elapsed` s after the start of the script.
+        """Return the wearer's torque (n,) in Nm on the joints, `elapsed` s after the start of the script.
 
-        theta, velocity: (4,) rad and rad/s. Call it with increasing times: the hand remembers where it took hold and
+        theta, velocity: (n,) rad and rad/s. Call it with increasing times: the hand remembers where it took hold and
         how much weight it has taken over. The torque is zero before the start (elapsed < 0) and after the end.
         """
+        nothing = (0.0,) * len(theta)
         if elapsed < 0:
-            return NO_TORQUE
+            return nothing
         index, since = self.script.at(elapsed)
         if index != self.step:
             self.step = index
             self._start = theta
-            self._weight = [0.0] * JOINT_COUNT
+            self._weight = [0.0] * len(theta)
         period, self._elapsed = elapsed - self._elapsed, elapsed
         if index == len(self.script.steps):
-            return NO_TORQUE
+            return nothing
         step = self.script.steps[index]
         if step.action == "move":
             path = path_between(self._start, step.value, since, MOVING * step.duration)
@@ -59,7 +60,7 @@ class VirtualWearer:
         if step.action == "push":
             share = math.sin(math.pi * since / step.duration)
             return tuple(share * torque for torque in step.value)
-        return NO_TORQUE
+        return nothing
 
     def idle(self, elapsed: float, duration: float) -> bool:
         """Return whether the wearer applies no torque for `duration` s from `elapsed` s after the start."""
@@ -70,17 +71,20 @@ class VirtualWearer:
         return index == self.step and step.action == "hold" and since + duration <= step.duration
 
     def lead(self, path: Path, theta: Sequence[float], velocity: Sequence[float], period: float) -> Torque:
-        """Return the torque (4,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
+        """Return the torque (n,) in Nm of a hand that leads the joints along `path`; period: s since the last call."""
         torque, limit = [], self.strength
-        for n, (position, speed) in enumerate(path):
+        self._weight = self._weight or [0.0] * len(path)
+        compliance = (for_joints(tuning, len(path)) for tuning in (STIFFNESS, DAMPING, INTEGRAL))
+        for n, ((position, speed), *hand) in enumerate(zip(path, *compliance, strict=True)):
+            stiffness, damping, integral = hand
             error = position - theta[n]
-            self._weight[n] = max(-limit, min(limit, self._weight[n] + INTEGRAL[n] * error * period))
-            pull = STIFFNESS[n] * error + DAMPING[n] * (speed - velocity[n]) + self._weight[n]
+            self._weight[n] = max(-limit, min(limit, self._weight[n] + integral * error * period))
+            pull = stiffness * error + damping * (speed - velocity[n]) + self._weight[n]
             torque.append(max(-limit, min(limit, pull)))
         return tuple(torque)
 
 
 def path_between(start: Sequence[float], end: Sequence[float], since: float, duration: float) -> Path:
-    """Return where the joints are `since` s into a minimum-jerk move from `start` to `end`, (4,) rad, in `duration`."""
+    """Return where the joints are `since` s into a minimum-jerk move from `start` to `end`, (n,) rad, in `duration`."""
     way, pace, _ = minimum_jerk(since / duration)
     return [(a + way * (b - a), pace / duration * (b - a)) for a, b in zip(start, end, strict=True)]

@@ -1,5 +1,7 @@
 """calibrate COMMAND --params FILE --output NEW.yaml: finds what differs between an arm and its parameter file.
 
+`calibrate new` writes the first file of an arm from its URDF, its motors and their IDs.
+
 The new file is the old one with new values, their uncertainty and the date. Beside it are a page (NEW.html) and
 what was measured (NEW.jsonl). No existing file is ever overwritten.
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from exo_gravity.lab.calibration.live import Person
     from exo_gravity.lab.calibration.result import CalibrationResult
 
-ACCEPTANCE = "acceptance"
+ACCEPTANCE, NEW = "acceptance", "new"
 # Module in lab/calibration, and what the command finds.
 COMMANDS = {
     "motors": ("motors", "each joint's motor, direction and zero, found by moving the joints by hand"),
@@ -64,6 +66,17 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
+    what = "the first parameter file of an arm, from its URDF, its motors and their CAN IDs"
+    new = commands.add_parser(NEW, help=f"writes {what}", description=f"calibrate {NEW}: writes {what}.")
+    option = new.add_argument
+    option("--urdf", required=True, metavar="FILE", help="description of the arm, or package://NAME/PATH")
+    option("--motors", required=True, nargs="+", metavar="TYPE", help="of each joint, as AK80-64")
+    option("--ids", required=True, nargs="+", type=int, metavar="ID", help="CAN ID of each motor")
+    option("--joints", nargs="+", default=(), metavar="NAME", help="in this order (default: all turning ones)")
+    option("--hand", default="", metavar="LINK", help="link of the URDF that holds a load")
+    option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
+    option("--channel", default="can0", metavar="BUS", help="SocketCAN interface (default: %(default)s)")
+    option("--output", required=True, type=Path, metavar="NEW.yaml", help="new file to write")
     return parser.parse_args(args)
 
 
@@ -90,6 +103,8 @@ def _run(options: argparse.Namespace) -> int:
     from exo_gravity.lab.calibration.result import check_output, page_of, write_changes
 
     command: str = options.command
+    if command == NEW:
+        return _write_new(options)
     if command == ACCEPTANCE:
         return _accept(options, Person())
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
@@ -117,6 +132,19 @@ def _run(options: argparse.Namespace) -> int:
     for refusal in result.refusals:
         print(f"calibrate: not calibrated: {refusal}", file=sys.stderr)
     return 1 if result.refusals else 0
+
+
+def _write_new(options: argparse.Namespace) -> int:
+    """Write the first file of an arm; return the exit code."""
+    from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
+    from exo_gravity.lab.calibration.result import check_output
+
+    check_output(options.output)
+    said = (getattr(options, name) for name in ("urdf", "motors", "ids", "joints", "hand", "side", "channel"))
+    for note in write_new(NewArm(*said), options.output):
+        print(note)
+    print(f"Written: {options.output}; {MEASURE} in it marks what is still to be measured")
+    return 0
 
 
 def _accept(options: argparse.Namespace, person: "Person") -> int:

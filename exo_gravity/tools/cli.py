@@ -7,12 +7,11 @@ without them, and a missing one ends the tool with one line instead of a traceba
 import argparse
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib.util import find_spec
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.lab.packages import missing
+from exo_gravity.lab.packages import extras
 
 
 def non_negative(text: str) -> float:
@@ -26,16 +25,15 @@ def non_negative(text: str) -> float:
     return number
 
 
-@contextmanager
-def extras(tool: str, extra: str) -> Iterator[None]:
-    """End `tool` with exit code 2 and one line if an import inside the context finds a package missing."""
+def positive(text: str) -> int:
+    """Return the whole number that `text` spells, 1 or more; raise ArgumentTypeError otherwise."""
     try:
-        yield
-    except ModuleNotFoundError as error:
-        if not error.name or error.name.startswith("exo_gravity"):
-            raise  # not a package that an extra installs
-        print(f"{tool}: {missing(error.name, extra)}", file=sys.stderr)
-        raise SystemExit(2) from None
+        number = int(text)
+    except ValueError:
+        number = 0
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, 1 or more")
+    return number
 
 
 def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:

@@ -7,9 +7,7 @@ use or wrong file.
 """
 
 import argparse
-import os
 import sys
-import threading
 from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
@@ -27,12 +25,6 @@ def print_line(node: str, line: str) -> None:
     """Print one line of a node's log, with the time of day and the node's name."""
     clock = datetime.now().time().isoformat("milliseconds")
     print(f"{clock} {node.lstrip('/'):<18} {line}", flush=True)
-
-
-def stop_with_owner(stopping: threading.Event) -> None:
-    """Set `stopping` when `ros2 launch` has ended, which holds our standard input open."""
-    sys.stdin.read()
-    stopping.set()
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -58,16 +50,14 @@ def main(args: Sequence[str] | None = None) -> None:
     options = _arguments(args)
     require_ros("launcher")
     stopping = stop_on_signals()
-    if os.environ.get("EXO_GRAVITY_SUPERVISED"):
-        threading.Thread(target=stop_with_owner, args=(stopping,), daemon=True).start()
     try:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
+        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)
-        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
             dead = launcher.run(stopping)
     except ExoGravityError as error:

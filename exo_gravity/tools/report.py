@@ -1,6 +1,7 @@
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
-Several recordings, or a folder of them, become one table, a row for each trial, and cohort.csv, a row for each joint.
+Several recordings, or a folder of them, become one table and page, a row for each trial, and cohort.csv, a row for each
+joint. They are read by a process for each core or, with --scheduler, by the workers of a Dask cluster.
 
 With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
 
@@ -11,12 +12,13 @@ use, or part of a recording could not be read; the rest is reported first.
 import argparse
 import math
 from collections.abc import Sequence
+from functools import partial
 from glob import glob
 from pathlib import Path
 
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
-from exo_gravity.tools.cli import exit_code, non_negative
+from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -29,6 +31,11 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     )
     option("--output", metavar="DIR", help="folder for the report (default: BAG_report next to the first recording)")
     option("--csv", action="store_true", help="also write the time series, time_series.csv, a row per sample and joint")
+    every = "keep one of N samples of each arm: less memory, a coarser report (%(default)s)"
+    option("--decimate", type=positive, default=1, metavar="N", help=every)
+    option(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster whose workers read the recordings, tcp://HOST:8786"
+    )
     formats = "also write each figure in this format; twice for both"
     option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
     for name, default, unit, description in (
@@ -77,11 +84,11 @@ def _run(options: argparse.Namespace) -> int:
     )
     (path, *more), screen = options.bag, Console(stderr=True)
     beside = path.resolve().with_name(f"{path.resolve().stem}_report")
-    if more or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
+    if more or options.scheduler or (path.is_dir() and cohort.recordings_below(path) not in ([], [path])):
         return _run_cohort(options, criteria, Path(options.output or beside))
     clip = video.requested(options.video, options.video_speed)
     with screen.status(f"reading {path.name}"):
-        bag = read_bag(path)
+        bag = read_bag(path, options.decimate)
     report = trial_report.analyse(bag, criteria, options.min_hold)
     written = trial_report.write(report, options.output or beside, options.figures, options.csv)
     if clip:
@@ -95,28 +102,30 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from exo_gravity.lab.report import cohort
+    from exo_gravity.lab.parallel import in_processes, on_cluster
+    from exo_gravity.lab.report import cohort, overview
 
     recordings = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
     output.mkdir(parents=True, exist_ok=True)
-    cache = cohort.Cache(output / "cohort_cache.json", criteria, options.min_hold)
-    screen, columns = (
-        Console(stderr=True),
-        (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("left")),
-    )
-    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress:
+    judging = cohort.Judging(criteria, options.min_hold, options.decimate)
+    cache = cohort.Cache(output / "cohort_cache.jsonl", judging)
+    run = partial(on_cluster, options.scheduler) if options.scheduler else in_processes
+    screen = Console(stderr=True)
+    columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("left")
+    with (
+        extras("report", "cluster"),
+        Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress,
+    ):
         task = progress.add_task("", total=len(recordings))
-        rows, known = cohort.summaries(
-            recordings, criteria, options.min_hold, cache, lambda path: progress.advance(task)
-        )
+        rows, known = cohort.summaries(recordings, judging, cache, run, lambda: progress.advance(task))
     cohort.write_csv(output / "cohort.csv", rows)
+    trials = overview.trials_of(rows)
+    name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
+    (output / "cohort.html").write_text(overview.page(trials, name), encoding="utf-8")
     console = Console(highlight=False, width=None if Console().is_terminal else 200)
-    trials = cohort.trials_of(rows)
-    cohort.print_trials(trials, console)
-    failed = {row["recording"]: row["problem"] for row in trials if row["problem"]}
-    for problem in failed.values():
-        console.print(f"Not reported: {problem}", markup=False)
-    held = sum(bool(row["held"]) for row in trials)
-    console.print(f"{held} of {len(trials)} trials held; {len(failed)} recordings failed; {known} had not changed")
-    console.print(f"Written: cohort.csv in {output}", markup=False, soft_wrap=True)
-    return 2 if failed else int(held < len(trials))
+    overview.print_trials(trials, console)
+    console.print(f"{overview.summary_of(trials)}; {known} recordings had not changed", soft_wrap=True)
+    console.print(f"Written: cohort.csv and cohort.html in {output}", markup=False, soft_wrap=True)
+    if overview.problems_of(trials):
+        return 2
+    return int(not all(row["held"] for row in trials))

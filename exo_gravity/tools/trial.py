@@ -25,6 +25,7 @@ from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError, ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.packages import MissingPackageError
 from exo_gravity.lab.processes import stop_on_signals
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.scripted import analysed, packaged_trials, read_script
@@ -121,4 +122,4 @@ def main(args: Sequence[str] | None = None) -> int:
             return _run(options, params, clip, Console(highlight=False, stderr=bool(options.attach)))
     except ExoGravityError as error:
         print(f"trial: {error}", file=sys.stderr)
-        return 2 if isinstance(error, ParameterError) else 1
+        return 2 if isinstance(error, ParameterError | MissingPackageError) else 1

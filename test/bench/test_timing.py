@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from bench.timing import LoopTiming, analyse, split_cycles
+from exo_gravity.core.motors.ak import pack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, MOTORS, pack_reply
 
 MOTOR_SPECS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
 ARM_MOTORS = tuple(JointMotor(MOTORS[name], can_id) for can_id, name in enumerate(MOTOR_SPECS, 1))

@@ -10,7 +10,6 @@ import pytest
 from bench.wearer import payload, tiring, ways
 from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
-from bench.wearer.payload import Balance
 from bench.wearer.report import verdict
 from bench.wearer.strapped_arm import RHYTHM, StrappedArm
 from bench.wearer.straps import table
@@ -84,13 +83,12 @@ def test_a_band_that_is_too_narrow_and_a_share_that_is_wrong_miss_their_limits()
 
 
 def test_a_load_that_is_weighed_wrongly_misses_its_limit_and_one_that_is_refused_is_counted():
-    balance = Balance(draw(0).settings)
-    balance.results = [Weighed(mass, 0.0, np.ones(4)) for mass in (0.02, 0.22, 1.1, 2.02)]
-    rows = {row.what: row for row in payload.verdict([(balance, "")])}
+    results: payload.Weighings = [Weighed(mass, 0.0, np.ones(4)) for mass in (0.02, 0.22, 1.1, 2.02)]
+    rows = {row.what: row for row in payload.verdict([results])}
     assert rows["load of 0.2 kg, error"].held and not rows["load of 1 kg, error"].held
     assert rows["load of 1 kg, error"].shown == "80 g at most; 0 of 1 within, 0 refused"
-    balance.results[1] = None
-    refused = payload.verdict([(balance, "")])[0]
+    results[1] = None
+    refused = payload.verdict([results])[0]
     assert "1 refused" in refused.shown and not refused.held
 
 

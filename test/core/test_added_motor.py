@@ -1,8 +1,9 @@
-"""CONTRIBUTING's "Add a motor" and "Add a wire format": one entry each, and an arm with it is carried."""
+"""CONTRIBUTING's "Add a motor family": another distribution's entry points, and an arm with its motors is carried."""
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from typing import Any
@@ -11,25 +12,31 @@ import pytest
 
 from ..support import ROOT
 
-
-def after_adding(what: str) -> Any:
-    """Return what `test/support/added_motor.py` finds with the entry."""
-    command = [sys.executable, "-m", "test.support.added_motor", what]
-    return json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout)
+OUR_LAB = ROOT / "test" / "support" / "our_lab"
 
 
-def test_an_entry_in_motors_is_all_that_a_motor_needs() -> None:
-    carried = after_adding("motor")
-    assert carried["refusal"].startswith("wire_format = 'mit_v3': must be another format for an AK70-10")
-    assert (carried["state"], carried["fault"], carried["on"], carried["off"]) == ("active", None, [True] * 4, True)
-    # Less than half a turn of the rotor at the output: 18 degrees.
-    assert carried["home_tolerance"] == pytest.approx([0.30, 0.34, 0.30, 0.50])
-    assert carried["peak"] == [24.8, 18.0, 24.8, 9.0]
-    assert carried["most"] == [0.0, 24.8]
-    assert carried["rotors"] == [4.1e-3, 4.9e-3, 4.1e-3, 8.8e-4]
+@pytest.fixture(scope="module")
+def carried() -> dict[str, Any]:
+    """What `test/support/added_motor.py` finds with the distribution `our_lab` installed."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(OUR_LAB), os.environ.get("PYTHONPATH", "")))}
+    command = [sys.executable, "-m", "test.support.added_motor"]
+    output = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
+    return json.loads(output)
 
 
-def test_an_entry_in_formats_is_all_that_a_wire_format_needs() -> None:
-    carried = after_adding("format")
+def test_a_laboratory_s_own_motor_needs_no_fork(carried: dict[str, Any]) -> None:
     assert (carried["state"], carried["fault"], carried["on"], carried["off"]) == ("active", None, [True] * 4, True)
     assert not carried["ignored"]
+    assert carried["simulated"] == ["OurSimulatedMotor", "SimulatedMotor", "OurSimulatedMotor", "SimulatedMotor"]
+
+
+def test_all_bounds_follow_from_the_record_of_a_motor(carried: dict[str, Any]) -> None:
+    # Less than half a turn of the rotor at the output: 9 degrees.
+    assert carried["home_tolerance"] == pytest.approx([0.15, 0.34, 0.15, 0.50])
+    assert carried["peak"] == [50.0, 18.0, 50.0, 9.0]
+    assert carried["most"] == [100.0, 40.0, 100.0, 40.0]
+    assert carried["rotors"] == [4.0e-3, 4.9e-3, 4.0e-3, 8.8e-4]
+
+
+def test_a_start_with_our_motors_alone_looks_up_no_entry_point(carried: dict[str, Any]) -> None:
+    assert carried["is_lazy"]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.boards import Boards
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import MALFORMED, SERVO
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import MALFORMED, MIT, MIT_V3, SERVO
 
 RATE = 400.0  # Hz of the control loop
 
@@ -55,18 +56,18 @@ def test_a_v1_board_that_does_not_reply_is_left_to_the_state_machine():
 
 def test_a_malformed_reply_is_shown_until_the_motor_replies_or_falls_silent():
     boards = Boards(motors_of(MIT))
-    boards.heard(2, MALFORMED, bytes.fromhex("0380017ff8"), 1.0)
+    boards.heard(2, MALFORMED, (3, bytes.fromhex("0380017ff8")), 1.0)
     expected = "motor 3 sent 5 bytes [03 80 01 7f f8] as its reply: must be 6, 7 or 8 bytes"
     assert boards.hindrance(1.5, RATE) == expected
     assert boards.hindrance(2.1, RATE) == ""
-    boards.heard(2, MALFORMED, b"\x03", 3.0)
+    boards.heard(2, MALFORMED, (3, b"\x03"), 3.0)
     boards.take(2, sample(3.1))
     assert boards.hindrance(3.2, RATE) == ""
 
 
 def test_a_motor_that_sends_status_frames_in_place_of_replies_is_told_what_to_set():
     boards = Boards(motors_of(MIT))
-    boards.heard(0, SERVO, bytes(8), 1.0)
+    boards.heard(0, SERVO, (0x2901, bytes(8)), 1.0)
     assert boards.hindrance(1.1, RATE).startswith("motor 1 does not reply, but sends status frames: set it to MIT mode")
 
 

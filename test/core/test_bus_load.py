@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT_V3, pack_reply
+from exo_gravity.core.motors.damiao import DAMIAO_MIT
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ID_BITS, MotorReply, pack_command
 from exo_gravity.core.motors.joint_motor import (
     BITRATE,
     COMMAND_BITS,
+    FD_BITS,
+    FD_COMMAND_BITS,
+    FD_REPLY_BITS,
     REPLY_BITS,
     STATUS_BITS,
     V3_COMMAND_BITS,
@@ -18,11 +25,10 @@ from exo_gravity.core.motors.joint_motor import (
     buses_of,
     traffic_of,
 )
-from exo_gravity.core.motors.specs import MOTORS, MotorReply, pack_command, pack_reply
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT_V3
 
 AK60 = MOTORS["AK60-6"]
 V3 = MIT_V3.ranged(AK60)
+AK = {"motor": ["AK60-6"] * 4}
 
 
 def frame_bits(data_bytes: int, is_extended: bool = False) -> tuple[int, int]:
@@ -100,6 +106,37 @@ def test_typical_bits_are_the_mean_of_a_carried_arm_and_the_most_those_of_the_sp
     assert bits.most == frame_bits(8, kind.startswith("V3"))[1]
 
 
+def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
+    """The bits of a CAN FD frame at the bit rates of arbitration and of data, with its stuff bits before the CRC.
+
+    After the data: stuff count 4, CRC 17, 6 fixed stuff bits; then, slowly again, 13 bits to the next frame.
+    """
+    head = [0, *bits_of(can_id, 11), 0, 0, 1, 0, 1]
+    rest = [0, *bits_of(len(data), 4), *(bit for byte in data for bit in bits_of(byte, 8))]
+    stuff, last, run = [0, 0], None, 0
+    for index, bit in enumerate((*head, *rest)):
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuff[index >= len(head)] += 1
+            last, run = 1 - bit, 1
+    return len(head) + 13 + stuff[0], len(rest) + 27 + stuff[1]
+
+
+def test_typical_bits_of_can_fd_are_the_mean_of_a_carried_arm():
+    rng, spec = np.random.default_rng(5), MOTORS["DM-J4340"]
+    commands, replies = [], []
+    for index in range(1000):
+        can_id = index % 8 + 1
+        torque, position, velocity = rng.uniform((-9, -1.65, -1), (9, 3.14, 1)).tolist()
+        reply = MotorReply(can_id, position, velocity, torque, int(rng.integers(20, 60)), 0, True)
+        commands.append(fd_bits(can_id, pack_command(spec, 0.0, 0.0, 0.0, 0.0, torque)))
+        replies.append(fd_bits(DAMIAO_MIT.reply_id(can_id), DAMIAO_MIT.pack_reply(spec, reply)))
+    assert np.mean(commands, axis=0) == pytest.approx((FD_BITS.typical, FD_COMMAND_BITS.typical), abs=1.0)
+    assert np.mean(replies, axis=0) == pytest.approx((FD_BITS.typical, FD_REPLY_BITS.typical), abs=1.0)
+    assert np.all(np.max([*commands, *replies], axis=0) <= (FD_BITS.most, FD_COMMAND_BITS.most))
+
+
 def test_the_load_of_replying_and_reporting_motors():
     assert Traffic(4).load(500.0) == pytest.approx(0.48, abs=0.01)
     assert Traffic(4).load(500.0, worst=True) == pytest.approx(0.54)
@@ -126,7 +163,7 @@ def test_a_rate_beyond_the_bus_is_rejected_with_the_largest_and_one_that_crowds_
 
 @pytest.mark.parametrize("interface", ["gs_usb", "slcan"])
 def test_an_adapter_without_a_bit_rate_is_refused(interface):
-    values = {"can.interface": interface, "can.channel": "c", "wire_format": ["mit", "mit", "mit", "mit_v3"]}
+    values = {"can.interface": interface, "can.channel": "c", "wire_format": ["mit", "mit", "mit", "mit_v3"], **AK}
     with pytest.raises(ParameterError, match=rf"can.options.bitrate = None: must be set for {interface}"):
         traffic_of(values, {})
     with pytest.raises(ParameterError, match=r"can.options.bitrate = 5: must be a whole number from 10000"):
@@ -135,10 +172,15 @@ def test_an_adapter_without_a_bit_rate_is_refused(interface):
 
 
 def test_each_bus_has_the_load_of_its_own_motors():
-    values = {"can.interface": "socketcan", "wire_format": ["mit"] * 4}
+    values = {"can.interface": "socketcan", "wire_format": ["mit"] * 4, **AK}
     two = traffic_of({**values, "can.channel": "can0,can0,can1,can1"}, {})
     assert two == {"can0": Traffic(2), "can1": Traffic(2)}
-    values = {"can.interface": "slcan", "can.channel": "a, b,b, b", "wire_format": ["mit", "mit", "mit_v3", "mit_v3"]}
+    values = {
+        "can.interface": "slcan",
+        "can.channel": "a, b,b, b",
+        "wire_format": ["mit", "mit", "mit_v3", "mit_v3"],
+        **AK,
+    }
     slow_and_fast = {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]}
     assert traffic_of(values, slow_and_fast) == {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)}
 
@@ -154,4 +196,4 @@ def test_each_bus_has_the_load_of_its_own_motors():
 )
 def test_channels_and_options_that_are_not_one_per_motor_are_refused(channel, options, problem):
     with pytest.raises(ParameterError, match=problem):
-        buses_of(channel, options)
+        buses_of(channel, options, 4)

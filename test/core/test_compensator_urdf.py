@@ -1,4 +1,4 @@
-"""The compensator of another arm than the exoskeleton's: a pendulum of two joints."""
+"""The compensator of another arm than the paper's: a pendulum of two joints."""
 
 import math
 
@@ -10,26 +10,36 @@ from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.hardware.urdf_arm import UrdfArm
 
 PERIOD = 0.004  # s
 POSE = (0.4, -0.7)
 
 
-class Pendulum:
-    """Two joints about y, each with 1 kg m; it hangs along -z."""
+# Two joints about y in one place, each with 1 kg m; it hangs along -z.
+LINK = """<link name="{0}"><inertial><origin xyz="0 0 -1"/><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{0}" type="revolute"><parent link="{1}"/><child link="{2}"/><axis xyz="0 -1 0"/>
+<limit lower="-3" upper="3" effort="{3}" velocity="5"/></joint>"""
+PARTS = (
+    LINK.format("upper"),
+    JOINT.format("a", "base", "upper", 30),
+    LINK.format("lower"),
+    JOINT.format("b", "upper", "lower", 0),
+)
+PENDULUM = UrdfArm(f'<robot name="pendulum"><link name="base"/>{"".join(PARTS)}</robot>', ["a", "b"])
 
-    max_effort = (30.0, 0.0)
-    mass = 2.0
 
-    def torque(self, theta, gravity):
-        (first, second), (x, _, z) = theta, gravity
-        lower = -z * math.sin(first + second) - x * math.cos(first + second)
-        return lower - z * math.sin(first) - x * math.cos(first), lower
+def torque_of(theta, gravity):
+    """Return the torque (2,) in Nm that holds the pendulum; gravity: (3,) m/s^2."""
+    (first, second), (x, _, z) = theta, gravity
+    lower = -z * math.sin(first + second) - x * math.cos(first + second)
+    return lower - z * math.sin(first) - x * math.cos(first), lower
 
 
 def settings(**changes):
     given = {"joint_names": ["a", "b"], "max_effort": [0.0, 20.0], "use_imu": False, **changes}
-    return urdf_settings_of(values_of(urdf_table(2, ()), given), Pendulum())
+    return urdf_settings_of(values_of(urdf_table(given), given), PENDULUM)
 
 
 def steps(arm, start, seconds):
@@ -38,7 +48,7 @@ def steps(arm, start, seconds):
 
 def test_it_gives_the_models_torque_times_the_gain():
     arm = Compensator(settings(gain=[1.0, 0.5]))
-    first, second = Pendulum().torque(POSE, (0.0, 0.0, -9.80665))
+    first, second = torque_of(POSE, (0.0, 0.0, -9.80665))
     assert arm.step(5.0, POSE, (0.0, 0.0)).effort == pytest.approx((first, 0.5 * second), abs=1e-12)
 
 
@@ -48,7 +58,7 @@ def test_gravity_comes_from_the_tilt_in_the_root_links_axes():
     for n in range(300):
         arm.tilt.set_gravity(2.0 + n * PERIOD, (0.6, 0.0, -0.8))
         answer = arm.step(2.0 + n * PERIOD, POSE)
-    assert answer.effort == pytest.approx(Pendulum().torque(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
+    assert answer.effort == pytest.approx(torque_of(POSE, (0.6 * 9.80665, 0.0, -0.8 * 9.80665)), abs=1e-9)
     assert arm.step(4.0, POSE).reason == "trunk tilt older than 500 ms"
 
 

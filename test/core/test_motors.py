@@ -16,32 +16,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
-from exo_gravity.core.motors.specs import (
-    ENTER,
-    EXIT,
-    MOTORS,
-    SET_ZERO,
-    MotorReply,
-    error_text,
-    is_special,
-    pack_command,
-    pack_reply,
-    unpack_command,
-    unpack_reply,
-)
-from exo_gravity.core.motors.wire_formats import (
+from exo_gravity.core.motors.ak import MIT, MIT_V3, error_text, pack_reply, unpack_reply
+from exo_gravity.core.motors.families import FORMATS, MOTORS
+from exo_gravity.core.motors.frames import (
+    ALIAS,
     BROADCAST_ID,
     COMMAND,
+    ENTER,
+    EXIT,
     EXTENDED,
-    FORMATS,
     MALFORMED,
-    MIT,
-    MIT_V3,
     OTHER,
     REPLY,
     SERVO,
+    SET_ZERO,
+    MotorReply,
+    is_special,
+    pack_command,
+    unpack_command,
 )
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 
@@ -192,7 +186,7 @@ def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(
 def test_any_frame_is_a_reply_that_can_be_read_or_a_command_or_neither(board, frame_id, data, is_remote):
     wire_format, spec = board
     kind, can_id = wire_format.classify(frame_id, data, IDS, is_remote)
-    assert (kind, can_id) == (OTHER, 0) or kind in (REPLY, COMMAND, MALFORMED, SERVO)
+    assert (kind, can_id) == (OTHER, 0) or kind in (REPLY, COMMAND, ALIAS, MALFORMED, SERVO)
     assert can_id in IDS or kind == OTHER or (kind, can_id) == (COMMAND, BROADCAST_ID)
     if kind == REPLY:
         assert all(map(math.isfinite, wire_format.unpack_reply(spec, can_id, data)[1:4]))
@@ -278,7 +272,8 @@ def test_every_frame_that_some_firmware_takes_for_another_is_special():
     [(3, 6, False), (3, 1, False), (3, 0, False), (3, 0, True), (0x83, 8, False), (0x703, 1, False), (0x103, 0, True)],
 )
 def test_a_motor_may_obey_short_and_remote_frames_and_ids_whose_lowest_7_bits_are_its_own(frame_id, length, is_remote):
-    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (COMMAND, 3)
+    kind = COMMAND if frame_id == 3 else ALIAS
+    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (kind, 3)
     assert MIT.classify(frame_id + 1, b"\xff" * length, IDS, is_remote) == (OTHER, 0)
 
 
@@ -291,7 +286,7 @@ def test_a_reply_of_another_length_is_malformed_and_a_status_frame_is_no_reply_o
 
 def test_the_seventh_byte_of_the_open_drive_is_no_temperature():
     reply = unpack_reply(AK60, pack_reply(AK60, 3, 0.5, 0.0, 0.0) + b"\x4d")
-    assert reply[:2] == (3, pytest.approx(0.5, abs=0.001)) and reply[4:] == (None, None)
+    assert reply[:2] == (3, pytest.approx(0.5, abs=0.001)) and reply[4:6] == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -329,7 +324,7 @@ def test_a_v1_command_and_reply_have_the_bytes_worked_out_by_hand():
     assert pack_command(AK60, 0.0, 0.0, 0.0, 5.0, 3.0) == bytes.fromhex("8000800000fff999")
     # motor 7, position 0xffff -> 12.5, velocity 0 -> -45, torque 2457 -> 3, 70 - 40 degC, error 2
     data = bytes.fromhex("07 ffff 000999 46 02")
-    assert unpack_reply(AK60, data) == (7, *(pytest.approx(value) for value in (12.5, -45.0, 3.0)), 30, 2)
+    assert unpack_reply(AK60, data) == (7, *(pytest.approx(value) for value in (12.5, -45.0, 3.0)), 30, 2, None)
 
 
 def test_a_v3_command_has_the_bytes_worked_out_by_hand():
@@ -343,7 +338,7 @@ def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
     data = bytes.fromhex("0384 0348 ff38 fb 07")
     reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
     assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
-    assert reply[3:] == (pytest.approx(-2.0 * 0.2997), -5, 7)
+    assert reply[3:] == (pytest.approx(-2.0 * 0.2997), -5, 7, None)
     assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
     assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
 

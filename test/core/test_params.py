@@ -17,8 +17,9 @@ from exo_gravity.core.compensation.settings import (
     settings_of,
 )
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import GONE, in_force, values_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.calibration.tour import CALIBRATOR
@@ -100,7 +101,7 @@ def test_a_list_of_whole_and_other_numbers_which_ros_cannot_load_is_refused_by_n
 
 
 def test_the_wearers_arm_follows_from_the_body_mass():
-    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g"}
+    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": 1.0}
     assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
     half = values_of(COMPENSATOR, {**wearer, "support": 0.5})
     assert settings_of(half).arm.total_mass == pytest.approx(3.707, abs=1e-3)
@@ -165,3 +166,43 @@ def test_moments_that_only_too_heavy_an_arm_can_have_are_refused():
 def test_the_law_of_a_urdf_is_not_for_the_exoskeletons_own_arm():
     with pytest.raises(ParameterError, match=r"^law = 'urdf': must be chosen at the start"):
         settings_of(values_of(COMPENSATOR, {"law": "urdf"}))
+
+
+ELBOW = {
+    "can.interface": "virtual",
+    "can.channel": "arm",
+    "joint_names": ["elbow"],
+    "motor": ["AK80-64"],
+    "can_id": [7],
+    "position_min": [-0.1],
+    "position_max": [2.4],
+    "max_effort": [12.0],
+}
+
+
+def test_an_arm_of_one_joint_has_the_defaults_that_are_the_same_for_all_joints():
+    values = values_of(CAN_BRIDGE, ELBOW)
+    assert values["direction"] == [1] and values["zero"] == values["home"] == values["largest_moment"] == [0.0]
+    assert limits_of(values).home_tolerance == (pytest.approx(0.048, abs=1e-3),)
+    assert motors_of(values)[0].spec.gear_ratio == 64
+
+
+@pytest.mark.parametrize("name", ["motor", "can_id", "position_min", "position_max", "max_effort"])
+def test_what_differs_between_the_joints_of_the_papers_arm_is_no_default_for_another_arm(name):
+    with pytest.raises(ParameterError, match=rf"^{name} = \[\]: must be set to 1 "):
+        values_of(CAN_BRIDGE, {key: value for key, value in ELBOW.items() if key != name})
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"zero": [0.0] * 4}, r"^zero = .*: must be 1 number"),
+        ({"joint_names": []}, r"^joint_names = \[\]: must be 4 strings"),
+        ({"home": [2.9]}, r"^home of elbow = 2\.9: must be within its limits, -0\.1 to 2\.4 rad"),
+        ({"largest_moment": [0.3]}, r"^largest_moment = \[0\.3\]: must be zeros for another arm than the paper's"),
+        ({"can.channel": "a,b"}, r"^can\.channel = 'a,b': must be one channel for all motors, or 1"),
+    ],
+)
+def test_a_list_that_does_not_fit_the_joints_is_refused(changes, problem):
+    with pytest.raises(ParameterError, match=problem):
+        limits_of(values_of(CAN_BRIDGE, {**ELBOW, **changes}))

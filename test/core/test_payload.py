@@ -17,8 +17,8 @@ from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.limits import Limits
@@ -96,7 +96,7 @@ def test_a_load_and_a_wearer_add_up_in_any_order_and_the_load_is_carried_in_full
         ({"payload.mass": 5.5}, "payload.mass = 5.5: must be a number from 0 to 5 kg"),
         ({"payload.cog": [0.0, 0.6, 0.0]}, "payload.cog = .* from -0.5 to 0.5 m"),
         ({"payload.mass": 1.0, "law": "paper_static"}, "payload.mass = 1.0: must be 0 for law paper_static"),
-        ({"payload.mass": 4.0, "wearer.body_mass": 140.0, "mode": "zero_g"}, "payload.mass 4.00"),
+        ({"payload.mass": 4.0, "wearer.body_mass": 140.0, "support": 1.0, "mode": "zero_g"}, "payload.mass 4.00"),
     ],
 )
 def test_an_impossible_load_is_refused_with_the_reason(values, message):

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.safety.descent import DESCENT
-from exo_gravity.core.safety.drive import CARRYING, OFF, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 from exo_gravity.core.safety.monitors import RIDE
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+from ..support.simulated_device import OFF
 
 FAULTS = [
     (lambda arm: arm.silent.add(3), "motor_silent"),

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from exo_gravity.core.safety.drive import OFF, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.drive import Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import SIGN_PUSH, SWITCH_ON, SignCheck
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
 from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
+from ..support.simulated_device import OFF
 
 
 def test_a_new_machine_keeps_the_motors_off_and_torque_begins_slowly_and_without_a_step():
@@ -206,6 +207,7 @@ def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():
     arm.enable().cycle(1.6)
     assert arm.fault_code == "torque_not_delivered"
     assert "d: the motor did not switch on: 0 % of the commanded torque replied" in arm.machine.fault.reason
+    assert "in servo mode" in arm.machine.fault.reason
 
 
 def test_a_motor_that_missed_its_enter_gets_another_one():

@@ -130,3 +130,21 @@ def test_a_clock_that_gains_half_a_second_in_a_quarter_of_an_hour_is_followed_an
         assert "by its stamp" in tilt.problem(now)
     with pytest.raises(ParameterError, match="synchronise the clocks"):
         tilt.set_gravity(901.0, UPRIGHT, age=-gain * 901.0 - 0.06)
+
+
+def test_a_tilt_that_creeps_in_small_jumps_faster_than_a_trunk_is_refused():
+    tilt, period = TiltInput("left", TIMEOUT), 0.004
+    turned = Rotation.from_euler("y", np.arange(0.0, 3.1, 15.0 * period)[:, None]).inv().apply(UPRIGHT)
+    with pytest.raises(ParameterError, match="of the last ones"):
+        for n, gravity in enumerate(turned):
+            tilt.set_gravity(10.0 + n * period, gravity)
+    assert angle_between(tilt.at(10.0).direction, BASE_FROM_TRUNK["left"] @ UPRIGHT) < 0.2
+
+
+def test_noise_and_a_quick_bow_are_accepted():
+    tilt, random = TiltInput("left", TIMEOUT), np.random.default_rng(1)
+    for now in np.arange(0.0, 1.0, 0.002):
+        bowed = 0.8 * (1.0 - math.cos(math.pi * now))  # 92 degrees in a second, 2.5 rad/s at most
+        noise = random.normal(0.0, 0.02, 2)
+        tilt.set_tilt(now, bowed + noise[0], noise[1])
+    assert tilt.problem(1.0) == ""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.trust import Readings
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait

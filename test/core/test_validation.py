@@ -7,8 +7,8 @@ import math
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import motors_of
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 

@@ -16,8 +16,8 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -33,8 +33,8 @@ MOVE, HELD = 7.0, 9.2  # s in which the hand leads the arm to POSE, and time at 
 LOAD = Wearer(70.0).on_links(DEFAULT_LINKS.length)
 CALIBRATED = ModelError((0.05,) * 4, (0.01,) * 4, 0.02, 0.01)
 SETTINGS = Settings(
-    "right", DEFAULT_LINKS, mode="zero_g", wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), use_imu=False,
-    max_effort=(9.0, 18.0, 9.0, 9.0), model_error=CALIBRATED,
+    "right", DEFAULT_LINKS, mode="zero_g", support=1.0, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog),
+    use_imu=False, max_effort=(9.0, 18.0, 9.0, 9.0), model_error=CALIBRATED,
 )  # fmt: skip
 TILT = Tilt.of("right")
 

@@ -19,9 +19,9 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import EXTENDED, ID_BITS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS
 
 from ..support.launched_nodes import executable
 from ..support.load import start_frames, start_spin

@@ -15,9 +15,9 @@ import time
 
 import numpy as np
 
+from exo_gravity.core.motors.ak import MIT_V3
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
-from exo_gravity.core.motors.wire_formats import MIT_V3
 
 from ..support.launched_nodes import SECOND_GROUP
 from ..support.ros_probe import Timeout

@@ -281,7 +281,7 @@ class WearerRig(Rig):
     """Zero-G for a wearer of 75 kg, who is passive. In this pose the rated torques carry the wearer's arm."""
 
     pose = (0.0, 0.4, 0.2, 0.5)
-    compensator: ClassVar[Parameters] = {"mode": "zero_g", "wearer": {"body_mass": 75.0}}
+    compensator: ClassVar[Parameters] = {"mode": "zero_g", "support": 1.0, "wearer": {"body_mass": 75.0}}
     simulator: ClassVar[Parameters] = {
         "wearer": {"mass": _MASS.tolist(), "cog": _COG.tolist()},
         "friction": {"coulomb": [0.1] * 4},

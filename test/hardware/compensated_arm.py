@@ -10,7 +10,8 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.motors.wire_formats import MIT, WireFormat
+from exo_gravity.core.motors.ak import MIT
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
@@ -65,7 +66,7 @@ class CompensatedArm(DirectController, VirtualArm):
     ) -> None:
         mass, cog = WEARER
         worn = {"wearer_mass": mass, "wearer_cog": cog}
-        given = {"mode": "zero_g", "max_effort": limit, "use_imu": bool(imu), **worn, **settings}
+        given = {"mode": "zero_g", "support": 1.0, "max_effort": limit, "use_imu": bool(imu), **worn, **settings}
         self.settings = Settings("right", DEFAULT_LINKS, **given)
         self.is_damped = True
         self.top_speed = self.driven = 0.0

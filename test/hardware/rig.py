@@ -12,8 +12,9 @@ from typing import Any
 import can
 
 from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
+from exo_gravity.core.motors.ak import MIT
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.motors.wire_formats import MIT, WireFormat
 from exo_gravity.core.safety.drive import Drive, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus

@@ -64,9 +64,9 @@ def test_exchanged_adapters_are_refused_by_their_numbers(sysfs):
 
 
 def test_two_buses_have_a_number_for_each_motor():
-    assert serials_of("", "can0") == ("",) * 4
-    assert serials_of("A", "can0") == ("A",) * 4
-    assert serials_of("A,A,B, B", "can0,can0,can1,can1") == ("A", "A", "B", "B")
+    assert serials_of("", "can0", 4) == ("",) * 4
+    assert serials_of("A", "can0", 4) == ("A",) * 4
+    assert serials_of("A,A,B, B", "can0,can0,can1,can1", 4) == ("A", "A", "B", "B")
     for wrong in ("A,B", "A,B,A,B"):
         with pytest.raises(ParameterError, match=r"can\.serial"):
-            serials_of(wrong, "can0,can0,can1,can1")
+            serials_of(wrong, "can0,can0,can1,can1", 4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.imu_report import report
-from bench.imu_trials import by_estimator, by_vqf, lost_samples, read_trials, score
+from bench.imu_trials import Trial, by_estimator, by_vqf, lost_samples, read_trials, score
 
 TRIALS = list(read_trials())
 
@@ -35,6 +35,21 @@ def test_jitter_of_the_stamps_costs_little():
     jittered = type(trial)(**{**vars(trial), "times": trial.times + jitter})
     assert score(jittered, "here").rms < score(trial, "here").rms + 0.1
     assert score(jittered, "here").published >= 0.99
+
+
+@pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
+def test_a_start_amid_strong_motion_gives_a_tilt_within_12_seconds(trial):
+    # Motion that is played forward and then backward has no jump: rates change their sign, forces do not.
+    rates, forces = (
+        np.concatenate((values, sign * values[::-1]))
+        for values, sign in ((trial.angular_velocity, -1.0), (trial.acceleration, 1.0))
+    )
+    for start in np.linspace(np.flatnonzero(trial.counts)[0], len(trial.times) - 2.0 * trial.rate, 5).astype(int):
+        part = slice(start, start + round(12.0 * trial.rate))
+        times = np.arange(part.stop - part.start) / trial.rate
+        nothing = np.zeros((len(times), 3))
+        shaken = Trial(trial.name, trial.rate, times, rates[part], forces[part], nothing, nothing[:, 0] == 0.0)
+        assert np.isfinite(by_estimator(shaken)[0]).any()
 
 
 def test_the_report_has_a_row_for_each_trial_and_a_column_for_each_method():

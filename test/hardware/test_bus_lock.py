@@ -10,7 +10,6 @@ import sys
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import (
@@ -24,7 +23,7 @@ from exo_gravity.hardware.ownership.bus_lock import (
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, take_over
 from exo_gravity.sim.virtual_time import VirtualClock
 
-from ..support.simulated_device import drive_of
+from ..support.simulated_device import OFF, drive_of
 from .rig import MOTORS_OF_ARM, VirtualRig
 from .simulated_rig import NoWatchdog
 from .wires import Responder
@@ -103,7 +102,7 @@ def test_a_refused_owner_leaves_the_notes_unchanged():
 
 def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     lock = lock_of("first")
-    assert lock.notes.drive == OFF and not lock.problem
+    assert not lock.notes.drive.powered and not lock.problem
     assert stat.S_IMODE(notes_file(CAN0).stat().st_mode) == 0o666  # the next owner may be another user
     lock.notes.note(DRIVE)
     lock.release()

@@ -7,7 +7,7 @@ import pytest
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import EXIT
+from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus

@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
-from exo_gravity.core.compensation.controller import DirectController
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.ak import MIT, USUAL_MOTORS
+from exo_gravity.core.motors.families import FORMATS, MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS
-from exo_gravity.core.motors.wire_formats import FORMATS, MIT
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.sim import ArmConfig
-from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
-from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
-from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.truth import TruthRecords
-from exo_gravity.sim.virtual_arm import VirtualArm
-from exo_gravity.sim.virtual_time import Wire
-from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
-RATE = 250.0  # Hz
-POSE = [0.0, 0.5, 0.4, 0.6]  # rad
-WORN_MASS, WORN_COG = Wearer(75.0).on_links(DEFAULT_LINKS.length)
-DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause
-# While a motor has no power and it is not yet known, the others push on with the torque of the pose before.
-UNKNOWN_LOSS = 1.9, 0.5  # rad/s and J
 FIRMWARE = pytest.mark.parametrize("name", [name for name in FIRMWARES if name != "v3_query"])
 
 
@@ -48,44 +28,13 @@ def motor_of(firmware: Firmware, name: str, can_id: int) -> JointMotor:
     return JointMotor(spec, can_id, wire_format=wire_format)
 
 
-class FirmwareArm(DirectController, VirtualArm):
-    """The arm of a 75 kg wearer, hanging, in Zero-G; its motors have one firmware. truth: since it was last cleared."""
+class FirmwareArm(CarriedArm):
+    """An arm whose motors have one firmware."""
 
     def __init__(self, firmware: Firmware, remembered: float = 0.0, bitrate: int = 0) -> None:
         joints = [motor_of(firmware, name, 1 + i) for i, name in enumerate(USUAL_MOTORS)]
         usual = replace(firmware, status_rate=500.0)  # as docs/wiring.md asks for
-        config = ArmConfig(wearer_mass=WORN_MASS, wearer_cog=WORN_COG, coulomb_friction=(0.1,) * len(joints))
-        device = SimulatedDevice(SimulatedArm(config), [SimulatedMotor(joint, usual) for joint in joints])
-        for joint in joints if remembered else ():  # what another tool left in their memory
-            for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
-                device.exchange(*frame)
-        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", max_effort=PEAK, use_imu=False,
-                            wearer_mass=WORN_MASS, wearer_cog=WORN_COG)  # fmt: skip
-        limits = Limits(JOINTS, max_effort=PEAK)
-        DirectController.__init__(self, Compensator(settings, JOINTS), limits)
-        wire = Wire(start=0.0, bitrate=bitrate)
-        wire.play(device, tick=None)
-        port = CanPort(wire.open(), wire.clock, wire.open)
-        VirtualArm.__init__(self, device, self, joints, limits, RATE, wire, [port] * len(joints))
-        self.truth = device.truth = TruthRecords()
-
-    def carry(self) -> None:
-        """Enable the hanging arm, and run until it is carried."""
-        self.enable()
-        assert self.run_until(lambda: self.safety.state in (State.ACTIVE, State.FAULT), 30.0), self.safety.waiting_for
-        assert self.safety.state is State.ACTIVE, self.safety.fault
-
-    def raise_to(self, pose: list[float]) -> None:
-        """Let the wearer bring the arm to a pose, and leave it to the motors."""
-        script = TrialScript.parse({"name": "raise", "steps": [{"move": pose, "over": 2.0}]})
-        self.device.start(VirtualWearer(script))
-        self.run(3.0)
-        self.truth = self.device.truth = TruthRecords()
-
-    @property
-    def caused(self) -> Driven:
-        """What the motors caused."""
-        return driven(self.truth.records)
+        super().__init__(joints, [SimulatedMotor(joint, usual) for joint in joints], PEAK, remembered, bitrate)
 
 
 @FIRMWARE
@@ -119,28 +68,6 @@ def test_a_torque_that_another_tool_left_in_the_motors_memory_is_not_carried_out
     arm = FirmwareArm(FIRMWARES[name], remembered=4.9)
     arm.carry()
     assert arm.caused.speed < DRIVEN and arm.caused.energy < ENERGY
-
-
-def cut(joints: tuple[int, ...], duration: float) -> Callable[[FirmwareArm], None]:
-    def act(arm: FirmwareArm) -> None:
-        for joint in joints:
-            arm.device.unplug(joint, duration)
-
-    return act
-
-
-def stall(duration: float) -> Callable[[FirmwareArm], None]:
-    return lambda arm: arm.clock.stall(duration)
-
-
-EVENTS = {
-    "all motors restart in 20 ms": cut((0, 1, 2, 3), 0.02),
-    "all motors restart in 80 ms": cut((0, 1, 2, 3), 0.08),
-    "supply cut for 3 s": cut((0, 1, 2, 3), 3.0),
-    "motor 2 restarts in 30 ms": cut((1,), 0.03),
-    "motor 2 loses its power for 1 s": cut((1,), 1.0),
-    **{f"loop stalls for {ms} ms": stall(ms / 1000.0) for ms in (20, 40, 60, 75, 120)},
-}
 
 
 # Of each kind of event, the firmware that takes it worst.

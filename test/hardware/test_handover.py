@@ -7,7 +7,8 @@ import pytest
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, MotorCommand, unpack_command
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, MotorCommand, unpack_command
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 from exo_gravity.hardware.can.can_port import ArmOnBus
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from bench.ordinary.drivers import DURATION, Timing, even, ordinary_drivers, true_stamps
-from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 
 from ..support.imu_drivers import driven, swaying_trunk
 from ..support.imu_faults import bowing_trunk, follow, sampled
@@ -65,15 +65,13 @@ def test_a_sensor_that_is_polled_twice_as_often_as_it_measures_is_followed():
 
 
 def test_a_reported_orientation_in_batches_is_followed():
-    taken = even()
+    def trunk(times):  # turns by up to 1.2 rad/s
+        return 4.0 * swaying_trunk(times)
+
     timing = DRIVERS["arrival, 16 ms timer of an FTDI adapter"]
-    turns = Rotation.from_euler("xyz", 4.0 * swaying_trunk(taken)).as_quat()  # up to 1.2 rad/s
-    estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))
-    answers = [
-        estimator.update(ImuSample(stamp, None, None, turn), stamp)
-        for stamp, turn in zip(timing.stamps.tolist(), turns.tolist(), strict=True)
-    ]
-    assert all(answers[110:])
+    motion = replace(driven(trunk, timing), orientation=Rotation.from_euler("xyz", trunk(timing.taken)).as_quat())
+    outcome = follow(motion)
+    assert not any(outcome.refusals) and np.isfinite(outcome.errors[110:]).all()
 
 
 def test_a_clock_that_is_a_little_slow_is_followed():

@@ -6,9 +6,9 @@ motion; every published tilt is judged by the true one.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,6 +26,7 @@ from ..support.imu_faults import (
     bowing_trunk,
     follow,
     lost,
+    sampled,
     second_publisher,
     slow_clock,
     stuck,
@@ -108,14 +109,33 @@ def test_a_gyroscope_that_turns_to_degrees_amid_the_motion_is_named_within_the_n
         assert any(outcome.refusals[start : start + 7])
 
 
+def standing(times):
+    """Roll, pitch and yaw (n, 3) rad of a trunk that sways by a degree."""
+    return np.radians(np.stack((np.sin(1.9 * times), 0.7 * np.sin(1.3 * times + 1.0), 2.0 * np.sin(0.4 * times)), 1))
+
+
+def bowing_slowly(times):
+    """The same of a trunk that bows by 34 degrees in 8 s."""
+    s = np.clip((times - STILL_TIME) / 8.0, 0.0, 1.0)
+    return np.outer(s**3 * (10.0 - 15.0 * s + 6.0 * s * s), (0.0, 0.6, 0.0))
+
+
+@pytest.mark.parametrize("trunk", [standing, bowing_slowly])
+@pytest.mark.parametrize("start", [260, 310, 430, 560, 690])
+def test_a_gyroscope_that_turns_to_degrees_in_slow_motion_is_withheld_before_the_tilt_is_wrong_and_named(trunk, start):
+    motion = values(np.degrees)(sampled(trunk, np.arange(800) / 100.0, 0.01, 100.0), start)
+    outcome = follow(motion)
+    withheld = start + np.flatnonzero(np.isnan(outcome.errors[start:]))
+    named = [k for k, text in enumerate(outcome.refusals) if "check the gyroscope's unit" in text]
+    assert withheld[0] < start + 17 and named[0] < start + 60
+    assert np.nanmax(outcome.errors) < 6.0 and not np.isfinite(outcome.errors[start + 17 :]).any()
+
+
 @pytest.mark.parametrize("turn", [30.0, 90.0, 180.0])
 def test_a_wrong_reported_orientation_is_never_used_also_while_the_trunk_moves(turn):
-    estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))
     reported = Rotation.from_euler("xyz", bowing_trunk(MOTION.times)) * Rotation.from_euler("y", turn, degrees=True)
-    rows = (MOTION.times, MOTION.gyroscope, MOTION.accelerometer, reported.as_quat())
-    for row in zip(*(column.tolist() for column in rows), strict=True):
-        with contextlib.suppress(ParameterError):
-            assert estimator.update(ImuSample(*row)) is None
+    outcome = follow(replace(MOTION, orientation=reported.as_quat()))
+    assert any(outcome.refusals) and np.isnan(outcome.errors).all()
 
 
 def test_3_percent_of_the_samples_lost_cost_nothing():

@@ -11,9 +11,9 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, MIT, MIT_V3, WireFormat
-from exo_gravity.core.safety.drive import OFF, Send, State
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ENTER, EXIT, EXTENDED, ID_BITS, WireFormat
+from exo_gravity.core.safety.drive import Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.hardware.can.motor_bus import MotorBus
@@ -21,7 +21,7 @@ from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 from exo_gravity.sim.virtual_time import Wire
 
-from ..support.simulated_device import drive_of, joints_of, make_device, sending
+from ..support.simulated_device import OFF, drive_of, joints_of, make_device, sending
 from .rig import CYCLE, LIMITS
 from .test_motor_bus import WEIGHTLESS, now
 from .wires import wire_for_test

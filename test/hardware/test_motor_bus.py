@@ -11,16 +11,18 @@ from can.interfaces.socketcan import SocketcanBus
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import pack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, MotorCommand, unpack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, MotorCommand, pack_reply, unpack_command
-from exo_gravity.core.safety.drive import OFF, Send
+from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
-from ..support.simulated_device import drive_of, frame, sending
+from ..support.simulated_device import OFF, drive_of, frame, sending
 from .wires import wire_for_test
 
 AK60 = MOTORS["AK60-6"]
@@ -153,8 +155,7 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
         (frame(1, ENTER), "foreign command"),
         (frame(1, b""), "foreign command"),
         (frame(1, ENTER[:6]), "foreign command"),
-        (frame(0x83, ENTER), "foreign command"),  # the open drive compares 7 bits of the ID
-        (frame(0x703, b"\x05"), "foreign command"),
+        (frame(0x83, ENTER), "foreign frame"),
         (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
         (frame(1, REPLY[:5]), "malformed reply"),
@@ -172,6 +173,14 @@ def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(bus, other, message,
     bus.exchange(OFF, now(bus))
     assert bus.samples[0].time == float("-inf")
     assert bus.ignored == {kind: 1}
+
+
+@pytest.mark.parametrize(("length", "kind"), [(7, "foreign command"), (8, "foreign frame")])
+def test_another_id_with_the_same_lowest_7_bits_commands_an_open_drive_alone(bus, other, length, kind):
+    for message in (frame(1, REPLY[:length]), frame(0x81, ENTER), frame(0x701, b"\x05")):
+        other.send(message)
+    bus.exchange(OFF, now(bus))
+    assert bus.ignored == {kind: 2}
 
 
 @pytest.mark.parametrize("can_id", [0, 1])

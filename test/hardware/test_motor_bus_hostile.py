@@ -14,9 +14,8 @@ from collections import Counter
 import can
 import pytest
 
+from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.motors.specs import ENTER, EXIT, SET_ZERO
-from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.trust import Readings
 from exo_gravity.hardware.can.can_port import message_of
@@ -24,6 +23,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import Wire
 
+from ..support.simulated_device import OFF
 from .test_motor_bus import MOTORS_OF_ARM as JOINTS
 from .test_motor_bus import WEIGHTLESS
 from .wires import Responder

@@ -8,8 +8,8 @@ import pytest
 from bench.ordinary.__main__ import is_quiet
 from bench.ordinary.motors import Electronics, OrdinaryMotor
 from bench.ordinary.rows import EQUIPMENT, Row
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT
 
 from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
 

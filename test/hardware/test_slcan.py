@@ -13,15 +13,15 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import MotorReply
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
-from exo_gravity.core.safety.drive import OFF, Send
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ID_BITS, MotorReply
+from exo_gravity.core.safety.drive import Send
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
-from ..support.simulated_device import drive_of, joints_of, make_device, sending
+from ..support.simulated_device import OFF, drive_of, joints_of, make_device, sending
 from ..support.waiting import pause, wait_until
 from .test_motor_bus import WEIGHTLESS
 

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import pytest
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import Drive, State
 
 from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig

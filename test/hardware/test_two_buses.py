@@ -14,8 +14,9 @@ import pytest
 
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import ID_BITS, WireFormat
 from exo_gravity.core.motors.joint_motor import channels_of
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3, WireFormat
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.power import Power
@@ -69,7 +70,7 @@ class TwoBusRig(VirtualRig):
         near = HalfPlayed(self.first, self, (0, 1))
         self.halves = near, HalfPlayed(self.second, self, (2, 3), near)
         address: Address = ("wire", f"{FIRST},{FIRST},{SECOND},{SECOND}", {})
-        limits = replace(LIMITS, channels=channels_of(address[1]))
+        limits = replace(LIMITS, channels=channels_of(address[1], 4))
         self.arm = ArmOnWires(address, self.motors, limits, CYCLE, self.wires)
 
     @property

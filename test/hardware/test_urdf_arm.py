@@ -4,9 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rtbdata
 
-from exo_gravity.core import gravity_torque
+from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.urdf_arm import UrdfArm
@@ -17,14 +16,12 @@ from exo_gravity.tools.urdf import urdf_of
 from ..support.urdf_oracle import MujocoArm
 
 PUBLISHED = Path(__file__).parents[1] / "data" / "arms"
-KUKA = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
 ARMS = {
     # The UR5 as a table arm; the Panda with two prismatic fingers, which stay at 0; the Kinova with continuous joints.
     "ur5": (PUBLISHED / "ur5.urdf",
             [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]),
     "panda": (PUBLISHED / "panda.urdf", [f"panda_joint{n}" for n in range(1, 8)]),
     "kinova": (PUBLISHED / "kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
-    "kr16": (KUKA, [f"joint_a{n}" for n in range(1, 7)]),
 }  # fmt: skip
 POSES = 200
 ONE_LINK = """<robot name="one">
@@ -34,6 +31,11 @@ ONE_LINK = """<robot name="one">
 <joint name="j" type="{kind}"><parent link="base"/><child link="link"/><axis xyz="0 1 0"/>
 <limit lower="-1" upper="1" effort="5" velocity="1"/></joint>
 </robot>"""
+
+
+def torque_of(arm: UrdfArm, theta, gravity) -> tuple[float, ...]:
+    """Return the torque (n,) in Nm where the root link feels `gravity`, (3,) m/s^2 in its axes."""
+    return arm.torque(theta, Tilt.of_felt("left", gravity, STANDARD_GRAVITY))
 
 
 def random_gravity(random: np.random.Generator) -> np.ndarray:
@@ -49,7 +51,7 @@ def test_the_torques_of_published_arms_equal_mujocos_in_any_pose_under_any_tilt(
     largest = 0.0
     for _ in range(POSES):
         theta, gravity = random.uniform(-np.pi, np.pi, len(joints)), random_gravity(random)
-        torque = arm.torque(theta, gravity)
+        torque = torque_of(arm, theta, gravity)
         assert np.allclose(torque, mujoco.torque(theta, gravity), rtol=0.0, atol=1e-11)
         largest = max(largest, *np.abs(torque))
     assert largest > 10.0
@@ -61,7 +63,7 @@ def test_the_joints_may_come_in_any_order():
     order = random.permutation(len(joints))
     theta, gravity = random.uniform(-3.0, 3.0, len(joints)), random_gravity(random)
     mixed, ordered = UrdfArm(text, [joints[n] for n in order]), UrdfArm(text, joints)
-    assert np.allclose(mixed.torque(theta[order], gravity), np.array(ordered.torque(theta, gravity))[order])
+    assert np.allclose(torque_of(mixed, theta[order], gravity), np.array(torque_of(ordered, theta, gravity))[order])
     assert mixed.max_effort == tuple(ordered.max_effort[n] for n in order)
 
 
@@ -74,8 +76,8 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(sid
         for _ in range(POSES):
             theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
             exact = gravity_torque(own.robot, theta, Tilt.of_gravity(side, gravity).direction)
-            assert np.allclose(arm.torque(theta, gravity), exact, rtol=0.0, atol=1e-9)
-        assert arm.mass == pytest.approx(own.robot.total_mass)
+            assert np.allclose(torque_of(arm, theta, gravity), exact, rtol=0.0, atol=1e-9)
+        assert arm.total_mass == pytest.approx(own.robot.total_mass)
 
 
 @pytest.mark.parametrize(("text", "joint", "problem"), [
@@ -92,7 +94,28 @@ def test_a_description_that_cannot_be_used_is_refused_with_the_reason(text, join
         UrdfArm(text, [joint])
 
 
+def test_the_papers_arm_as_a_urdf_carries_a_wearer_and_a_load_like_the_closed_form():
+    """The description has the trunk's axes in every link while the arm hangs: x_4 down, y_4 forward, z_4 inward."""
+    params, random = packaged_config("sim_both.yaml"), np.random.default_rng(4)
+    for side, inward in (("right", 1.0), ("left", -1.0)):
+        own = configured_arm(params, side)
+        arm = UrdfArm(urdf_of(params, side), own.joint_names, f"{side}_end")
+        assert arm.length == pytest.approx(own.robot.length.tolist())
+        mass, cog, load = (0.0, 0.2, 2.0, 1.5), (0.0, 0.05, 0.16, 0.18), (0.03, 0.02, -0.01)
+        x, y, z = load
+        held = arm.with_wearer(mass, cog, 0.7).with_payload(1.2, (y, inward * z, -x))
+        exact = own.robot.with_wearer(mass, cog, 0.7).with_payload(1.2, load)
+        assert held.total_mass == pytest.approx(exact.total_mass)
+        for _ in range(POSES):
+            theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
+            expected = gravity_torque(exact, theta, Tilt.of_gravity(side, gravity).direction)
+            assert np.allclose(torque_of(held, theta, gravity), expected, rtol=0.0, atol=1e-9)
+        assert held.with_payload(0.0).with_wearer((0.0,) * 4, (0.0,) * 4) == arm.with_payload(0.0).with_wearer(
+            (0.0,) * 4, (0.0,) * 4
+        )
+
+
 def test_one_link_takes_its_weight_times_its_lever():
     arm = UrdfArm(ONE_LINK.format(mass=2, kind="continuous"), ["j"])
-    assert arm.torque([np.pi / 2], (0.0, 0.0, -10.0)) == pytest.approx([10.0])
+    assert torque_of(arm, [np.pi / 2], (0.0, 0.0, -10.0)) == pytest.approx([10.0])
     assert arm.max_effort == (5.0,)

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence
@@ -18,6 +17,7 @@ from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
 from exo_gravity.sim.virtual_time import VirtualClock
 
 from ..support.launched_nodes import children
+from ..support.simulated_device import OFF
 from .rig import CYCLE, VirtualRig
 from .wires import Responder
 

@@ -11,6 +11,7 @@ import pytest
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -86,11 +87,13 @@ def failed(results: list[BenchStep]) -> str:
 def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
     results = acceptance()
     assert failed(results) == "", results[-1].sentence
-    written = json.loads(json.dumps(record(results, "right", is_simulated=True), default=float))
-    assert written["passed"] and written["simulated"] and [step["name"] for step in written["steps"]] == NAMES
+    written = json.loads(json.dumps(record(results, "right", Source.SIMULATED), default=float))
+    assert (
+        written["passed"] and written["source"] == "simulated" and [step["name"] for step in written["steps"]] == NAMES
+    )
     measured = results[NAMES.index("torque")].measured
     assert measured["ratio"] == pytest.approx(1.0, abs=0.15)
-    assert not record(results[:-1], "right", is_simulated=False)["passed"]  # a step is missing
+    assert not record(results[:-1], "right", Source.REAL)["passed"]  # a step is missing
 
 
 def test_a_motor_without_the_offset_of_its_temperature_fails_when_cold():

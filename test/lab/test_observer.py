@@ -16,15 +16,18 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.numbers import COVER
+from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
 from exo_gravity.lab.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
 from exo_gravity.lab.observer.watch import WearerWatch
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.urdf import UrdfConfig
 
 from ..core.test_gravity_oracles import random_arm
 from ..core.test_kinematics import NO_ROTORS, ROUNDING, with_rods
+from ..support.chains import random_chain
 
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 STILL = (0.0,) * 4
@@ -97,7 +100,13 @@ def simulated(seconds, torque_of, base=None):
     TrunkState.
     """
     arm = SimulatedArm(
-        ArmConfig(DEFAULT_LINKS, LOAD.mass, LOAD.cog, coulomb_friction=COULOMB, viscous_friction=VISCOUS)
+        ArmConfig(
+            DEFAULT_LINKS,
+            wearer_mass=LOAD.mass,
+            wearer_cog=LOAD.cog,
+            coulomb_friction=COULOMB,
+            viscous_friction=VISCOUS,
+        )
     )
     arm.reset(POSE)
     for n in range(round(seconds / PERIOD)):
@@ -233,3 +242,34 @@ def test_a_watch_follows_the_load_in_the_settings():
     loaded = replace(SETTINGS, payload_mass=1.0)
     needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
     assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
+
+
+def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
+    count, rotor = 3, 0.01
+    text, names = random_chain(count, seed=5)
+    arm = UrdfArm(text, names, "hand", (rotor,) * count)
+    worn = {"wearer_mass": (0.0, 0.8, 0.6), "wearer_cog": (0.0, 0.5 * arm.length[1], 0.6 * arm.length[2])}
+    settings = Settings(
+        "left", arm, "urdf", mode="zero_g", support=1.0, max_effort=(100.0,) * count, use_imu=False, **worn
+    )
+    friction = dict.fromkeys(("coulomb_friction", "viscous_friction"), (0.0,) * count)
+    device = SimulatedArm(
+        UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(rotor,) * count, **worn, **friction)
+    )
+    start = np.array((0.3, -0.4, 0.5))
+    device.reset(start)
+    observer, tilt, given = MomentumObserver(settings), Tilt.of("left"), np.array((0.6, -0.4, 0.3))
+    errors, speeds = [], []
+    for n in range(3000):
+        now, theta = n * 0.001, device.positions
+        swing = 2.0 * np.cos(3.0 * now + np.arange(count)) - 5.0 * (theta - start)  # Nm, which moves the arm to and fro
+        motors = np.array(settings.torque(theta, tilt)[0]) + swing - 0.4 * np.array(device.velocities)
+        device.step(motors + given)
+        if n % 10 == 0:
+            estimate = observer.update(now, (theta, device.velocities, motors.tolist()), tilt)
+            errors.append(np.subtract(estimate.torque, given))
+            speeds.append(np.abs(device.velocities).max())
+            carried = np.subtract(settings.torque(theta, tilt)[0], arm.torque(theta, tilt))
+            assert estimate.weight == pytest.approx(carried, abs=1e-9)
+    assert max(speeds[100:]) > 1.0
+    assert np.abs(errors[100:]).max() < 0.05

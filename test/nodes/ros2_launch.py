@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from ..support import ROOT
 from ..support.document_commands import ROS2
 from ..support.launched_nodes import CALM, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
@@ -31,10 +32,10 @@ LARGEST_SPEED = 1.0  # rad/s of an arm that is let down
 class Launched:
     """`ros2 launch` on the simulated right arm. log: its lines so far."""
 
-    def __init__(self, nodes: LaunchedNodes, *arguments: str) -> None:
+    def __init__(self, nodes: LaunchedNodes, *arguments: str, file: Path | None = None) -> None:
         self.truth = Truth(nodes.truth_path())
         self.log: list[str] = []
-        command = ["ros2", "launch", *PACKAGE, f"params:={nodes.path}", *arguments]
+        command = ["ros2", "launch", *([file] if file else PACKAGE), f"params:={nodes.path}", *arguments]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
         )
@@ -51,8 +52,7 @@ class Launched:
 
     def pid(self, node: str) -> int:
         """Return the ID of a node's process."""
-        (launcher,) = children(self.process.pid)
-        for child in children(launcher):
+        for child in children(self.process.pid):
             if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
                 return child
         raise LookupError(f"{node} does not run")
@@ -66,6 +66,11 @@ class Launched:
     def was_let_down(self) -> bool:
         """Return whether the motors went off, and the arm was never fast."""
         return self.truth.motors_are_off() and float(abs(self.truth.since(0.0)["velocity"]).max()) < LARGEST_SPEED
+
+    def ends(self) -> list[str]:
+        """Return the executables in the order in which they ended."""
+        form = re.compile(r"\[(?:INFO|ERROR)\] \[(\w+)-\d+\]: process has (?:finished|died)")
+        return [found[1] for found in map(form.match, self.log) if found]
 
 
 @pytest.fixture
@@ -88,6 +93,8 @@ def test_ctrl_c_lets_the_arm_down_before_the_other_nodes_stop(launched):
     launched.ctrl_c()
     assert launched.wait() == 0
     assert launched.was_let_down()
+    first, *others = launched.ends()
+    assert first == "can_bridge" and sorted(others) == ["compensator", "imu", "simulator", "wearer"]
 
 
 def test_an_interrupt_of_launch_alone_does_the_same(launched):
@@ -113,7 +120,7 @@ def close_terminal(launched):
 
 
 @pytest.mark.parametrize("end_launch", [kill, close_terminal])
-def test_when_launch_is_killed_or_its_terminal_closed_its_launcher_lets_the_arm_down(launched, end_launch):
+def test_when_launch_is_killed_or_its_terminal_closed_the_nodes_let_the_arm_down(launched, end_launch):
     end_launch(launched)
     launched.wait()
     end = time.monotonic() + STOP_TIMEOUT
@@ -139,6 +146,38 @@ def test_a_namespace_is_in_front_of_every_node_and_of_the_imus_topics(prepare):
         probe.wait_until_carried()
         topics = {name for name, _ in probe.node.get_topic_names_and_types()}
         assert "/lab/imu/data" in topics and "/imu/data" not in topics
+    finally:
+        launched.ctrl_c()
+        assert launched.wait() == 0
+        probe.close()
+
+
+INCLUDING = """
+from launch import LaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import PushRosNamespace, SetRemap
+
+def generate_launch_description():
+    source = PythonLaunchDescriptionSource({path!r})
+    included = IncludeLaunchDescription(source, launch_arguments={{"params": LaunchConfiguration("params")}}.items())
+    return LaunchDescription([
+        GroupAction([PushRosNamespace("lab"), SetRemap("assist_efforts", "my_controller/efforts"), included])
+    ])
+"""
+
+
+def test_a_file_that_includes_this_one_pushes_its_namespace_and_its_remappings(prepare, tmp_path):
+    file = tmp_path / "mine.launch.py"
+    file.write_text(INCLUDING.format(path=str(ROOT / "launch" / "exo.launch.py")))
+    probe = RosProbe("/lab/right")
+    launched = Launched(prepare(compensator={"assist.max_effort": [1.0] * 4}), file=file)
+    try:
+        probe.wait_until_carried()
+        topics = {name for name, _ in probe.node.get_topic_names_and_types()}
+        assert {"/lab/imu/data", "/lab/right/my_controller/efforts"} <= topics and "/imu/data" not in topics
+        assert probe.diagnostic("compensator", "mass carried (kg)") == "1.854"  # of the file, and not the defaults'
     finally:
         launched.ctrl_c()
         assert launched.wait() == 0

@@ -11,15 +11,16 @@ import pytest
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.motors.ak import pack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, pack_reply
-from exo_gravity.core.safety.drive import OFF
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 
-from ..support.simulated_device import drive_of
+from ..support.simulated_device import OFF, drive_of
 
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]

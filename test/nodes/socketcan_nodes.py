@@ -14,7 +14,9 @@ import can
 import pytest
 import yaml
 
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, unpack_command, unpack_reply
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, unpack_command
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.lab import processes
 from exo_gravity.lab.processes import Launcher

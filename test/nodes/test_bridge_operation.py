@@ -15,8 +15,8 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.drive import NO_EFFORTS, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits

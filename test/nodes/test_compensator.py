@@ -118,7 +118,8 @@ def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_
         return probe.diagnostic("wearer", "budget text") or ""
 
     probe.wait_until(lambda: probe.diagnostic("wearer", "budget") == "within_rated")
-    assert probe.set_parameters("compensator", atomically=True, mode="zero_g", wearer__body_mass=75).successful
+    worn = {"mode": "zero_g", "support": 1.0, "wearer__body_mass": 75}
+    assert probe.set_parameters("compensator", atomically=True, **worn).successful
     needs = "right_shoulder_abduction needs 19.6 Nm in its worst pose (rated 9, peak 18)"
     probe.wait_until(lambda: needs in budget())
     assert probe.diagnostic("wearer", "budget") == "above_rated"

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rtbdata
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation import guidance
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety import guidance as guided
@@ -27,10 +27,11 @@ from exo_gravity.nodes.ros.subscriptions import LATCHED
 from ..support.compensator_rig import CompensatorRig
 
 keep_to_this_machine()
-URDF = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf")
-NAMES = [f"joint_a{n}" for n in range(1, 7)]
+ARMS = Path(__file__).parents[1] / "data" / "arms"
+URDF = ARMS / "ur5.urdf"
+NAMES = [f"{part}_joint" for part in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 POSE = (0.3, -0.8, 1.1, 0.4, -0.6, 0.2)
-EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, (0.0, 0.0, -9.80665))
+EXPECTED = UrdfArm(URDF.read_text(), NAMES).torque(POSE, Tilt.of("left"))
 PARAMETERS = {
     "law": "urdf",
     "joint_names": f"[{','.join(NAMES)}]",
@@ -149,6 +150,20 @@ def test_the_description_may_come_from_a_latched_topic_and_the_torque_begins_fro
     carried(rig)
 
 
+def test_the_positions_of_other_joints_come_from_the_joint_states_or_there_is_no_torque(make_rig):
+    own = [f"panda_joint{n}" for n in (1, 2, 3)]
+    rig = make_rig(**{"urdf.file": ARMS / "panda.urdf", "joint_names": f"[{','.join(own)}]", "max_effort": [87.0] * 3})
+    rig.names, rig.pose, rig.applied = own, (0.0, 0.6, 0.0), (0.0,) * 3
+    rig.start()
+    rig.wait_until(lambda: "position of panda_joint4 must be in the joint states" in rig.status.message)
+    assert "cannot be at 0 (limits -3.0718 to -0.0698)" in rig.status.message and rig.commands == []
+    rig.names = [f"panda_joint{n}" for n in (4, 5, 6, 7, 1, 2, 3)]
+    rig.pose, rig.applied = (-1.57, 0.0, 1.57, 0.78, 0.0, 0.6, 0.0), (0.0,) * 7
+    # -44.9 Nm by differentiating the potential energy; -32.0 with the other joints at 0
+    carried(rig, lambda: rig.commands and abs(rig.commands[-1][1] + 44.92) < 0.01)
+    assert rig.values["joints taken to be at 0"] == "none"
+
+
 def test_a_missing_description_is_an_error_at_the_start(make_rig, monkeypatch):
     monkeypatch.setattr(arm, "DESCRIPTION_TIMEOUT", 0.2)
     rig = make_rig(**{"urdf.file": '""'})
@@ -158,7 +173,7 @@ def test_a_missing_description_is_an_error_at_the_start(make_rig, monkeypatch):
 
 def test_six_joints_among_others_in_any_order_are_carried_in_the_order_of_the_controller(rig):
     carried(rig, lambda: rig.status.message == "compensating" and rig.values["output"] == "active")
-    assert rig.values["law"] == "urdf" and rig.values["mass carried (kg)"] == "12.000"
+    assert rig.values["law"] == "urdf" and rig.values["mass carried (kg)"] == "16.994"
 
 
 def test_gains_and_limits_change_live_and_the_law_does_not(rig):

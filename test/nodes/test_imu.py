@@ -84,8 +84,13 @@ class ImuNode:
         """Whether a status with `text` has come, not counting the first `since`."""
         return any(text in one.message and level in (None, one.level) for one in self.reported[since:])
 
-    def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9):
-        """Publish the sample of `stamp` s; wait while too many are in flight."""
+    def send(
+        self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9, covariance=0.0
+    ):
+        """Publish the sample of `stamp` s; wait while too many are in flight.
+
+        covariance: of rate and acceleration, its first entry.
+        """
         message = Imu()
         message.header.stamp = Time(nanoseconds=round(stamp * 1e9)).to_msg()
         for vector, values in ((message.angular_velocity, rate), (message.linear_acceleration, acceleration)):
@@ -93,6 +98,7 @@ class ImuNode:
         q = message.orientation
         q.x, q.y, q.z, q.w = map(float, UPRIGHT if orientation is None else orientation)
         message.orientation_covariance[0] = -1.0 if orientation is None else 0.0
+        message.angular_velocity_covariance[0] = message.linear_acceleration_covariance[0] = covariance
         self.sent += 1
         message.linear_acceleration.x += noise * (-1) ** self.sent
         self.publisher.publish(message)
@@ -163,6 +169,35 @@ def test_a_refusal_is_reported_with_its_reason_and_gives_no_tilt(imu):
     imu.wait_until(lambda: imu.reports("the IMU or its driver is frozen") and imu.received == imu.sent)
     imu.wait_until(lambda: round((stamp + 0.09) * 1e9) in imu.tilts)
     assert not [number for number in imu.tilts if number > round((stamp + 0.11) * 1e9)]
+
+
+def test_values_with_a_covariance_of_minus_1_are_used_and_passed_on_as_measured(imu):
+    messages = []
+    imu.node.create_subscription(Imu, "/imu/data", messages.append, 50)
+    imu.settle(5000.0, rate=(0.0, 0.0, 1e-3), covariance=-1.0)
+    imu.wait_until(lambda: messages)
+    assert messages[-1].angular_velocity.z == pytest.approx(1e-3)
+    assert messages[-1].angular_velocity_covariance[0] == messages[-1].linear_acceleration_covariance[0] == 0.0
+
+
+@pytest.mark.parametrize("orientation", [(0.0,) * 4, (math.nan,) * 4], ids=["0 0 0 0", "NaN"])
+def test_an_orientation_that_the_driver_does_not_have_is_fused(imu, orientation):
+    stamp = imu.settle(6000.0, acceleration=(0.0, G * math.sin(0.2), G * math.cos(0.2)), orientation=orientation)
+    assert imu.tilts[round(stamp * 1e9)].x == pytest.approx(0.2, abs=1e-3)
+
+
+def test_an_orientation_without_gravity_in_the_acceleration_is_refused_with_the_reason(imu):
+    for stamp in 7000.0 + 0.01 * np.arange(300):
+        imu.send(stamp, rate=(0.0, 0.0, 1e-3), acceleration=(0.0, 0.0, 0.03), orientation=UPRIGHT, noise=1e-3)
+    imu.wait_until(lambda: imu.reports("it must contain gravity, +9.8 upward at rest", DiagnosticStatus.ERROR))
+    assert imu.received == imu.sent and imu.tilts == {}
+
+
+def test_slow_samples_are_refused_with_the_rate_that_is_needed(imu):
+    for stamp in 8000.0 + 0.1 * np.arange(40):
+        imu.send(stamp)
+    imu.wait_until(lambda: imu.reports("must be 20 or more; they come at 10 Hz", DiagnosticStatus.ERROR))
+    assert imu.tilts == {}
 
 
 def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):

@@ -1,14 +1,24 @@
-"""Which hosts a node communicates with, as set before it starts, and which signals end it."""
+"""Which hosts a node communicates with, as set before it starts, which signals end it, and which clock it waits for."""
 
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 
 from exo_gravity.hardware import network
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
-from exo_gravity.nodes.ros.run import handle_signals
+from exo_gravity.nodes.ros import run as running
+from exo_gravity.nodes.ros.run import WAITS_FOR_BRIDGES, handle_signals
+
+from ..support.waiting import wait_until
 
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PEERS, PROFILES = "ROS_STATIC_PEERS", "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -64,9 +74,15 @@ def test_the_setting_that_admits_other_hosts_is_named(environment, settings, nam
 
 
 @pytest.mark.parametrize(
-    ("has_nohup", "ends"), [(False, ["SIGTERM", "SIGINT", "SIGHUP"]), (True, ["SIGTERM", "SIGINT"])]
+    ("has_nohup", "waits", "ends"),
+    [
+        (False, "", ["SIGTERM", "SIGINT", "SIGHUP"]),
+        (True, "", ["SIGTERM", "SIGINT"]),
+        (False, "1", ["SIGTERM"]),  # under `ros2 launch`, which interrupts all nodes at once
+    ],
 )
-def test_which_signals_end_a_node(has_nohup, ends):
+def test_which_signals_end_a_node(environment, has_nohup, waits, ends):
+    environment(WAITS_FOR_BRIDGES, waits)
     sent = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     handlers = [signal.getsignal(number) for number in sent]
     ending = []
@@ -79,3 +95,47 @@ def test_which_signals_end_a_node(has_nohup, ends):
         for number, handler in zip(sent, handlers, strict=True):
             signal.signal(number, handler)
     assert ending == [signal.Signals[name] for name in ends]
+
+
+@pytest.fixture
+def waiting():
+    """A node that waits for /clock, and its executor."""
+    keep_to_this_machine()
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    given = [Parameter("use_sim_time", value=True)]
+    node = rclpy.create_node("waiting", namespace="/right", context=context, parameter_overrides=given)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    yield node, executor
+    executor.shutdown()
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
+def test_a_node_whose_clock_nobody_publishes_says_so_until_it_is_published(waiting, monkeypatch):
+    (node, executor), now, heard = waiting, [0.0], []
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda array: heard.extend(array.status), 10)
+    watch = running.ClockWatch(node)
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.05)
+
+    for now[0] in (0.0, 1.9, 2.1):
+        watch.look()
+    wait_until(lambda: heard, spin)
+    assert [(status.name, status.message) for status in heard] == [("right/waiting", running.NO_CLOCK)]
+    publisher = node.create_publisher(Clock, "/clock", 10)
+
+    def publish() -> None:
+        publisher.publish(Clock(clock=Time(sec=5)))
+        spin()
+
+    wait_until(lambda: node.get_clock().now().nanoseconds, publish)
+    watch.look()
+    wait_until(lambda: heard[-1].message == "/clock is published", spin)
+    for now[0] in (10.0, 20.0):  # a clock that its publisher has stopped, as a simulation that waits
+        watch.look()
+    spin()
+    assert len(heard) == 2

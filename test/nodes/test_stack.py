@@ -172,6 +172,7 @@ def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_
     assert seated.set_parameters("compensator", atomically=True, law="anfis", anfis_file=path).successful
     seated.wait_until(lambda: seated.diagnostic("compensator", "law") == "anfis")
     seated.wait_until(lambda: seated.status_contains("compensator", "compensating"))
-    assert seated.set_parameters("compensator", wearer__body_mass=75.0, mode="zero_g", atomically=True).successful
+    worn = {"mode": "zero_g", "support": 1.0, "wearer__body_mass": 75.0}
+    assert seated.set_parameters("compensator", atomically=True, **worn).successful
     message = "the exact law replaces anfis: the ANFIS was trained for another arm"
     seated.wait_until(lambda: seated.status_contains("compensator", message))

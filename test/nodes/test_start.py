@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.sim.script import TrialScript
 

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import yaml
 
-from exo_gravity.core.motors.specs import MOTORS, is_special, unpack_command
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import is_special, unpack_command
 
 from ..faults.live_arm import resident
 from ..support.bus_listener import CAN_IDS, BusListener, Frame

@@ -25,7 +25,7 @@ def main() -> None:
     stage.arms.pose = (0.0, 0.4, 0.5, 0.8)
     stage.arms.states["right"] = "active"
     stage.arms.fail("left", "over_temperature")
-    stage.arms.share = "96 +- 7"
+    stage.arms.share = ("96", "7")
     wearer = stage.files.wearers["P01"] = {"wearer.body_mass": 75.0}
     session = {
         "subject": "P01",
@@ -49,7 +49,7 @@ def main() -> None:
             stage.arms.faults.clear()
             stage.arms.states.update(right="disabled", left="disabled")  # texts are written while the motors are off
             wait_for_state(page, "disabled", "left")
-            page.fill("#session [name=marker_text]", "third reach begins")
+            page.fill("#markers [name=marker_text]", "third reach begins")
             page.click("#session summary")
             page.locator("#session").evaluate("section => section.scrollIntoView()")
             _shoot(page, "panel_session", {"x": 0, "y": 0, "width": 850, "height": 660})

@@ -15,7 +15,7 @@ from exo_gravity.panel import control
 
 from ..support import waiting
 from ..support.panel_browser import IN_BROWSER, PATIENCE, enable, of_arm, wait_for_state
-from ..support.panel_stage import WEARER_FILE
+from ..support.panel_stage import LEAVES, WEARER_FILE
 
 pytestmark = IN_BROWSER
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
@@ -55,6 +55,43 @@ def test_enable_asks_once_and_says_what_will_happen_also_beyond_rated_torque(vis
     page.wait_for_selector(of_arm(".mark:not([hidden])", "left"), state="attached")
     page.click(of_arm(".enable", "left"))
     confirm(page, "More than rated torque")
+
+
+def test_a_question_is_about_the_settings_at_the_press_and_is_asked_again_where_they_change_meanwhile(visit, stage):
+    page, settings = visit(), stage.arms.settings["right"]
+    page.wait_for_selector(of_arm(".mark:not([hidden])"), state="attached")
+    stage.arms.shown["right"] = dict(settings)  # the page does not learn of what is changed now
+    settings.update({"mode": "zero_g", "support": 0.5})
+    page.click(of_arm(".enable"))
+    page.wait_for_selector("#ask:visible")
+    assert "50.0 % of the wearer's arm" in page.inner_text("#ask-text")
+    settings["support"] = 0.02
+    page.click("#ask-yes")
+    page.wait_for_selector("#ask-text:has-text('2.0 % of the wearer')")
+    assert stage.arms.calls == []
+    page.click("#ask-yes")
+    wait_for_state(page, "active")
+    assert stage.arms.calls == [("enable", "right")]
+
+
+def test_let_down_ends_an_enable_whose_settings_are_still_being_read(visit, stage):
+    page = visit()
+    page.click(of_arm(".enable"))
+    page.wait_for_selector("#ask:visible")
+    stage.arms.delay, reads = 1.0, stage.arms.reads
+    page.click("#ask-yes")
+    page.keyboard.press("Space")
+    wait_until(page, lambda: stage.arms.reads > reads)
+    page.evaluate("fetch('/strings').then((answer) => answer.text())")  # what the page sends at once has arrived then
+    assert stage.arms.calls == BOTH_DOWN and not page.is_visible("#ask")
+
+
+def test_an_arm_whose_settings_cannot_be_read_is_not_enabled(visit, stage):
+    page = visit()
+    stage.arms.problem = "the compensator does not answer"
+    page.click(of_arm(".enable"))
+    page.wait_for_selector("#message:has-text('the compensator does not answer')")
+    assert stage.arms.calls == [] and not page.is_visible("#ask")
 
 
 @pytest.mark.parametrize("means", ["click", "space", "touch while asking", "space in a field", "space on enable"])
@@ -98,8 +135,32 @@ def test_no_state_moves_the_buttons(visit, stage, width):
         stage.arms.states = {"right": state, "left": state}
         wait_for_state(page, state)
         wait_for_state(page, state, "left")
-        places.add(str(page.locator(of_arm(".enable")).bounding_box()))
+        places.add(str([page.locator(of_arm(part)).bounding_box() for part in (".down", ".support input", ".weigh")]))
     assert len(places) == 1
+
+
+@pytest.mark.parametrize("width", [390, 768, 1280])
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_no_text_of_a_fault_is_longer_than_its_place(visit, stage, width, language):
+    page = visit(width=width)
+    page.select_option("#language", language)
+    tallest = page.evaluate(
+        """async (column) => {
+            const { texts } = await (await fetch("/strings")).json();
+            const [why, todo] = [".sentence", ".remedy"].map((part) => document.querySelector(`.arm ${part}`));
+            const place = document.querySelector(".arm .tell"), least = parseFloat(getComputedStyle(place).minHeight);
+            todo.hidden = false;
+            const height = (code) => {
+                why.textContent = `${texts[`fault.${code}`][column]} ${texts["sentence.letting down"][column]}`;
+                todo.textContent = `${texts[`do.${code}`][column]} ${texts["then.clear"][column]}`;
+                return place.getBoundingClientRect().height;
+            };
+            const codes = Object.keys(texts).filter((key) => key.startsWith("fault.")).map((key) => key.slice(6));
+            return Math.max(...codes.map(height)) - least;
+        }""",
+        ["en", "de"].index(language),
+    )
+    assert tallest == 0.0
 
 
 def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(visit, stage):
@@ -110,11 +171,13 @@ def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(visi
     wait_for_state(page, "fault")
     assert [button.bounding_box() for button in buttons] == before
     assert "Wait until it has cooled" in page.inner_text(of_arm(".remedy"))
+    assert "Then press Clear fault." in page.inner_text(of_arm(".remedy"))
     assert page.is_disabled(of_arm(".enable")) and not page.is_visible(of_arm(".resume"))
     page.click(of_arm(".clear"))
     wait_for_state(page, "disabled")
-    assert not page.is_visible(of_arm(".remedy"))
+    assert "cooled" not in page.inner_text(of_arm(".tell"))
     stage.arms.fail("right", "command_stale")  # it leaves nothing to repair
+    page.wait_for_selector(of_arm(".remedy:has-text('Then press Carry again.')"))
     page.click(of_arm(".resume"))
     wait_for_state(page, "active")
     assert stage.arms.calls[-1] == ("resume", "right")
@@ -129,6 +192,9 @@ def test_a_start_from_unknown_angles_asks_beside_the_picture_whether_the_arm_han
     question.wait_for()
     assert "Elbow flexion 23°" in question.inner_text()
     assert not page.is_visible('.pose[data-arm="left"]')
+    page.evaluate("scrollTo(0, 0)")
+    page.click(of_arm(".look"))
+    assert page.locator("#picture").evaluate("picture => picture.getBoundingClientRect().top < innerHeight / 2")
     question.get_by_role("button").click()
     question.wait_for(state="hidden")
     assert stage.arms.calls[-1] == ("confirm_pose", "right")
@@ -200,14 +266,14 @@ def test_a_heavier_wearers_data_lower_the_support_to_what_rated_torque_allows(vi
 
 def test_an_arm_that_moves_is_not_called_carried(visit, stage):
     stage.arms.states["right"] = "active"
-    stage.arms.changing, stage.arms.sinking = "right_elbow_flexion, 2.1 Nm to go", 0.2
+    stage.arms.changing, stage.arms.sinking = "right_elbow_flexion", 0.2
     page, state = visit(), of_arm(".state")
     page.wait_for_selector(f"{state}:has-text('Sinking')")
     stage.arms.sinking = -0.2
     page.wait_for_selector(f"{state}:has-text('Moving')")
     assert "The load is changing" in page.inner_text(of_arm(".sentence"))
     stage.arms.changing = "none"
-    page.wait_for_selector(of_arm(".sentence:has-text('If the wearer does not move it')"))
+    page.wait_for_selector(of_arm(".remedy:has-text('If the wearer does not move it')"))
     stage.arms.sinking = 0.2
     page.wait_for_selector("#chips .badge[data-moves]:has-text('Right arm: Sinking')")
     stage.arms.sinking = 0.0
@@ -229,6 +295,37 @@ def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_m
     assert not page.is_visible("#light")
     page.click("#record")
     page.wait_for_selector("#light:visible")
+    assert page.inner_text("#source") == "SIMULATED" and page.inner_text("#connection") == "Connected"
+
+
+@pytest.mark.parametrize("width", [390, 768])
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_while_recording_nothing_is_cut_off_and_source_and_connection_stay_in_sight(visit, stage, width, language):
+    stage.arms.states["right"] = "active"
+    stage.arms.fail("left", "implausible_zero")
+    recording = {"on": True, "foreign": False, "folder": f"/home/clinic/recordings/{'P' * 60}", "seconds": 3600}
+    stage.files.content["recording"] = recording
+    page = visit(width=width, height=844)
+    page.select_option("#language", language)
+    page.wait_for_selector("#light:visible")
+    page.evaluate("scrollTo(0, document.body.scrollHeight)")
+    for part in ("#source", "#connection", "#light"):
+        box = page.locator(part).bounding_box()
+        assert box is not None and 0 <= box["y"] < 120 and box["x"] + box["width"] <= width
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    temperature = page.locator(of_arm("tbody tr:first-child td:last-child")).bounding_box()
+    card = page.locator(".arm[data-arm=right]").bounding_box()
+    assert temperature["x"] + temperature["width"] <= card["x"] + card["width"]
+
+
+def test_the_page_says_which_arm_is_simulated_as_the_devices_say(visit, stage):
+    stage.arms.simulator = None
+    stage.arms.reports = {"right": {"source": "real"}, "left": {"source": "unknown"}}
+    page = visit()
+    page.wait_for_selector("#source:has-text('Right arm: Real arm, Left arm: Source unknown')")
+    assert not page.is_visible(of_arm(".home"))
+    stage.arms.reports["left"] = {"source": "real"}
+    wait_until(page, lambda: page.inner_text("#source") == "Real arm")
 
 
 def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(visit, stage):
@@ -325,19 +422,34 @@ def test_a_subject_is_chosen_with_its_wearer_and_the_past_sessions_have_their_re
 
 def test_the_key_m_sets_a_marker_while_it_is_recorded(visit, stage):
     page = visit()
-    page.fill("#session [name=marker_text]", "cramp")
+    page.fill("#markers [name=marker_text]", "cramp at 3")
     page.click("#plots-head")
     page.keyboard.press("m")
     page.click("#record")
     page.wait_for_selector("#marker:enabled")
+    page.click("#plots-head")
     page.keyboard.press("m")
-    page.wait_for_selector("#message:has-text('marker')")
+    page.wait_for_selector("#message:has-text('cramp at 3')")
     page.click("#marker")
     watching = visit()
     watching.wait_for_selector("#marker:enabled")
     watching.click("#marker")
     watching.wait_for_selector("#message:has-text('marker')")
-    assert stage.files.calls == ["record", "marker cramp", "marker cramp", "marker "]
+    assert stage.files.calls == ["record", "marker cramp at 3", "marker cramp at 3", "marker "]
+
+
+def test_usual_markers_have_a_button_and_a_digit_and_the_space_bar_still_lets_down(visit, active):
+    page = visit()
+    wait_for_state(page, "active")
+    assert page.is_disabled("#presets button") and page.is_disabled("[name=marker_text]")
+    page.click("#record")
+    page.click("#presets button:has-text('Task begins')")
+    page.keyboard.press("2")
+    page.click('#presets button:has-text("a text of one\'s own")')
+    wait_until(page, lambda: len(active.files.calls) == 4)
+    assert active.files.calls[1:] == ["marker begin", "marker end", "marker a text of one's own"]
+    page.keyboard.press("Space")
+    wait_for_state(page, "letting down")
 
 
 def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage):
@@ -351,10 +463,10 @@ def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage)
     assert stage.arms.calls == BOTH_DOWN
 
 
-def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, stage):
+def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, active):
     page = visit()
-    for reported, shown in (("unknown", "–"), ("40 +- 10", "40 %"), ("-30 +- 10", "-30 %")):  # a hand presses it down
-        stage.arms.share = reported
+    for reported, shown in ((("unknown",) * 2, "–"), (("40", "10"), "40 %"), (("-30", "10"), "-30 %")):  # pressed down
+        active.arms.share = reported
         wait_until(page, lambda shown=shown: page.inner_text(of_arm(".carries strong")) == shown)
         boxes = [page.locator(of_arm(f".{part}")).bounding_box() for part in ("bar", "part", "band")]
         if shown == "40 %":
@@ -362,6 +474,41 @@ def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, stage):
             assert abs(part / whole - 0.4) < 0.02 and abs(band / whole - 0.2) < 0.02
             assert abs((low - start) / whole - 0.3) < 0.02
     assert boxes[1]["width"] == 0.0
+
+
+def test_the_share_is_shown_only_while_it_means_something(visit, stage):
+    stage.arms.share = ("111", "9")
+    page, words = visit(), of_arm(".carries .width")
+    page.wait_for_selector(f"{words}:has-text('while the arm is carried')")
+    assert page.inner_text(of_arm(".carries strong")) == "–"
+    assert page.locator(of_arm(".part")).bounding_box()["width"] == 0.0
+    stage.arms.states["right"] = "active"
+    wait_until(page, lambda: page.inner_text(of_arm(".carries strong")) == "111 %")
+    stage.arms.share = ("40", "60")
+    page.wait_for_selector(f"{words}:has-text('Too uncertain')")
+    stage.arms.share, stage.arms.limit = ("40", "9"), "none"
+    stage.arms.settings["right"]["wearer.body_mass"] = 0.0
+    page.wait_for_selector(f'{words}:has-text("Enter the wearer\'s data")')
+    assert page.inner_text(of_arm(".carries strong")) == "–"
+
+
+def test_in_one_g_the_motors_carry_nothing_of_the_wearers_arm(visit, stage):
+    page = visit()
+    page.wait_for_selector(of_arm(".mark:not([hidden])"), state="attached")
+    assert page.input_value(of_arm(".support input")) == "0" and page.is_disabled(of_arm(".support input"))
+    stage.arms.settings["right"]["mode"] = "zero_g"
+    wait_until(page, lambda: page.input_value(of_arm(".support input")) == "5")
+
+
+def test_a_plot_without_a_curve_says_why(visit, stage):
+    stage.arms.silent = {"left"}
+    nothing = {f"right_{leaf} temperature (degC)": "unknown" for leaf in LEAVES}
+    stage.arms.reports["right"] = nothing
+    page = visit()
+    page.wait_for_selector("#plots-blank:has-text('Left arm: Blank: no angles have arrived')")
+    page.wait_for_selector(".blank:has-text('report no temperature')")
+    stage.arms.reports.clear()
+    wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
 
 
 def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, stage):
@@ -372,15 +519,19 @@ def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, sta
     page.click(weigh)
     confirm(page, "relax within 4 s")
     wait_until(page, lambda: ("weigh", "right") in stage.arms.calls)
-    more = "1.050 +- 0.080 kg more than the settings carry; 0.990 +- 0.052 kg more than with an empty hand"
-    stage.arms.weighing = f"{more}: payload.mass = 0.990 carries it"
-    stage.arms.contact = "right_elbow_flexion +4.0 Nm, 1 s ago; 1 in all"
+    stage.arms.compensator = {"weighing": "sweeping", "weighing time (s)": "9"}
+    page.wait_for_selector(of_arm(".weighing:has-text('Do not help it (9 s)')"))
+    more = {"weighed mass (kg)": "1.050", "weighed band (kg)": "0.080"}
+    stage.arms.compensator = {"weighing": "done", **more}
+    stage.arms.compensator |= {"weighed payload (kg)": "0.990", "weighed payload band (kg)": "0.052"}
+    touched = {"contacts": "1", "contact joint": "right_elbow_flexion"}
+    stage.arms.contact = {**touched, "contact torque (Nm)": "4.0", "contact age (s)": "1"}
     page.wait_for_selector(carry, state="visible")
     assert page.inner_text(carry) == "Carry 0.99 kg (±0.05)"
-    assert "right_elbow_flexion +4.0 Nm" in page.inner_text(of_arm(".contact"))
+    assert "Elbow flexion +4.0 Nm" in page.inner_text(of_arm(".contact"))
     assert "adapts" not in page.inner_text(of_arm(".limit"))
-    stage.arms.adapts = "40 -> 52 %"
-    wait_until(page, lambda: "support adapts: 40 -> 52 %" in page.inner_text(of_arm(".limit")))
+    stage.arms.adapts = {"support adapts": "on", "support asked for": "0.52"}
+    wait_until(page, lambda: "support adapts: 5 -> 52 %" in page.inner_text(of_arm(".limit")))
     page.click(carry)
     confirm(page, "0.99 kg in the hand instead of 0.00 kg")
     wait_until(page, lambda: stage.arms.settings["right"]["payload.mass"] == 0.99)

@@ -53,7 +53,7 @@ def test_the_keyboard_alone_reaches_everything(visit, stage):
         page.keyboard.press("Tab")
         name = "document.activeElement.id || document.activeElement.className || document.activeElement.name"
         reached.add(page.evaluate(name))
-    assert {"language", "release", "operate enable", "down", "trial-start", "record", "save", "let-down"} <= reached
+    assert {"language", "release", "operate primary enable", "trial-start", "record", "save", "let-down"} <= reached
     assert {"body_mass", "sex", "upper_arm"} <= reached
     page.focus(of_arm(".enable"))
     page.keyboard.press("Enter")
@@ -61,9 +61,14 @@ def test_the_keyboard_alone_reaches_everything(visit, stage):
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     wait_for_state(page, "active")
+    page.focus(of_arm(".down"))
+    page.keyboard.press("Enter")
+    wait_for_state(page, "letting down")
 
 
-@pytest.mark.parametrize(("width", "height"), [(768, 1024), (640, 450), (1280, 800)], ids=["tablet", "200 %", "desk"])
+@pytest.mark.parametrize(
+    ("width", "height"), [(390, 844), (768, 1024), (640, 450), (1280, 800)], ids=["phone", "tablet", "200 %", "desk"]
+)
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_let_down_is_always_in_sight_and_nothing_is_cut_off(visit, stage, width, height, language):
     page = visit(width=width, height=height)  # 200 % of 1280 by 900 is 640 by 450
@@ -77,7 +82,7 @@ def test_let_down_is_always_in_sight_and_nothing_is_cut_off(visit, stage, width,
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
-@pytest.mark.parametrize("state", ["off", "fault", "dark", "moving", "asking", "german", "login"])
+@pytest.mark.parametrize("state", ["off", "carried", "fault", "dark", "moving", "asking", "german", "login"])
 def test_axe_has_no_serious_findings(browser, visit, stage, state):
     if state == "login":
         locked = Stage(token="a token for this test")
@@ -101,8 +106,13 @@ def test_axe_has_no_serious_findings(browser, visit, stage, state):
     elif state == "moving":
         stage.arms.states["right"], stage.arms.sinking = "active", 0.2
         page.wait_for_selector("#chips .badge[data-moves]")
+    elif state == "carried":
+        stage.arms.states, stage.arms.share = {"right": "active", "left": "active"}, ("40", "10")
+        page.click("#record")
+        page.wait_for_selector(of_arm(".carries[data-known]"))
     elif state == "asking":
         page.click(of_arm(".enable"))
+        page.wait_for_selector("#ask:visible")
     elif state == "german":
         page.select_option("#language", "de")
     assert serious(page) == []

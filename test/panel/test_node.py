@@ -147,6 +147,8 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
             assert ask(do="enable", arm="right") == (200, "")
             assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
             assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")
+            answer = httpx.get(panel.url + "settings/right", verify=False)  # also before the panel has heard of it
+            assert answer.json() == {"settings": {"support": 0.2}}
             message(connection, "setup", lambda setup: is_known(setup, 0.2))
             assert ask(do="let_down") == (200, "")
             assert arm.asked == [("enable", True), ("clear_fault", None), ("enable", False)]

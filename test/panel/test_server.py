@@ -207,6 +207,15 @@ def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stag
         assert first(connection, "page") == page
 
 
+def test_the_settings_of_an_arm_are_read_when_they_are_asked_for(stage):
+    stage.arms.settings["right"]["support"] = 0.4  # of which the pages have not heard yet
+    assert get(stage, "settings/right").json()["settings"]["support"] == 0.4
+    assert get(stage, "settings/middle").status_code == 404
+    stage.arms.problem = "no answer"
+    answer = get(stage, "settings/right")
+    assert (answer.status_code, answer.json()) == (503, {"error": "no answer"})
+
+
 def test_a_copied_page_replaces_the_first(stage):
     with live(stage) as one:
         secret = first(one, "page")["page"]

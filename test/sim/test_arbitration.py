@@ -7,7 +7,7 @@ from dataclasses import replace
 import can
 import pytest
 
-from exo_gravity.core.motors.specs import ENTER
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.sim import FIRMWARES
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
 from exo_gravity.sim.virtual_time import VirtualBus, Wire

@@ -7,8 +7,9 @@ import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.core.safety.drive import NO_EFFORTS, Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine

@@ -9,7 +9,8 @@ import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_reply
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.frames import ENTER, SET_ZERO
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 

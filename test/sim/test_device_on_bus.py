@@ -13,9 +13,18 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, EXIT, unpack_reply
-from exo_gravity.sim import Firmware
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.damiao import DAMIAO_MIT
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.drive import OFF
+from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
 from exo_gravity.sim import device as device_module
+from exo_gravity.sim.motors import simulated
 
 from ..support.simulated_device import SPECS, command, frame, make_device
 
@@ -232,3 +241,20 @@ def test_stalls_and_silence_are_measured_while_the_motors_are_on(monkeypatch, sc
     device = make_device()
     ScriptedBus(script).run(device, monkeypatch)
     assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))
+
+
+@pytest.mark.parametrize("is_fd", [False, True], ids=["classic", "fd"])
+def test_damiao_motors_tell_their_state_and_settings_on_the_buses_of_python_can(options, is_fd):
+    joints = [JointMotor(MOTORS["DM-J4310"], can_id, wire_format=DAMIAO_MIT, timeout=0.2) for can_id in (1, 2, 3, 4)]
+    device = SimulatedDevice(SimulatedArm(), [simulated(joint) for joint in joints])
+    device.is_fd = (is_fd,) * len(joints)
+    with running(device, options) as host:
+        bus = MotorBus([CanPort(host, COMPUTER_CLOCK, is_fd=is_fd)] * len(joints), joints)
+        bus.exchange(OFF, time.monotonic() + 0.01)
+        assert bus.boards.hindrance(time.monotonic(), 100.0) == "motor 1 to tell its CTRL_MODE"
+        end = time.monotonic() + 5.0
+        while bus.boards.hindrance(time.monotonic(), 100.0) and time.monotonic() < end:
+            bus.exchange(OFF, time.monotonic() + 0.01)
+        assert not bus.boards.hindrance(time.monotonic(), 100.0)
+    assert [sample.on for sample in bus.samples] == [False] * len(joints)
+    assert not device.powered and bus.foreign_commands == 0

@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT_V3, unpack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, EXTENDED, SET_ZERO, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_command, unpack_reply
-from exo_gravity.core.motors.wire_formats import EXTENDED, MIT_V3
 from exo_gravity.core.params import values_of
 from exo_gravity.sim import FIRMWARES, Firmware, SimulatedMotor
 from exo_gravity.sim.motors.ak import Heat

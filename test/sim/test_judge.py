@@ -161,11 +161,29 @@ def test_only_the_longest_stretch_in_which_a_motor_drives_counts_as_its_energy(r
 def test_damping_that_drives_a_joint_is_seen(records):
     """As that of a motor whose torque is reversed."""
     falling = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 1.5)
+    records["velocity"][~falling, 1] = 0.0
     records["torque"][:, 1] = np.where(falling, 5.0 * records["velocity"][:, 1], 0.0)
     done = driven(records)
     assert (done.speed, done.joint) == (pytest.approx(0.3), 2)
     assert done.energy == pytest.approx(0.5 * 1.5 * 0.3, abs=0.01)
     assert done.damping == pytest.approx(1.5 / 9.0)  # Nm, of what an AK80-9 is rated for
+
+
+def test_of_a_joint_that_falls_the_motor_gave_only_what_it_adds(records):
+    since = records["time"] - FAULT
+    fall = (since >= 1.0) & (since < 2.0)
+    records["velocity"][fall, 2] = 3.0 * (since[fall] - 1.0)
+    records["torque"][fall & (since >= 1.5), 2] = 1.0
+    assert driven(records).speed == pytest.approx(1.5, abs=0.01)
+
+
+def test_a_motor_that_throws_and_catches_by_turns_drives_for_the_whole_time(records):
+    since = records["time"] - FAULT
+    thrown = (since >= 1.0) & (since < 2.0)
+    records["velocity"][thrown, 2] = since[thrown] - 1.0
+    records["torque"][thrown, 2] = np.where(np.arange(thrown.sum()) // 4 % 2, -1.0, 1.0)
+    assert driven(records).speed == pytest.approx(1.0, abs=0.01)
+    assert driven(records).energy == pytest.approx(0.25, abs=0.02)
 
 
 def test_a_motor_does_not_drive_what_the_wearer_moves(lifted):

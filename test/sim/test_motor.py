@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS, SET_ZERO, pack_command, unpack_reply
 from exo_gravity.sim import Firmware, SimulatedMotor
 
 SPEC = MOTORS["AK60-6"]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from exo_gravity.core.motors.specs import MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.sim import FIRMWARES, SimulatedDevice
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 

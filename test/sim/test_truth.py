@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, truth
 from exo_gravity.sim.truth import RECORD, TruthLog
 
@@ -19,7 +20,6 @@ JOINTS = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-
 ADVANCE = """
 import sys, time
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.truth import TruthLog
 device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(JointMotor(MOTORS["AK60-6"], n)) for n in (1, 2, 3, 4)])

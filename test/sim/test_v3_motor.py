@@ -9,9 +9,10 @@ import can
 import numpy as np
 import pytest
 
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, EXIT, MOTORS
-from exo_gravity.core.motors.wire_formats import ID_BITS, MIT, MIT_V3
 from exo_gravity.sim import Firmware, SimulatedMotor
 from exo_gravity.sim import device as device_module
 

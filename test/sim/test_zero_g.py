@@ -11,8 +11,8 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -27,7 +27,7 @@ LIMITS = Limits(
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 MASS, COG = Wearer(75.0).on_links(ROBOT.length)
-CONTROLLER = Settings("right", ROBOT, mode="zero_g", wearer_mass=MASS, wearer_cog=COG)
+CONTROLLER = Settings("right", ROBOT, mode="zero_g", support=1.0, wearer_mass=MASS, wearer_cog=COG)
 
 HELD = [0.2, 0.35, -0.20, 0.9]  # within the motors' limits with all of a 75 kg wearer's arm
 BENT = (0.06, -0.04)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import can
 
-from exo_gravity.core.motors.specs import ENTER, EXIT
+from exo_gravity.core.motors.frames import ENTER, EXIT
 
 CAN_IDS = (1, 2, 3, 4)
 

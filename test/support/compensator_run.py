@@ -21,6 +21,7 @@ def settings_with(**changes: Any) -> Settings:
     defaults = {
         "side": "left",
         "robot": ROBOT,
+        "support": 1.0,
         "wearer_mass": (0.0, 0.0, 2.0, 1.6),
         "wearer_cog": (0.0, 0.0, 0.16, 0.17),
         "max_effort": (9.0, 18.0, 9.0, 9.0),

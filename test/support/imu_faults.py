@@ -35,6 +35,8 @@ class Motion:
     gravity: np.ndarray
     #: (n,) s, None: not known
     arrivals: np.ndarray | None = None
+    #: (n, 4), x, y, z, w, world from IMU, as the IMU reports it; None: it does not
+    orientation: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def follow(motion: Motion) -> Outcome:
     """Feed the samples to an estimator."""
     estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0), motion.rate)
     answers, refusals = np.full(motion.gravity.shape, np.nan), []
-    columns = (motion.times.tolist(), motion.gyroscope.tolist(), motion.accelerometer.tolist())
+    columns = [motion.times.tolist(), motion.gyroscope.tolist(), motion.accelerometer.tolist()]
+    columns.append([None] * len(motion.times) if motion.orientation is None else motion.orientation.tolist())
     arrivals = [None] * len(motion.times) if motion.arrivals is None else motion.arrivals.tolist()
     for k, (arrival, *sample) in enumerate(zip(arrivals, *columns, strict=True)):
         refusals.append("")

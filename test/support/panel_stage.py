@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import threading
 import time
@@ -12,11 +13,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
-from exo_gravity.panel.view import LoadChanges, joint_rows, setup_of
+from exo_gravity.panel.view import SETTABLE, LoadChanges, joint_rows, setup_of
 
 from .ports import free_port
 
@@ -31,6 +33,7 @@ WEARER_FILE = {
     "limits.lower": [-0.5, -0.2, -0.2, 0.0],
     "limits.upper": [0.5, 1.5, 1.5, 2.0],
 }
+POWERED = ("proving signs", "ramping in", "active", "letting down")
 STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
 
 
@@ -49,14 +52,20 @@ class PlayedArms:
     calls: list[tuple[str, ...]] = field(default_factory=list)
     problem: str = ""
     errors: dict[str, Exception] = field(default_factory=dict)
-    changing: str = "none"  #: what a compensator reports of a change of load
-    weighing: str = "none"  #: what it reports of the load in the hand,
-    contact: str = "none"  #: and of contacts
+    changing: str = "none"  #: the joint whose load a compensator reports to change
+    compensator: dict[str, str] = field(default_factory=dict)  #: further keys of a compensator
+    contact: dict[str, str] = field(default_factory=dict)  #: what `wearer` reports of contacts
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
-    adapts: str = "off"  #: from which support to which it adapts
-    share: str = "unknown"  #: of their arm's weight that the wearer carries
+    adapts: dict[str, str] = field(default_factory=dict)  #: what it reports of a support that adapts
+    share: tuple[str, str] = ("unknown", "unknown")  #: of their arm's weight that the wearer carries, and its band, %
+    limit: str = "0.068"  #: the largest support that it reports
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
-    messages: dict[str, str] = field(default_factory=dict)  #: of the bridges, by arm, if not the usual ones
+    reports: dict[str, dict[str, str]] = field(default_factory=dict)  #: further keys of the bridges, by arm
+    #: settings that the panel still shows of an arm, in place of those in force
+    shown: dict[str, dict[str, Any]] = field(default_factory=dict)
+    delay: float = 0.0  #: s until the settings are read
+    reads: int = 0  #: how often they were
+    silent: set[str] = field(default_factory=set)  #: arms of which no joint states arrive
     #: what the simulators report
     simulator: dict[str, str] | None = field(
         default_factory=lambda: {"longest stall (ms)": "3", "longest silence (ms)": "14", "disconnected": "no"}
@@ -79,6 +88,13 @@ class PlayedArms:
 
     def other_holder(self, arm: str, page: str) -> str:
         return self.others.get(arm, "")
+
+    async def settings_of(self, arm: str) -> dict[str, Any]:
+        await asyncio.sleep(self.delay)
+        self.reads += 1
+        if self.problem:
+            raise ExoGravityError(self.problem)
+        return {name: self.settings[arm][name] for name in SETTABLE}
 
     async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
         self.calls.append((kind, arm, str(dict(values))) if values else (kind, arm))
@@ -108,17 +124,20 @@ class PlayedArms:
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}
         values["pose to confirm (deg)"] = self.asked.get(name, "none")
-        values["resume"] = "possible" if fault == "command_stale" else "refused"
-        message = f"fault: {fault}: {name} elbow" if fault != "none" else state
-        bridge = {**values, "level": 2 if fault != "none" else 0, "message": self.messages.get(name, message)}
-        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating"}
-        carried |= {"changing load": self.changing, "weighing": self.weighing}
-        of_wearer = {"largest support": "0.068", "contact": self.contact, "support adapts": self.adapts}
-        of_wearer["share of the wearer (%)"] = self.share
+        values["resume"] = "possible" if fault == "command_stale" else "has_cause"
+        values |= {"source": "simulated", "motors": "on" if state in POWERED else "off", "refusal": "none"}
+        values |= {"waiting for": "none", "joints outside limits": "none", "turn back (deg)": "none"}
+        sentence = f"fault: {fault}: {name} elbow" if fault != "none" else state
+        level = 2 if fault != "none" else 0
+        bridge = {**values, "level": level, "message": sentence, **self.reports.get(name, {})}
+        carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
+        carried |= {"changing load": self.changing, "reason": "none", "weighing": "none", **self.compensator}
+        of_wearer = {"largest support": self.limit, "support adapts": "off", **self.adapts, **self.contact}
+        of_wearer["share of the wearer (%)"], of_wearer["share band (%)"] = self.share
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         statuses = {"bridge": bridge, "compensator": carried, "wearer": of_wearer, "simulator": self.simulator}
-        return {**statuses, "joints": joints}
+        return {**statuses, "joints": None if name in self.silent else joints}
 
 
 @dataclass
@@ -188,7 +207,8 @@ class Stage:
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, token, self.control)
-        self._own_setup = {"language": "auto", "dead_man": False, "trials": list(self.files.trials)}
+        trials, markers = list(self.files.trials), ["begin", "end", "a text of one's own"]
+        self._own_setup = {"language": "auto", "dead_man": False, "trials": trials, "markers": markers}
         self._bridge = values_of(CAN_BRIDGE, BUS, "can.options")
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._play, daemon=True)
@@ -205,7 +225,7 @@ class Stage:
         while not self._stopping.wait(PERIOD):
             nodes = {
                 arm: ({**self._bridge, "joint_names": settings["joint_names"]}, dict(settings))
-                for arm, settings in self.arms.settings.items()
+                for arm, settings in (self.arms.settings | self.arms.shown).items()
             }
             if nodes != shown:
                 shown = nodes

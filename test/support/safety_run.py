@@ -8,9 +8,11 @@ from typing import Any
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
-from exo_gravity.core.safety.drive import OFF, Efforts, Send, State
+from exo_gravity.core.safety.drive import Efforts, Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
+
+from .simulated_device import OFF
 
 PERIOD = 0.004  # s
 LIMITS = Limits(

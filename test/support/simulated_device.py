@@ -8,13 +8,15 @@ from typing import Any
 import can
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.motors.ak import MIT
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import WireFormat, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS, pack_command
-from exo_gravity.core.motors.wire_formats import MIT, WireFormat
-from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive, Send
+from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
+OFF = Drive.off(len(SPECS))
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
 
 
@@ -38,7 +40,7 @@ def joints_of(formats: Sequence[WireFormat], ids: Sequence[int] = (1, 2, 3, 4)) 
 
 def drive_of(effort: Sequence[float], damping: Sequence[float] = NO_TORQUE) -> Drive:
     """Return the drive of motors that are on, all of them for sure. effort: (4,) Nm, damping: (4,) Nm s/rad."""
-    return Drive(tuple(effort), tuple(damping), COMMANDS, True)
+    return Drive(tuple(effort), tuple(damping), (Send.COMMAND,) * len(SPECS), True)
 
 
 def sending(send: Send, drive: Drive = OFF) -> Drive:

@@ -12,8 +12,9 @@ import numpy as np
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.compensation.terms.terms import Terms, TermSettings
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import ENTER, MOTORS
 from exo_gravity.core.numbers import Vector
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS

@@ -14,8 +14,8 @@ from exo_gravity.core.arm.gravity import NO_TORQUE, load_moments, moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Station
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.lab.calibration.tour import Tour

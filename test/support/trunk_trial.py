@@ -9,8 +9,8 @@ import numpy as np
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MOTORS
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.from_file import trunk_imu
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial

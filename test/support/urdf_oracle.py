@@ -26,9 +26,15 @@ class MujocoArm:
         ElementTree.SubElement(settings, "compiler", fixes)
         self._model = mujoco.MjModel.from_xml_string(ElementTree.tostring(robot, encoding="unicode"))
         self._data = mujoco.MjData(self._model)
+        self._model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
         joints = [self._model.joint(name) for name in joint_names]
         self._positions = [int(joint.qposadr[0]) for joint in joints]
         self._speeds = [int(joint.dofadr[0]) for joint in joints]
+
+    def energy(self, theta: Sequence[float], gravity: Sequence[float]) -> float:
+        """Return the potential energy in J at `theta` (n,) rad, from which a torque can be differentiated."""
+        self.torque(theta, gravity)
+        return float(self._data.energy[0])
 
     def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> np.ndarray:
         """Return what holds the arm at `theta`, (n,) in Nm.

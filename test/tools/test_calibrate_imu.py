@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from vqf import VQF
 
 from exo_gravity.core.arm.tilt import angle_between, rotation_matrix
 from exo_gravity.lab.calibration.imu import ImuRecord, read_imu
@@ -21,22 +24,39 @@ MOUNTED = np.array((0.1, -0.2, 0.6, 0.768))
 MOUNTED /= np.linalg.norm(MOUNTED)
 
 
-def imu_entry(time: float, rate: np.ndarray, force: np.ndarray) -> Entry:
+def imu_entry(
+    time: float, rate: np.ndarray, force: np.ndarray, orientation: np.ndarray | None = None, unknown: float = 0.0
+) -> Entry:
+    """Return a message; unknown: first entry of the covariances of rate and force."""
     types = STORE.types
     stamp = START + round(time * 1e9)
     header = types["std_msgs/msg/Header"](
         stamp=types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="imu"
     )
-    vector, no_covariance = types["geometry_msgs/msg/Vector3"], np.zeros(9)
+    vector, covariance = types["geometry_msgs/msg/Vector3"], np.full(9, unknown)
+    quaternion = (0.0, 0.0, 0.0, 1.0) if orientation is None else orientation
     message = types[IMU](
-        header, types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0), np.full(9, -1.0),
-        vector(*map(float, rate)), no_covariance, vector(*map(float, force)), no_covariance,
+        header, types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
+        np.full(9, -1.0 if orientation is None else 0.0),
+        vector(*map(float, rate)), covariance, vector(*map(float, force)), covariance,
     )  # fmt: skip
     return "/imu/data_raw", IMU, stamp, bytes(STORE.serialize_cdr(message, IMU))
 
 
-def bag_of(folder: Path, samples: ImuRecord) -> Path:
-    return write_bag(folder, (imu_entry(*row) for row in zip(*samples, strict=True)))
+def bag_of(folder: Path, samples: ImuRecord, unknown: float = 0.0) -> Path:
+    orientation = [None] * len(samples.time) if samples.orientation is None else samples.orientation
+    rows = zip(*samples[:3], orientation, strict=True)
+    return write_bag(folder, (imu_entry(*row, unknown) for row in rows))
+
+
+def reporting(samples: ImuRecord, kind: str) -> ImuRecord:
+    """Return the samples with an orientation: what VQF makes of them, one filled in, zeros, or one of other axes."""
+    rate, force = (np.ascontiguousarray(values) for values in samples[1:3])
+    filtered = np.roll(VQF(0.01).updateBatch(rate, force)["quat6D"], -1, axis=1)
+    turned = (Rotation.from_quat(filtered) * Rotation.from_euler("x", 3.8, degrees=True)).as_quat()
+    upright = np.tile(filtered[100], (len(rate), 1))
+    known = {"true": filtered, "filled in": upright, "zeros": np.zeros_like(filtered), "of other axes": turned}
+    return samples._replace(orientation=known[kind])
 
 
 def calibrate(tmp_path: Path, *arguments: str) -> int:
@@ -56,6 +76,46 @@ def test_the_mounting_goes_into_the_new_file_and_onto_the_page(
     assert "calibrate imu: ±1.0 1.0" in text and "# x, y, z, w, from a calibration" in text
     assert "Calibrated." in (tmp_path / "new.html").read_text(encoding="utf-8")
     assert "rotation_trunk_from_imu" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("kind", "unknown", "problem"),
+    [
+        ("true", 0.0, ""),
+        ("zeros", 0.0, ""),
+        ("zeros", -1.0, ""),
+        ("filled in", 0.0, "its orientation_covariance\\[0\\] must be -1"),
+        (
+            "of other axes",
+            0.0,
+            "the reported orientation, which `imu` would use, is [34] degrees from the accelerometer",
+        ),
+    ],
+)
+def test_the_orientation_that_imu_will_use_is_judged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, unknown: float, problem: str
+) -> None:
+    bag = bag_of(tmp_path / "bag", reporting(record(MOUNTED), kind), unknown)
+    assert calibrate(tmp_path, "--bag", str(bag)) == (1 if problem else 0)
+    assert re.search(problem, capsys.readouterr().err)
+
+
+def test_an_imu_that_reports_its_orientation_and_no_rate_is_calibrated(tmp_path: Path) -> None:
+    samples = reporting(record(MOUNTED), "true")
+    bag = bag_of(tmp_path / "bag", samples._replace(angular_velocity=np.zeros_like(samples.angular_velocity)))
+    assert calibrate(tmp_path, "--bag", str(bag)) == 0
+    found = rotation_matrix(load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"])
+    error = found @ rotation_matrix(MOUNTED).T
+    assert all(angle_between(axis, column) < math.radians(1.5) for axis, column in zip(np.eye(3), error, strict=True))
+
+
+def test_samples_that_imu_would_find_too_slow_are_not_calibrated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    samples = record(MOUNTED)
+    slow = ImuRecord(*(values[::10] for values in samples[:3]))
+    assert calibrate(tmp_path, "--bag", str(bag_of(tmp_path / "bag", slow))) == 1
+    assert "samples a second must be 20 or more; they come at 10 Hz" in capsys.readouterr().err
 
 
 def test_six_rests_are_shown_and_noted_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
 from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
@@ -67,6 +67,7 @@ class Arm(BusScan):
         self.power_up: Iterable[float] | None = None
         self.shaking = 0.0
         self.silent: set[int] = set()
+        self.wire_format = MIT.name
         self.problems: tuple[str, ...] = ()
         self.requests: list[str] = []
         self.said: list[object] = []
@@ -82,7 +83,9 @@ class Arm(BusScan):
         self._now += CYCLE
         shaken = self.pose + np.array((0.0, 0.0, 0.0, self.shaking * math.sin(20.0 * self._now)))
         angles = dict(zip(self.ids, self.zeros + np.array(self.directions) * shaken, strict=True))
-        return {i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0) for i in can_ids if i not in self.silent}
+        return {
+            i: MotorAnswer(i, i, 8, float(angles[i]), 25, 0, self.wire_format) for i in can_ids if i not in self.silent
+        }
 
     def _move(self, target: Iterable[float], watch: Callable[[], object]) -> None:
         start, end = self.pose, np.array(list(target))
@@ -152,6 +155,15 @@ def test_a_silent_motor_and_a_problem_of_the_bus_are_reported_before_anything_is
     assert arm.requests == []
 
 
+def test_a_board_in_servo_mode_cannot_be_told_from_a_v3_board_and_the_person_is_told_so(tmp_path: Path) -> None:
+    for wire_format, is_told in ((MIT.name, False), (MIT_V3.name, True)):
+        arm = Arm(6)
+        arm.wire_format = wire_format
+        result = arm.calibrate(tmp_path)
+        assert value(result, "wire_format") == [wire_format] * 4
+        assert (motors.SERVO_MODE in arm.said) is is_told
+
+
 @pytest.mark.parametrize(
     ("motion", "sentence"),
     [
@@ -210,7 +222,7 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
     boards = [SimulatedMotor(JointMotor(*column), Firmware(status_rate=400.0)) for column in columns]
     device, stop = SimulatedDevice(SimulatedArm(), boards), threading.Event()
     with ExitStack() as opened:
-        names = channels_of(channel)
+        names = channels_of(channel, 4)
         buses = {name: opened.enter_context(can.Bus(interface="virtual", channel=name)) for name in set(names)}
         hold = lambda now: device.arm.reset(arm.pose.tolist())  # noqa: E731
         thread = threading.Thread(target=device.run, args=([buses[name] for name in names], stop.is_set, hold))

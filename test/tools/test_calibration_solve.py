@@ -108,7 +108,7 @@ def test_scale_needs_a_weight_that_shows():
 def test_the_calibrator_replaces_the_compensator_and_the_tour_takes_its_parameters():
     nodes = live.tour_parameters(packaged_config("sim.yaml"), ARM, {"tour.poses": 3})
     assert set(nodes) == {"/imu", "/right/can_bridge", "/right/simulator", "/right/calibrator"}
-    given = nodes["/right/calibrator"]["ros__parameters"]
+    given = nodes["/right/calibrator"]
     assert given["max_effort"] == list(ARM.limits.max_effort) and given["tour.poses"] == 3
     tour = tour_of(values_of(CALIBRATOR, given))
     assert np.all(np.isfinite(tour.wait((0.1, 0.2, 0.3, 0.4), Tilt.of("right"))))

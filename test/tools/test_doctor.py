@@ -3,19 +3,24 @@
 import json
 import os
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from can.interfaces import BACKENDS
 
 from exo_gravity.core.motors.joint_motor import Traffic
+from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab import computer as settings
 from exo_gravity.lab.computer import Level, Wakeups
 from exo_gravity.tools import doctor
 
 from ..support import CONFIG
+from ..support.ports import own_ports
 
+PORTS = own_ports(20_600)
 IN_TIME = Wakeups(np.full(2500, 1e-4), -20)
 CPU = "sys/devices/system/cpu"
 LINK = {"linkinfo": {"info_kind": "can", "info_data": {
@@ -198,7 +203,11 @@ def test_an_interface_that_is_missing_without_ip_or_virtual(computer):
 
 @pytest.fixture
 def run(computer, monkeypatch, capsys):
-    """Run doctor there, with wake-ups in time or as given; return its code and text."""
+    """Run doctor there, with wake-ups in time or as given; return its code and text.
+
+    python-can has a bus within the process for each interface of SocketCAN.
+    """
+    monkeypatch.setitem(BACKENDS, "socketcan", ("can.interfaces.virtual", "VirtualBus"))
 
     def run(*arguments: object, woken: Wakeups = IN_TIME):
         monkeypatch.setattr(settings, "measured", lambda *_: woken)
@@ -248,6 +257,70 @@ def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
     path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", rate=500.0, wire_format=["mit_v3"] * 4)
     code, text = run("--params", path)
     assert code == 2 and "/right/can_bridge rate = 500.0" in text and "400 Hz" in text
+
+
+BUS = {"interface": "udp_multicast", "channel": "239.74.163.2"}
+INTERFACES = {  # the case, changes of `can`, what is found, and what is to be done
+    "misspelt": ({"interface": "socket_can", "channel": "can0"}, "no interface socket_can", "one of canalystii, "),
+    "no driver": (
+        {"interface": "canalystii", "channel": "0", "options": {"bitrate": 1_000_000}},
+        "no driver: ", "pip install 'python-can[canalystii]'",
+    ),
+    "no adapter": ({"interface": "slcan", "channel": "/dev/no", "options": {"bitrate": 10**6}}, "No such file", "plug"),
+    "another adapter": ({**BUS, "serial": "A1"}, "must be can.serial = A1", "plug the adapter in"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("can", "found", "remedy"), INTERFACES.values(), ids=INTERFACES)
+def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, tmp_path, can, found, remedy):
+    options = {"port": next(PORTS), "hop_limit": 0} if can["interface"] == BUS["interface"] else {}
+    path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can={"options": options, **can})
+    code, text = run("--params", path)
+    row, advice = next(pair for pair in pairwise(text.splitlines()) if ": opens" in pair[0])
+    assert code == 2 and row.startswith("fault") and found in row and remedy in advice
+
+
+@pytest.mark.parametrize("interface", ["seeedstudio", "systec", "iscan", "nixnet", "neousys", "pcan", "robotell"])
+def test_a_bit_rate_is_asked_for_where_the_adapter_would_take_another(run, tmp_path, interface):
+    can = {"interface": interface, "channel": "/dev/ttyUSB0", "options": {}}
+    code, text = run("--params", with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can=can))
+    assert code == 2 and f"/right/can_bridge can.options.bitrate = None: must be set for {interface}" in text
+
+
+def test_a_bus_that_a_bridge_holds_is_left_alone_and_the_last_line_says_that_not_all_was_tried(run, tmp_path):
+    options = {"port": next(PORTS), "hop_limit": 0}
+    path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can={**BUS, "options": options})
+    assert run("--params", path)[1].splitlines()[-1] == "Fine"
+    lock = BusLock((BUS["interface"], BUS["channel"], options), "/right/can_bridge (PID 7)")
+    try:
+        code, text = run("--params", path)
+    finally:
+        lock.release()
+    (row,) = (line for line in text.splitlines() if ": opens" in line)
+    assert row.startswith("unknown") and "not tried: held by /right/can_bridge (PID 7)" in row
+    assert code == 0 and text.splitlines()[-1] == "Nothing is wrong in what could be tried; unknown: 1"
+
+
+NODES = {  # a node, its changes, and what the node itself would say
+    "misspelt": ("/right/compensator", {"max_efort": [1.0] * 4}, "/right/compensator max_efort"),
+    "no mounting": ("/imu", {"rotation_trunk_from_imu": [0.0] * 4}, "/imu rotation_trunk_from_imu"),
+    "no model": ("/right/compensator", {"law": "anfis", "anfis_file": "none.json"}, "/right/compensator anfis_file"),
+    "two types": ("/right/compensator", {"gain": [1, 1.0, 1.0, 1.0]}, "a list of one type"),
+}
+
+
+@pytest.mark.parametrize(("node", "changes", "said"), NODES.values(), ids=NODES)
+def test_each_node_of_the_file_is_checked_as_it_checks_itself(run, tmp_path, node, changes, said):
+    code, text = run("--params", with_parameters(tmp_path, "sim.yaml", node, **changes))
+    assert code == 2 and text.startswith("doctor: ") and said in text
+
+
+@pytest.mark.parametrize(("file", "level"), [("sim.yaml", "warning"), ("exo.yaml", "fault")])
+def test_a_node_that_waits_for_a_clock_is_named(run, tmp_path, file, level):
+    path = with_parameters(tmp_path, file, "/right/can_bridge", use_sim_time=True)
+    _, text = run("--params", path)
+    (row,) = (line for line in text.splitlines() if "use_sim_time  " in line)
+    assert row.startswith(level) and "a program that publishes /clock" in row
 
 
 def test_it_measures_in_a_separate_process_at_the_rate_of_the_file():

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from exo_gravity.lab.processes import node_modules
+
 from ..support import CONFIG
 
 EXO = str(CONFIG / "exo.yaml")
@@ -34,6 +36,7 @@ WRONG = [
     ("trial", ["no_such_trial"], "no_such_trial"),
     ("trial", ["demo", *NO_FILE], "nowhere.yaml"),
     ("trial", ["demo", "--offline", "--params", EXO], "a file with a simulator"),
+    ("trial", ["two_poses", "--params", "urdf.yaml"], "a file with a can_bridge, whose arm a trial follows"),
     ("urdf", NO_FILE, "nowhere.yaml"),
     ("urdf", ["--params", EXO, "--output", "missing/arm.urdf"], "arm.urdf"),
     ("validate", NO_FILE, "nowhere.yaml"),
@@ -44,7 +47,17 @@ WITHOUT = {  # by tool: the package, words that need it, and how it is installed
     "report": ("rosbags.typesys", ["b"], "exo_gravity[report]"),
     "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
     "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
+    "doctor": ("rich", ["--seconds", "0"], "python3-rich"),
 }
+# By node: the package, and the extra that has it.
+NODES_WITHOUT = {"simulator": ("mujoco", "sim"), "recorder": ("rosbags", "bag"), "panel": ("uvicorn", "panel")}
+NODE = """
+import sys
+sys.modules[{module!r}] = None
+sys.argv = [{node!r}]
+from importlib import import_module
+import_module({where!r}).main()
+"""
 MAIN = """
 import sys
 sys.modules[{module!r}] = None
@@ -62,6 +75,7 @@ for words, expected in (({words!r}, 2), (["--help"], 0)):
 def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("taken.html").touch()
+    Path("urdf.yaml").write_text("/arm/compensator: {ros__parameters: {law: urdf, joint_names: [a1]}}\n")
     try:
         code = importlib.import_module(f"exo_gravity.tools.{tool}").main(words)
     except SystemExit as ended:
@@ -79,3 +93,19 @@ def test_a_missing_package_is_named_with_what_installs_it_and_help_still_works(t
     assert ended.returncode == 0, ended.stderr
     assert f"{module.partition('.')[0]} " in ended.stderr and installs in ended.stderr
     assert ended.stderr.count("\n") == 1 and "usage: " in ended.stdout
+
+
+@pytest.mark.parametrize("node", NODES_WITHOUT)
+def test_a_node_whose_package_is_missing_ends_with_one_sentence_in_place_of_a_traceback(node, tmp_path):
+    module, extra = NODES_WITHOUT[node]
+    program = NODE.format(module=module, node=node, where=node_modules()[node])
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 2 and module in line and f"pip install 'exo_gravity[{extra}]'" in line
+
+
+@pytest.mark.parametrize("node", node_modules())
+def test_each_node_answers_help_with_what_it_does(node, tmp_path):
+    program = f"import sys; sys.argv = [{node!r}, '--help']; from {node_modules()[node]} import main; sys.exit(main())"
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    assert ended.returncode == 0 and ended.stdout.startswith(f"{node}: ") and f"{node} --ros-args" in ended.stdout

@@ -3,6 +3,7 @@
 test/nodes starts real nodes.
 """
 
+import importlib
 import os
 import signal
 import subprocess
@@ -15,10 +16,11 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.lab import packages
 from exo_gravity.lab.inputs.parameter_file import load, stages
-from exo_gravity.lab.processes import chosen, command_of, in_namespace, node_modules, stop_on_signals, wearers
+from exo_gravity.lab.processes import Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
-from exo_gravity.tools.launcher import main, stop_with_owner
+from exo_gravity.tools.launcher import main
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -53,27 +55,6 @@ def test_a_closed_terminal_stops_the_launcher_as_ctrl_c_does():
         for number, handler in zip(numbers, handlers, strict=True):
             signal.signal(number, handler)
     assert stopping.wait(10.0)
-
-
-def test_the_end_of_ros2_launch_stops_its_launcher_and_no_program_below_it(monkeypatch):
-    monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")
-    reading, writing = os.pipe()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    handlers = [signal.getsignal(number) for number in numbers]
-    try:
-        with open(reading) as held:
-            monkeypatch.setattr(sys, "stdin", held)
-            trial, stopping = stop_on_signals(), threading.Event()
-            owner = threading.Thread(target=stop_with_owner, args=(stopping,))
-            owner.start()
-            assert not stopping.wait(0.1)
-            os.close(writing)
-            owner.join(10.0)
-            assert stopping.is_set()
-            assert not trial.is_set()  # the page starts it with a standard input that has ended
-    finally:
-        for number, handler in zip(numbers, handlers, strict=True):
-            signal.signal(number, handler)
 
 
 def test_the_node_names_are_the_modules_with_an_entry_point():
@@ -232,15 +213,69 @@ def test_patterns_are_compared_with_full_names(only, names):
         assert chosen(NAMES, only) == names
 
 
-def test_a_namespace_is_put_in_front_of_every_node_and_changes_no_parameter():
-    nodes = load(SIM)
-    moved = load(in_namespace(SIM, "/lab"))
-    assert moved == {f"/lab{node}": parameters for node, parameters in nodes.items()}
-    assert in_namespace(SIM, "") == SIM
+HARD = """
+/right/compensator:
+  ros__parameters:
+    robot: {mass: [5e-1, 4e-1, 6e-1, 2e-1], cog: [.05, .1, .2, .1]}
+    use_imu: off
+    support_adapts: n
+    anfis_file: "5e-1"
+    max_effort: [3., 9., 3., 3.]
+"""
+
+
+@pytest.mark.parametrize("namespace", ["", "/lab"])
+def test_in_whatever_namespace_a_node_gets_what_the_tools_have_read(namespace, tmp_path):
+    path = tmp_path / "hard.yaml"
+    path.write_text(HARD)
+    expected = {
+        "robot.mass": [0.5, 0.4, 0.6, 0.2], "robot.cog": [0.05, 0.1, 0.2, 0.1], "use_imu": False,
+        "support_adapts": False, "anfis_file": "5e-1", "max_effort": [3.0, 9.0, 3.0, 3.0],
+    }  # fmt: skip
+    launcher = Launcher(path, print, namespace=namespace)
+    given = load(launcher.params)
+    assert given == {f"{namespace}/right/compensator": expected, f"{namespace}/right/wearer": {}}
+    launcher.stop()
+    assert not launcher.params.exists()
+
+
+def test_a_node_whose_package_is_missing_is_refused_before_any_starts(monkeypatch, refused):
+    monkeypatch.setattr(packages, "find_spec", lambda name: None)
+    error = refused({})
+    assert error == (
+        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install 'exo_gravity[sim]'\n"
+    )
+
+
+TWICE = "/right/compensator: {ros__parameters: {max_effort: [2.5, 6.0, 2.5, 2.5]}}\n"
+MEANT_BY_NOBODY = {  # what is added to a file, and what each tool says of it
+    "a block twice": (TWICE, "'/right/compensator': must be given once: line "),
+    "wildcards": ("/**: {ros__parameters: {max_effort: [9.0, 18.0, 9.0, 9.0]}}\n", "'/**': must be the full name"),
+    "a wildcard": ("/**/compensator: {ros__parameters: {gravity: 9.81}}\n", "'/**/compensator': must be the full"),
+    "an anchor": ("/left/compensator: {ros__parameters: {gain: &g [1.0]}}\n", "'&g': must be written out"),
+}
+TOOLS = {
+    "launcher": ["--params"], "doctor": ["--params"], "urdf": ["--params"], "trial": ["demo", "--offline", "--params"],
+    "budget": ["--body-mass", "70", "--params"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("tool", TOOLS)
+@pytest.mark.parametrize(("added", "said"), MEANT_BY_NOBODY.values(), ids=MEANT_BY_NOBODY)
+def test_every_tool_refuses_what_ros_would_read_otherwise_with_its_line(tool, added, said, tmp_path, capsys):
+    path = tmp_path / "params.yaml"
+    before = SIM.read_text()
+    path.write_text(before + added)
+    line = len(before.splitlines()) + 1
+    try:
+        code = importlib.import_module(f"exo_gravity.tools.{tool}").main([*TOOLS[tool], str(path)])
+    except SystemExit as ended:
+        code = ended.code
+    error = capsys.readouterr().err
+    assert code == 2 and error.startswith(f"{tool}: ") and f"params.yaml, line {line} = {said}" in error, error
 
 
 def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
     commands, _ = launched("--namespace", "lab/", "--log-level", "warn")
     words = commands["/lab/right/compensator"]
     assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", "warn"} <= set(words)
-    assert [*load(words[words.index("--params-file") + 1]), "/lab/right/wearer"] == list(commands)

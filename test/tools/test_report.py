@@ -18,10 +18,11 @@ from rich.console import Console
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
-from exo_gravity.lab.report import figures
-from exo_gravity.lab.report.trial_report import analyse, print_report, write, write_empty
+from exo_gravity.lab.report import figures, html
+from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write, write_empty
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.tools.report import main
 
@@ -124,7 +125,7 @@ def test_the_page_refers_to_nothing_outside_itself_and_its_pictures_are_the_png_
     page = Page(folder)
     assert "url(" not in page.source and f"<h1>{held.title}</h1>" in page.source
     embedded = [base64.b64decode(ref.removeprefix("data:image/png;base64,")) for ref in page.references]
-    assert embedded == [(folder / f"right_{kind}.png").read_bytes() for kind in ("overview", "drift")]
+    assert embedded == [(folder / "right_overview.png").read_bytes()]  # the joints stayed: no drift to draw
     picture = matplotlib.image.imread(folder / "right_overview.png")
     assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
 
@@ -289,14 +290,56 @@ def mode_set(seconds, mode):
 def test_rows_and_page_say_of_whom_under_what_settings_and_by_what_criteria(page_of, tmp_path):
     page = page_of(report_of(WHOLE, mode_set(9.0, "one_g")))
     rows = csv_rows(tmp_path / "holds.csv")
-    shared = {"trial": "demo", "subject": "P01", "arm": "right", "side": "right", "support": "0.3", "version": "1.2.3"}
+    shared = {"trial": "demo", "subject": "P01", "arm": "right", "side": "right", "version": "1.2.3"}
     assert all(row.items() >= shared.items() for row in rows)
-    assert [row["mode"] for row in rows] == ["zero_g"] * 4 + ["one_g"] * 4
+    carried = [(row["mode"], row["support"]) for row in rows]
+    assert carried == [("zero_g", "0.3")] * 4 + [("one_g", "")] * 4  # One-G does not use the support
     top = ("It held.", "P01", "pilot", "first visit", "Zero-G, One-G from 9.0 s", "30 %", "75 kg, female", "Criteria:")
     places = [page.text.index(part) for part in (*top, "1.2.3", "Arm: right")]
     assert places == sorted(places)
     one_g = COMPENSATOR.replace("zero_g", "one_g")  # it does not use the support
     assert "One-G, support none" in printed(report_of(WHOLE, given=one_g))
+
+
+BRIDGE = """/right/can_bridge:
+  ros__parameters: {{can.interface: {}, can.channel: {}}}
+"""
+SAID = {"simulated": "Simulated: programs made", "real": "Recorded on a real arm", "unknown": "does not say whether"}
+
+
+@pytest.mark.parametrize(
+    ("bridge", "source"),
+    [(("virtual", "stage"), "simulated"), (("socketcan", "can0"), "real"), (("socketcan", "vcan0"), "unknown")],
+)
+def test_page_rows_figures_and_terminal_say_where_the_numbers_come_from(tmp_path, bridge, source, monkeypatch):
+    stamped = []
+    monkeypatch.setattr(html, "stamp", lambda figure, text: stamped.append(text))
+    monkeypatch.setattr(html, "png_of", lambda *_: b"")
+    report = analyse(made.bag_of(WHOLE, parameters={"/right/can_bridge": BRIDGE.format(*bridge)}))
+    write(report, tmp_path)
+    text = Page(tmp_path).text
+    assert text.index(SAID[source]) < text.index(report.held)
+    assert {row["source"] for row in csv_rows(tmp_path / "holds.csv")} == {source}
+    assert set(report.bag.columns()["source"]) == {source}
+    assert set(stamped) == {STAMPS[Source(source)]}
+    assert f"source: {source}" in printed(report)
+
+
+def test_what_the_nodes_say_of_the_source_is_believed_before_the_parameters(tmp_path):
+    entries = [*made.messages(WHOLE), made.status(0.5, "active", state="active", source="real")]
+    bag = read_bag(made.write_bag(tmp_path / "bag", entries))
+    assert bag.source("right") is Source.REAL and bag.source("left") is Source.UNKNOWN
+
+
+def test_only_joints_that_moved_are_drawn_and_the_others_are_a_line(tmp_path, page_of):
+    away = np.array([0.0, 0.0, 0.0, math.radians(6.0) / 60.0])
+    report = analyse(made.bag_of(made.trial(made.POSES, hold=6.0, rate=100.0, drift=away)))
+    figure = figures.drift(*report.arms[0], report.criteria)
+    titles = [axis.get_title(loc="left") for axis in figure.axes]
+    assert [title for title in titles if title] == ["joint 4"]
+    text = page_of(report).text
+    assert re.search(r"none of joint 1, joint 2, joint 3 moved more than 0\.0\d\d degrees", text)
+    assert "no joint moved more than 0.0" in page_of(analyse(made.bag_of(WHOLE))).text
 
 
 def test_the_report_of_an_arm_that_did_not_hold_leads_with_it_and_each_reason(page_of):

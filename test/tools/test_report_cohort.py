@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
-from dataclasses import asdict
+import signal
+from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 import pytest
+from distributed import Client, LocalCluster
 
+from exo_gravity.lab.bag.writer import repair
+from exo_gravity.lab.parallel import on_cluster
 from exo_gravity.lab.report import cohort
-from exo_gravity.lab.trial.analysis import HoldCriteria
+from exo_gravity.lab.trial.analysis import HoldCriteria, analyse
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.tools.report import main
 
@@ -19,17 +25,21 @@ from ..support import csv_rows
 from ..support import synthetic_bags as made
 
 DRIFTS = (1.0, 2.0, 3.0)  # deg/min of the elbow
+DAY = 86_400 * 10**9  # ns
+JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
 
 
 @pytest.fixture
-def trials(tmp_path):
-    """A folder of three trials of one subject, one that is no recording, and one that is cut."""
+def trials(tmp_path, monkeypatch):
+    """A folder of three trials of one subject, a day each, one that is no recording, and one that is cut."""
     folder = tmp_path / "trials"
-    session = made.text_entry("/recorder/session", 0.0, json.dumps(asdict(Session("P01"))))
     for number, drift in enumerate(DRIFTS):
-        rates = np.radians([0.0, 0.0, 0.0, drift]) / 60.0
-        recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=rates)
-        made.write_bag(folder / f"day_{number}" / "bag", [session, *made.messages(recording)])
+        with monkeypatch.context() as day:
+            day.setattr(made, "START", made.START + number * DAY)
+            session = made.text_entry("/recorder/session", 0.0, json.dumps(asdict(Session("P01"))))
+            rates = np.radians([0.0, 0.0, 0.0, drift]) / 60.0
+            recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=rates)
+            made.write_bag(folder / f"day_{number}" / "bag", [session, *made.messages(recording)])
     cut = folder / "cut" / "bag"
     made.write_bag(cut, made.messages(recording))
     (cut / "metadata.yaml").unlink()
@@ -39,13 +49,17 @@ def trials(tmp_path):
     return folder
 
 
-def test_a_folder_becomes_one_table_and_what_fails_is_named(trials, tmp_path, capsys):
+def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, capsys):
     assert main([str(trials), "--output", str(tmp_path / "out")]) == 2
     text = " ".join(capsys.readouterr().out.split())
     assert "Not reported: " in text and "text.mcap: not an MCAP file" in text
-    assert "5 trials held; 1 recordings failed; 0 had not changed" in text
-    trend = re.search(r"P01, right, unknown mode: drift changes by (\S+) deg/min from one of 3 trials", text)
+    assert "4 of 4 trials held; recordings not read, or not completely: 1; 0 recordings had not changed" in text
+    trend = re.search(
+        r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg", text
+    )
     assert float(trend[1]) == pytest.approx(1.0, abs=0.4)
+    page = (tmp_path / "out" / "cohort.html").read_text(encoding="utf-8")
+    assert "text.mcap: not an MCAP file" in page and trend[0] in page and page.count("<img ") == 1
     rows = csv_rows(tmp_path / "out" / "cohort.csv")
     assert len(rows) == 4 * len(made.NAMES) + 1
     elbow = [float(row["drift_deg_per_min"]) for row in rows if row["joint"] == made.NAMES[3] and row["subject"]]
@@ -55,32 +69,65 @@ def test_a_folder_becomes_one_table_and_what_fails_is_named(trials, tmp_path, ca
     np.testing.assert_allclose(first, moved, atol=0.5)
     # Of whom nothing has changed nothing is read: its own summary would not be there.
     assert main([str(trials), "--output", str(tmp_path / "out")]) == 2
-    assert "4 had not changed" in capsys.readouterr().out
+    assert "4 recordings had not changed" in capsys.readouterr().out
     assert csv_rows(tmp_path / "out" / "cohort.csv") == rows
 
 
 def test_a_recording_is_read_again_where_its_content_or_the_criteria_change(trials, tmp_path):
-    bag, path = trials / "day_0" / "bag", tmp_path / "cache.json"
-    cache = cohort.Cache(path, HoldCriteria(), 2.0)
+    bag, path, rows = trials / "day_0" / "bag", tmp_path / "cache.jsonl", [{"arm": "right", "verdict": "It held."}]
+    cache = cohort.Cache(path, JUDGING)
     key = cache.key(bag)
-    cache.put(key, [{"recording": "elsewhere", "verdict": "It held."}])
-    cache.save()
-    assert cohort.Cache(path, HoldCriteria(), 2.0).get(key, bag) == [{"recording": str(bag), "verdict": "It held."}]
-    assert cohort.Cache(path, HoldCriteria(), 3.0).key(bag) != key
+    cache.put(key, rows)
+    assert cohort.Cache(path, JUDGING).get(key) == rows
+    assert cohort.Cache(path, replace(JUDGING, min_hold=3.0)).key(bag) != key
     file = bag / "bag.mcap"
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
     assert cache.key(bag) != key
-    path.write_text("damaged")
-    assert cohort.Cache(path, HoldCriteria(), 2.0).get(key, bag) is None
+    with path.open("a") as stream:
+        stream.write('["cut')
+    assert cohort.Cache(path, JUDGING).get(key) == rows
+
+
+def test_a_copy_that_was_repaired_is_not_a_second_trial(trials):
+    before = cohort.recordings_below(trials)
+    copy, _ = repair(trials / "cut" / "bag")
+    assert cohort.recordings_below(trials) == before and cohort.recordings_below(copy) == [copy]
+
+
+def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_there_twice(trials, tmp_path):
+    bags = []
+    for number in range(8):
+        recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=math.radians(number) / 60.0)
+        bags.append(made.write_bag(trials / f"more_{number}" / "bag", made.messages(recording)))
+    recordings = cohort.recordings_below(trials)
+    assert {*bags} < {*recordings}
+    expected = [row for recording in recordings for row in cohort.summary(str(recording), JUDGING)]
+    workers = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(host="127.0.0.1", **workers) as cluster, Client(cluster) as client:
+        running = sorted(client.run(os.getpid).values())
+
+        def done():
+            if running:  # the first recording is finished
+                os.kill(running.pop(), signal.SIGKILL)
+                running.clear()
+
+        run, cache = partial(on_cluster, cluster.scheduler_address), cohort.Cache(tmp_path / "cache.jsonl", JUDGING)
+        rows, known = cohort.summaries(recordings, JUDGING, cache, run, done)
+    assert rows == expected and known == 0
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, capsys):
+    monkeypatch.setattr("exo_gravity.lab.parallel.CONNECT", "0.1s")
+    assert main([str(trials), "--scheduler", "tcp://127.0.0.1:9"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("report: ") and "127.0.0.1:9" in line
 
 
 def test_a_move_along_a_bell_of_speed_is_smooth():
-    rows = cohort.summary(str(made.START), HoldCriteria(), 2.0)
+    rows = cohort.summary(str(made.START), JUDGING)
     assert rows[0]["problem"] and rows[0]["verdict"] is None
     recording = made.trial(made.POSES, hold=3.0, rate=200.0)
-    from exo_gravity.lab.trial.analysis import analyse
-
     assert -1.8 < cohort.smoothness(recording, analyse(recording)) < -1.3
     assert math.isnan(cohort.smoothness(recording, analyse(made.measured(made.still(made.POSES[0], 5.0)))))

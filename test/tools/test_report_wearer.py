@@ -11,6 +11,7 @@ import yaml
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.report import trial_report, wearer_share
 from exo_gravity.lab.trial.recording import Recording
 
@@ -46,11 +47,13 @@ def test_the_share_of_the_recording_is_found_and_said(share, tmp_path):
     part = report.wearers["right"]
     assert part.whole.value == pytest.approx(share, abs=0.005)
     assert part.curve.time[0] >= 1.0 and part.curve.time[-1] <= 7.0  # while the arm was carried
-    said = wearer_share.sentence(part)
+    said = wearer_share.sentence(part, Source.REAL)
+    assert wearer_share.sentence(part, Source.SIMULATED) == f"In the simulation, t{said[1:]}"
     assert f"{100 * share:.0f} % of their arm's weight" in said
     assert ("not distinguishable from zero" in said) == (share == 0.0)
     written = trial_report.write(report, tmp_path)
     assert "right_wearer.png" in [path.name for path in written]
+    said = wearer_share.sentence(part, Source.UNKNOWN)  # as this recording has it
     assert said.split("(")[0] in (tmp_path / "report.html").read_text(encoding="utf-8").replace("&#x27;", "'")
 
 
@@ -72,4 +75,4 @@ def test_a_hanging_arm_has_nothing_to_carry():
     still = np.zeros((len(TIME), 4))
     hanging = Recording("right", JOINTS, TIME, still, still, still, still)
     report = trial_report.analyse(bag_of(hanging, parameters=parameters(use_imu=False)))
-    assert "nothing to carry" in wearer_share.sentence(report.wearers["right"])
+    assert "nothing to carry" in wearer_share.sentence(report.wearers["right"], Source.UNKNOWN)

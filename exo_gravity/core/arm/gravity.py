@@ -27,17 +27,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmData
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 Torque = tuple[float, ...]  # (n,) Nm in joint order
 NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
+BLOCK = 2048  # poses at once: what a formula computes on the way stays in the processor's cache
 Values = Iterable[Any]  # plain floats if xp is `math`, arrays (n,) if it is `numpy`
 
 
-def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> tuple[Any, ...]:
+def _exact(xp: ModuleType, arm: ArmData, theta: Values, direction: Values) -> tuple[Any, ...]:
     """Return the closed form of Newton-Euler; `direction` is gravity's unit vector in the arm's base frame."""
     t1, t2, t3, t4 = theta
     gx, gy, gz = direction
@@ -59,7 +60,7 @@ def _exact(xp: ModuleType, arm: ArmModel, theta: Values, direction: Values) -> t
     )
 
 
-def _paper_static(xp: ModuleType, arm: ArmModel, theta: Values) -> tuple[Any, ...]:
+def _paper_static(xp: ModuleType, arm: ArmData, theta: Values) -> tuple[Any, ...]:
     """EQ2-EQ5; theta_1 is the angle between joint 1's axis and gravity."""
     t1, t2, t3, t4 = theta
     (_, l2, l3, l4), (d1, d2, d3, d4), (m1, m2, m3, m4) = (a.tolist() for a in (arm.length, arm.cog, arm.mass))
@@ -72,7 +73,7 @@ def _paper_static(xp: ModuleType, arm: ArmModel, theta: Values) -> tuple[Any, ..
     )  # fmt: skip
 
 
-def _paper_mobile(xp: ModuleType, arm: ArmModel, theta: Values, beta: Any, phi: Any) -> tuple[Any, ...]:
+def _paper_mobile(xp: ModuleType, arm: ArmData, theta: Values, beta: Any, phi: Any) -> tuple[Any, ...]:
     """EQ1m-EQ4m: EQ2-EQ5 at theta_2 + phi and theta_3 + beta, times cos(phi) cos(beta).
 
     Joints 2 to 4 have the additional factor cos(theta_1).
@@ -84,7 +85,7 @@ def _paper_mobile(xp: ModuleType, arm: ArmModel, theta: Values, beta: Any, phi: 
     return tau1 * upright, tau2 * axis, tau3 * axis, tau4 * axis
 
 
-def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
+def gravity_torque(arm: ArmData, theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0)) -> np.ndarray:
     """Return the torque in Nm that holds `arm` against gravity by the exact law, in the shape of `theta`.
 
     theta: (4,) or (n, 4) rad. direction: (3,) or (n, 3), unit vector of gravity in the arm's base frame; (0, 0, 1) if
@@ -100,7 +101,7 @@ def gravity_torque(arm: ArmModel, theta: ArrayLike, direction: ArrayLike = (0.0,
     return _torque(_exact, arm, poses, down)
 
 
-def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
+def paper_static_torque(arm: ArmData, theta: ArrayLike) -> np.ndarray:
     """Return the torque of EQ2-EQ5 in Nm, in the shape of `theta`.
 
     theta: (4,) or (n, 4) rad. Here theta_1 is the angle between joint 1's axis and gravity (0 for an upright wearer),
@@ -111,7 +112,7 @@ def paper_static_torque(arm: ArmModel, theta: ArrayLike) -> np.ndarray:
     return _torque(_paper_static, arm, _poses(theta))
 
 
-def paper_mobile_torque(arm: ArmModel, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
+def paper_mobile_torque(arm: ArmData, theta: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> np.ndarray:
     """Return the torque of EQ1m-EQ4m in Nm, in the shape of `theta`.
 
     theta: (4,) or (n, 4) rad, with theta_1 as in `paper_static_torque`. pitch, yaw: the paper's beta and phi in rad, a
@@ -136,14 +137,20 @@ def _poses(theta: ArrayLike) -> np.ndarray:
     return poses
 
 
-def _torque(formula: Callable[..., tuple[Any, ...]], arm: ArmModel, *inputs: np.ndarray) -> np.ndarray:
+def _torque(formula: Callable[..., tuple[Any, ...]], arm: ArmData, *inputs: np.ndarray) -> np.ndarray:
     """Return the scaled torque (4,) or (n, 4) by `formula`; inputs: (k,) for all poses, or (n, k), the angles first."""
-    columns = (np.moveaxis(values, -1, 0).copy() for values in inputs)  # contiguous: twice as fast
-    unscaled = np.broadcast_arrays(*formula(np, arm, *columns))
-    return np.asarray(np.stack(unscaled, axis=-1) * (arm.gain * arm.gravity))
+    poses, *others = inputs
+    rows, scale = np.atleast_2d(poses), arm.gain * arm.gravity
+    result = np.empty_like(rows)
+    for begin in range(0, len(rows), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        columns = (values[part].T.copy() if values.ndim == 2 else values for values in (rows, *others))
+        for torque, factor, column in zip(formula(np, arm, *columns), scale, result[part].T, strict=True):
+            np.multiply(torque, factor, out=column)
+    return result.reshape(poses.shape)
 
 
-def exact_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+def exact_torque(arm: ArmData, theta: Sequence[float], tilt: Tilt) -> Torque:
     """Return the torque (4,) in Nm that holds `arm` by the exact law, of one pose in plain floats.
 
     theta: (4,) rad.
@@ -151,17 +158,17 @@ def exact_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
     return _scaled(arm, tilt, _exact(math, arm, theta, tilt.direction))
 
 
-def static_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+def static_torque(arm: ArmData, theta: Sequence[float], tilt: Tilt) -> Torque:
     """Return the torque of EQ2-EQ5 like `exact_torque`; joint 1's own angle is not used."""
     return _scaled(arm, tilt, _paper_static(math, arm, (tilt.axis_angle, *theta[1:])))
 
 
-def mobile_torque(arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> Torque:
+def mobile_torque(arm: ArmData, theta: Sequence[float], tilt: Tilt) -> Torque:
     """Return the torque of EQ1m-EQ4m like `exact_torque`; joint 1's own angle is not used."""
     return _scaled(arm, tilt, _paper_mobile(math, arm, (tilt.axis_angle, *theta[1:]), tilt.beta, tilt.phi))
 
 
-def _scaled(arm: ArmModel, tilt: Tilt, tau: Torque) -> Torque:
+def _scaled(arm: ArmData, tilt: Tilt, tau: Torque) -> Torque:
     a, b, c, d = arm.scale
     felt = tilt.magnitude
     return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
@@ -171,7 +178,7 @@ MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
 MAX_OFFSET = 0.1  # m of a centre of gravity from its link
 
 
-def moments_of(arm: ArmModel) -> np.ndarray:
+def moments_of(arm: ArmData) -> np.ndarray:
     """Return the eight moments (8,) of `arm` in kg m."""
     return np.array((*arm.first_moment, *arm.off_axis))
 
@@ -200,8 +207,8 @@ def regressor(
 
 
 @lru_cache(4)
-def _unit_arms(gravity: float) -> list[ArmModel]:
+def _unit_arms(gravity: float) -> list[ArmData]:
     """Return an arm for each moment, which has that moment of 1 kg m and no other."""
     rows = np.eye(len(MOMENTS))
     no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
-    return [ArmModel.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]
+    return [ArmData.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]

@@ -6,8 +6,9 @@ length from the proximal joint. Mass and centre always come from the same table:
     de_leva   P. de Leva, J. Biomech. 29 (1996): scans of young adults; the hand ends at the third metacarpal
     winter    D. A. Winter, Biomechanics and Motor Control of Human Movement: cadavers, same values for both sexes
 
-Link 3 carries the upper arm and link 4 the forearm and hand; the robot's joints 3 and 4 turn about the wearer's
-shoulder and elbow. A table is an average: a person's arm can differ from it by more than 10 %.
+Of the paper's arm, link 3 carries the upper arm and link 4 the forearm and hand; its joints 3 and 4 turn about the
+wearer's shoulder and elbow. On another arm the user says which links do. A table is an average: a person's arm can
+differ from it by more than 10 %.
 """
 
 from collections.abc import Sequence
@@ -31,13 +32,14 @@ TABLES = {
 }
 # m, rounded values of an adult man: shoulder to elbow, elbow to wrist, wrist to third knuckle. Prefer measured lengths.
 TYPICAL_LENGTH = (0.28, 0.27, 0.086)
+PAPER_LINKS = (3, 4)
 
 
 class LinkLoad(NamedTuple):
     """The wearer's mass on each link of the robot."""
 
-    mass: np.ndarray  #: (4,) kg
-    cog: np.ndarray  #: (4,) m from joint n along link n
+    mass: np.ndarray  #: (n,) kg
+    cog: np.ndarray  #: (n,) m from joint n along link n
 
 
 @dataclass(frozen=True)
@@ -57,21 +59,30 @@ class Wearer:
         lengths = floats("segment_length", self.segment_length, 3, 0.0, 0.6, "m")
         object.__setattr__(self, "segment_length", tuple(lengths.tolist()))
 
-    def on_links(self, link_length: Vector) -> LinkLoad:
-        """Return the load of this wearer's arm on a robot with links of `link_length` (4,) m.
+    def on_links(self, link_length: Vector, links: Sequence[int] = PAPER_LINKS) -> LinkLoad:
+        """Return the load of this wearer's arm on a robot with links of `link_length` (n,) m.
 
-        Raises ParameterError if the centre of gravity of a segment lies beyond the link that must carry it.
+        links: which of them, from 1 on, carry the upper arm, and forearm and hand; 0: the robot does not carry it.
+
+        Raises ParameterError if there is no such link, or if the centre of gravity of a segment lies beyond it.
         """
         upper_arm, forearm, hand = self.segments
         elbow_to_wrist = self.segment_length[1]
         lower = forearm[0] + hand[0]
         moment = forearm[0] * forearm[1] + hand[0] * (elbow_to_wrist + hand[1])  # about the elbow
-        cog = (0.0, 0.0, upper_arm[1], moment / lower)
-        for link, what in ((2, "the upper arm"), (3, "the forearm and hand")):
-            if cog[link] > link_length[link]:
-                beyond = f"the centre of gravity of {what} is at {cog[link]:.3f} m, beyond link {link + 1}"
+        segments = (*upper_arm, "the upper arm"), (lower, moment / lower, "the forearm and hand")
+        count = len(link_length)
+        load = LinkLoad(np.zeros(count), np.zeros(count))
+        if len(links) != len(segments) or not all(0 <= link <= count for link in links) or links[0] == links[1]:
+            raise ParameterError("links", list(links), f"2 different links from 1 to {count}, or 0 for none")
+        for link, (mass, centre, what) in zip(links, segments, strict=True):
+            if not link:
+                continue
+            if centre > link_length[link - 1]:
+                beyond = f"the centre of gravity of {what} is at {centre:.3f} m, beyond link {link}"
                 raise ParameterError("link_length", [*map(float, link_length)], f"long enough for the wearer: {beyond}")
-        return LinkLoad(np.array((0.0, 0.0, upper_arm[0], lower)), np.array(cog))
+            load.mass[link - 1], load.cog[link - 1] = mass, centre
+        return load
 
     @property
     def segments(self) -> tuple[tuple[float, float], ...]:

@@ -14,8 +14,7 @@ from functools import partial
 from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import Torque, exact_torque
-from exo_gravity.core.arm.kinematics import turning_torque
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange
 from exo_gravity.core.compensation.settings import Settings
@@ -63,19 +62,18 @@ class Load(NamedTuple):
     """What the compensator carries."""
 
     settings: Settings
-    terms: TermsInForce | None  #: on top of gravity compensation
+    terms: TermsInForce  #: on top of gravity compensation
 
 
 class Compensator:
     """The control law and its state: rate limit, and the change of load that is under way.
 
-    names: of the joints (4,), for the outer loop's input.
+    names: of the joints (n,), for the outer loop's input.
     """
 
     def __init__(self, settings: Settings, names: Sequence[str] = JOINTS) -> None:
         self.settings = settings
-        #: what is added to gravity compensation; None for an arm that is known by its URDF alone
-        self.terms = Terms(names, settings.terms, settings.moving) if settings.robot else None
+        self.terms = Terms(names, settings.terms, settings.moving)  #: what is added to gravity compensation
         #: of the trunk, or of the root link of another arm
         self.tilt = TiltInput(settings.side, settings.tilt_timeout)
         self.support_request = SupportRequest()  #: used with `support_adapts` in zero_g
@@ -137,7 +135,7 @@ class Compensator:
             return Compensation.withdrawn(Reason(Withdrawal.LAW_NOT_FINITE, infinite))
         s, dt = self.settings, now - self._last_time
         torque = gravity
-        if self.terms and velocity:
+        if velocity:
             torque = tuple(map(operator.add, gravity, self.terms.torque(now, theta, velocity)))
         weighing = self._active_weighing if velocity else None
         if weighing and velocity:
@@ -174,21 +172,20 @@ class Compensator:
 
     def _replace_load(self, settings: Settings) -> Load:
         """Use new settings; return what was carried before them."""
-        before = Load(self.settings, self.terms.in_force if self.terms else None)
+        before = Load(self.settings, self.terms.in_force)
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
         if weighing := self._active_weighing:
             weighing.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, "the settings changed")
         self.tilt.timeout = settings.tilt_timeout
-        if self.terms is not None:
-            self.terms.apply(settings.terms, settings.moving)
+        self.terms.apply(settings.terms, settings.moving)
         return before
 
     def _withdraw_lost_load(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> None:
         """Carry a load that has left the hand no longer."""
         s = self.settings
-        per_mass = exact_torque(s.unit_load, theta, self.tilt.at(now))  # m that each joint lifts it, per rad
+        per_mass = s.unit_load.torque(theta, self.tilt.at(now))  # m that each joint lifts it, per rad
         if self.applied:  # motors that do not carry the load cannot throw the arm
             needed = s.payload_mass * s.arm.gravity * sum(height * height for height in per_mass)
             if sum(map(operator.mul, per_mass, self.applied)) < DROP.least_carried * needed:
@@ -215,7 +212,7 @@ class Compensator:
         if not felt:
             return s.torque(theta, self.tilt.at(now), exact)
         torque, reason = s.torque(theta, Tilt.of_felt(s.side, felt.gravity, STANDARD_GRAVITY), exact)
-        turning = turning_torque(s.arm, s.side, theta, felt.angular_acceleration)
+        turning = s.arm.turning_torque(s.side, theta, felt.angular_acceleration)
         return tuple(map(operator.add, torque, turning)), reason
 
     @property
@@ -225,7 +222,7 @@ class Compensator:
     def _torque_of(self, reading: Reading, load: Load) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
         torque, _ = self._gravity(load.settings, reading.time, reading.theta)
-        if self.terms and load.terms and reading.velocity:
+        if reading.velocity:
             torque = tuple(map(operator.add, torque, self.terms.torque_of(load.terms)))
         return clamped(torque, load.settings.max_effort)
 

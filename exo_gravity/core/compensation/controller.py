@@ -45,7 +45,7 @@ class DirectController(SampleController):
         self.answer = Compensation.withdrawn(NO_REASON)  #: the compensator's last one
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        position, velocity, effort, _, _, times = zip(*samples, strict=True)
+        position, velocity, effort, _, _, times, *_ = zip(*samples, strict=True)
         self.compensator.applied = effort
         self.answer = answer = self.compensator.step(now, position, velocity)
         return Efforts(answer.effort, min(times), answer.damped, bool(answer.held))

@@ -10,9 +10,12 @@ from typing import Protocol
 
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import Torque, exact_torque, mobile_torque, static_torque
+from exo_gravity.core.arm.gravity import Torque, mobile_torque, static_torque
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
+
+URDF_LAW = "urdf"  # the exact law of an arm from a URDF
 
 
 class Law(Protocol):
@@ -30,20 +33,24 @@ class Law(Protocol):
         ...
 
 
-class GravityModel(Protocol):
-    """An arm of n joints whose torques come from outside `core`: `hardware.urdf_arm.UrdfArm`."""
+@dataclass(frozen=True)
+class ExactLaw:
+    """The arm's own torque, which is exact in every pose."""
 
-    max_effort: tuple[float, ...]  #: the joints' own limits, (n,) Nm; 0 if not known
-    mass: float  #: kg that the joints carry
+    arm: Arm
 
-    def torque(self, theta: Sequence[float], gravity: Sequence[float]) -> Torque:
-        """Return the torque (n,) in Nm at `theta` (n,) rad; gravity: (3,) m/s^2 in the root link's axes."""
-        ...
+    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
+        """Return ''."""
+        return ""
+
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (n,) in Nm at `theta` (n,) rad."""
+        return self.arm.torque(theta, tilt)
 
 
 @dataclass(frozen=True)
 class ArmLaw:
-    """A law of the exoskeleton's own arm: a formula, and where it does not apply."""
+    """A law of the paper's arm: a formula, and where it does not apply."""
 
     arm: ArmModel
     formula: Callable[[ArmModel, Sequence[float], Tilt], Torque]
@@ -58,30 +65,12 @@ class ArmLaw:
         return self.formula(self.arm, theta, tilt)
 
 
-@dataclass(frozen=True)
-class UrdfLaw:
-    """The torque of any serial arm, from its URDF; it applies everywhere."""
-
-    model: GravityModel
-    gain: Sequence[float]  #: scales the torque, (n,)
-    gravity: float  #: m/s^2
-
-    def outside(self, theta: Sequence[float], tilt: Tilt) -> str:
-        """Return ''."""
-        return ""
-
-    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the torque (n,) in Nm at `theta` (n,) rad; tilt: of the root link, like that of the left arm."""
-        torque = self.model.torque(theta, [self.gravity * component for component in tilt.gravity_in_trunk])
-        return tuple([gain * tau for gain, tau in zip(self.gain, torque, strict=True)])
-
-
 class LawData(Protocol):
     """What a law can be made of: the compensator's `Settings`."""
 
     @property
-    def arm(self) -> ArmModel:
-        """The exoskeleton's own arm, with what it carries."""
+    def arm(self) -> Arm:
+        """The arm, with what it carries."""
         ...
 
     @property
@@ -89,40 +78,40 @@ class LawData(Protocol):
         """The model in `anfis_file`, if it is given."""
         ...
 
-    @property
-    def urdf(self) -> UrdfLaw | None:
-        """The law of another arm, known by its URDF; then there is no `arm`."""
-        ...
+
+def _with_masses(arm: Arm, law: str) -> ArmModel:
+    """Return the paper's arm, for a law that needs its masses. Raises ParameterError."""
+    if not isinstance(arm, ArmModel):
+        raise ParameterError("law", law, f"{URDF_LAW} for an arm from a URDF")
+    arm.check_masses(f"law {law}")
+    return arm
 
 
 def _paper_static(given: LawData) -> Law:
-    given.arm.check_masses("law paper_static")
-    return ArmLaw(given.arm, static_torque)
+    return ArmLaw(_with_masses(given.arm, "paper_static"), static_torque)
 
 
 def _paper_mobile(given: LawData) -> Law:
-    given.arm.check_masses("law paper_mobile")
-    return ArmLaw(given.arm, mobile_torque)
+    return ArmLaw(_with_masses(given.arm, "paper_mobile"), mobile_torque)
 
 
 def _anfis(given: LawData) -> Law:
     if given.anfis is None:
         raise ParameterError("law", "anfis", "used with anfis_file, a model from train_anfis")
-    given.arm.check_masses("law anfis")
-    return ArmLaw(given.arm, given.anfis.torque, given.anfis.outside)
+    return ArmLaw(_with_masses(given.arm, "anfis"), given.anfis.torque, given.anfis.outside)
 
 
 def _urdf(given: LawData) -> Law:
-    if given.urdf is None:
-        raise ParameterError("law", "urdf", "chosen at the start, with an arm from a URDF")
-    return given.urdf
+    if isinstance(given.arm, ArmModel):
+        raise ParameterError("law", URDF_LAW, "chosen at the start, with an arm from a URDF")
+    return ExactLaw(given.arm)
 
 
 #: what makes each law, by name. Raises ParameterError where the law does not cover such an arm
 LAWS: dict[str, Callable[[LawData], Law]] = {
-    "exact": lambda given: ArmLaw(given.arm, exact_torque),
+    "exact": lambda given: ExactLaw(given.arm),
     "paper_static": _paper_static,
     "paper_mobile": _paper_mobile,
     "anfis": _anfis,
-    "urdf": _urdf,
+    URDF_LAW: _urdf,
 }

@@ -3,7 +3,8 @@
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.arm.arm import (
@@ -18,98 +19,135 @@ from exo_gravity.core.arm.arm import (
     ArmModel,
     ModelError,
 )
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.tilt import SIDES, Tilt
-from exo_gravity.core.arm.wearer import SEX, TYPICAL_LENGTH, Wearer
-from exo_gravity.core.compensation.laws import LAWS, ArmLaw, GravityModel, Law, UrdfLaw
+from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
 from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, param_of, params_of
-from exo_gravity.core.safety.limits import MAX_COMMAND
+from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Vector, for_joints
+from exo_gravity.core.params import (
+    JOINT_NAMES,
+    REAL_TIME_PARAMETERS,
+    Param,
+    check_owned,
+    joint_count,
+    owned,
+    param_of,
+    params_of,
+    table_for,
+)
+from exo_gravity.core.safety.limits import MAX_EFFORT
 
 MODES = ("one_g", "zero_g")
-URDF_LAW = "urdf"  # chosen at the start, because it is that of another arm
 # Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
 MAX_SCALE = 20.0
 MAX_CARRIED = 10.0  # kg, robot and wearer's share: the arm of a 150 kg wearer has 8; more is probably in another unit
+LARGEST_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
+
+
+class UrdfModel(Arm, Protocol):
+    """An arm from a URDF."""
+
+    @property
+    def max_effort(self) -> tuple[float, ...]:
+        """(n,) Nm, the joints' own limits; 0 if not known."""
+        ...
+
+    @property
+    def length(self) -> tuple[float, ...]:
+        """(n,) m from each joint to the next one, and from the last one to the hand; 0 if there is none."""
+        ...
+
+    def scaled(self, gain: Sequence[float], gravity: float) -> Arm:
+        """Return this arm with other gains, (n,), and another gravity, m/s^2. Raises ParameterError."""
+        ...
 
 
 @dataclass(frozen=True)
 class Settings:
     """What holds an arm of n joints. All but `side` and `use_imu` may change while the arm is worn.
 
-    An arm that is known by its URDF alone has no `robot`: then it has no wearer, terms, load or weighing either, and
-    none of the models that are computed here. Raises ParameterError.
+    Raises ParameterError.
     """
 
-    side: str  #: 'left' or 'right'; 'left' with `urdf`, whose root link's axes are not mirrored
-    robot: ArmModel | None  #: the exoskeleton's own arm; None with `urdf`
+    side: str  #: 'left' or 'right'; 'left' for any arm from a URDF, whose root link's axes are not mirrored
+    robot: Arm  #: the arm alone
     law: str = owned("exact", "law that computes the gravity torque", choices=LAWS)
     mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
-    support: float = owned(1.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
+    support: float = owned(0.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
-    wearer_mass: Sequence[float] = NO_TORQUE  #: (4,) kg, the wearer's segment on each link
-    wearer_cog: Sequence[float] = NO_TORQUE  #: (4,) m from joint n, its centre of gravity
-    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, MAX_COMMAND), "Nm")
+    wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none
+    wearer_cog: Sequence[float] = ()  #: (n,) m from joint n, its centre of gravity
+    max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
     inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
     shoulder_from_imu: tuple[float, float, float] = owned(
-        (0.0, 0.0, 0.0), "the arm's base from the IMU along the trunk's axes, for `inertial`", (-1.0, 1.0), "m"
+        (0.0, 0.0, 0.0),
+        "the arm's base from the IMU along the trunk's axes, for `inertial`",
+        (-1.0, 1.0),
+        "m",
+        vector=True,
     )
     use_imu: bool = True  #: False assumes an upright trunk
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
     model_error: ModelError = field(default_factory=ModelError)  #: for the bands of what is estimated
-    robot_by_mass: ArmModel | None = None  #: the robot by its masses, for `terms`; None: `robot`
+    robot_by_mass: Arm | None = None  #: the robot by its masses, for `terms`; None: `robot`
     payload_mass: float = 0.0  #: kg in the hand
-    payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in frame 4
-    urdf: UrdfLaw | None = None  #: the law of another arm, in place of `robot`
-    #: a load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2
-    unit_load: ArmModel = field(init=False, repr=False, compare=False)
+    payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in the frame of the hand
     #: the robot with the load in its hand, which is carried in full in both modes, like the robot's own weight
-    loaded: ArmModel = field(init=False, repr=False, compare=False)
+    loaded: Arm = field(init=False, repr=False, compare=False)
     #: what is compensated: `loaded` in One-G, the same plus `support` times the wearer in Zero-G
-    arm: ArmModel = field(init=False, repr=False, compare=False)
-    moving: ArmModel = field(init=False, repr=False, compare=False)  #: the same by its masses
+    arm: Arm = field(init=False, repr=False, compare=False)
+    moving: Arm = field(init=False, repr=False, compare=False)  #: the same by its masses
     chosen: Law = field(init=False, repr=False, compare=False)  #: the law called `law`
     exact: Law = field(init=False, repr=False, compare=False)  #: what replaces it where it does not apply
 
     def __post_init__(self) -> None:
         if self.side not in SIDES:
             raise ParameterError("side", self.side, f"one of {', '.join(SIDES)}")
-        if self.robot is not None:
-            check_owned(self)
-            self._carry(self.robot)
+        check_owned(self, len(self.robot.scale))
+        for name in ("wearer_mass", "wearer_cog"):
+            object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
+        self._carry(self.robot)
         object.__setattr__(self, "chosen", LAWS[self.law](self))
-        object.__setattr__(self, "exact", self.urdf or ArmLaw(self.arm, exact_torque))
+        object.__setattr__(self, "exact", ExactLaw(self.arm))
 
-    def _carry(self, robot: ArmModel) -> None:
-        """Compute what is carried by the exoskeleton's own arm."""
+    def _carry(self, robot: Arm) -> None:
+        """Compute what is carried."""
         loaded = robot.with_payload(self.payload_mass, self.payload_cog)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
-        if loaded.total_mass + wearer > MAX_CARRIED:
-            bare = loaded.total_mass - self.payload_mass
+        given = loaded.given_mass
+        if given + wearer > MAX_CARRIED:
+            bare = given - self.payload_mass
             parts = f"robot {bare:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
             bound = f"at most {MAX_CARRIED:g} ({parts})"
-            raise ParameterError("total mass in kg", round(loaded.total_mass + wearer, 2), bound)
+            raise ParameterError("total mass in kg", round(given + wearer, 2), bound)
         if max(robot.scale) > MAX_SCALE:
             scale = [round(value, 2) for value in robot.scale]
             raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
         by_mass = (self.robot_by_mass or robot).with_payload(self.payload_mass, self.payload_cog)
         carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
         object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or robot))
-        nothing = ArmModel.from_moments(robot.length, NO_TORQUE, gravity=1.0)
-        object.__setattr__(self, "unit_load", nothing.with_payload(1.0, self.payload_cog))
         object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
+
+    @cached_property
+    def unit_load(self) -> Arm:
+        """A load of 1 kg in the hand, without an arm, where gravity is 1 m/s^2.
+
+        Raises ParameterError if it is not known where a load is held.
+        """
+        return self.robot.massless(1.0).with_payload(1.0, self.payload_cog)
 
     @property
     def is_adaptive(self) -> bool:
@@ -124,7 +162,7 @@ class Settings:
     @property
     def mass(self) -> float:
         """What is carried, in kg."""
-        return self.urdf.model.mass if self.urdf else self.arm.total_mass
+        return self.arm.total_mass
 
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; exact: by the exact law in any case.
@@ -136,13 +174,10 @@ class Settings:
         return law.torque(theta, tilt), reason
 
 
-MAX_JOINTS = 32
-MAX_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
-
 # fmt: off
 COMPENSATOR = (
     Param("side", "right", "side of the arm; the right arm mirrors the left", choices=SIDES, fixed=True),
-    JOINT_NAMES,
+    replace(JOINT_NAMES, vector=True),
     Param("link_length", [0.05, 0.13, 0.30, 0.30], "l_n, link lengths", (0.0, MAX_LENGTH), "m", fixed=True),
     param_of(Settings, "law"),
     Param("anfis_file", "", "model for the law anfis, written by train_anfis", expert=True),
@@ -162,12 +197,12 @@ COMPENSATOR = (
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
-    Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m"),
+    Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m", vector=True),
     Param("payload.mass", 0.0, "load in the hand, carried in full in both modes; 0 once it was dropped",
           (0.0, MAX_PAYLOAD), "kg"),
     Param("payload.cog", [0.0] * 3, "its centre of gravity in frame 4: from the end of link 4, along x_4, y_4, z_4",
-          (-MAX_REACH, MAX_REACH), "m"),
-    param_of(Settings, "max_effort"),
+          (-MAX_REACH, MAX_REACH), "m", vector=True),
+    replace(param_of(Settings, "max_effort"), bounds=(0.0, MAX_EFFORT)),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "inertial"),
     param_of(Settings, "shoulder_from_imu"),
@@ -189,11 +224,18 @@ COMMAND_PARAMETERS = (
 )
 # What is declared where a file gives one of them, as `calibrate` writes them.
 MODEL_PARAMETERS = tuple(replace(param, name=f"model_error.{param.name}") for param in params_of(ModelError))
-# What the law `urdf` adds.
+# What an arm from a URDF has in place of PAPER: the first also in `simulator`.
+URDF_FILE = Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True)
+URDF_HAND = Param("urdf.hand", "", "link of the URDF that holds the load; empty: there is no load, nor a wearer on the "
+                  "last link", fixed=True)
 URDF = (
-    Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True),
+    URDF_FILE,
     Param("urdf.topic", "/robot_description", "latched topic of the URDF, a std_msgs/String", fixed=True),
+    URDF_HAND,
+    Param("wearer.links", list(PAPER_LINKS), "which links carry the upper arm, and forearm and hand, from 1 on; 0: the "
+          "robot does not carry it", (0, MAX_JOINTS), vector=True, fixed=True),
 )
+PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis"}
 # fmt: on
 
 
@@ -203,28 +245,22 @@ def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSAT
     return (*table, *itertools.chain(*groups))
 
 
-def urdf_table(count: int, given: Collection[str]) -> tuple[Param, ...]:
-    """Return the parameters of `compensator` for the law `urdf`, `count` joints and a file with the names `given`."""
-    other = {
+def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
+    """Return the parameters of `compensator` for an arm from a URDF and the parameters `given`."""
+    count = joint_count(given)
+    changes: dict[str, dict[str, Any]] = {
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
                 "description": "urdf computes the torque of any serial arm from its URDF"},
-        "joint_names": {"default": [f"joint{n + 1}" for n in range(count)],
-                        "description": "in the order of the commands; the URDF's other joints are taken as fixed at 0"},
-        "gain": {"default": [1.0] * count, "description": "scales the torque of each joint"},
-        "gravity": {},
-        "max_effort": {"default": [0.0] * count, "bounds": (0.0, MAX_EFFORT),
+        "joint_names": {"vector": False,
+                        "description": "in the order of the commands; other joints: from the joint states, or at 0"},
+        "max_effort": {"default": [0.0] * count, "bounds": (0.0, LARGEST_EFFORT),
                        "description": "torque limit per joint; 0: the URDF's"},
-        "max_effort_rate": {},
+        "spring.pose": {"default": [0.0] * count},
+        "payload.cog": {"description": "its centre of gravity in the frame of the link urdf.hand"},
         "use_imu": {"description": "false assumes that the root link's z axis points up"},
-        "tilt_timeout": {},
-        "thread_priority": {},
     }  # fmt: skip
-    shared = [
-        replace(param, **other[param.name])  # type: ignore[arg-type]
-        for param in COMPENSATOR
-        if param.name in other
-    ]
-    return compensator_table(given, (*shared, *URDF))
+    shared = [replace(param, **changes.get(param.name, {})) for param in COMPENSATOR if param.name not in PAPER]
+    return tuple(table_for(compensator_table(given, (*shared, *URDF)), given))
 
 
 def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = None) -> Settings:
@@ -237,33 +273,43 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         anfis = AnfisLaw.load(read(path)) if path and read else None
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    mass, cog = wearer_of(values)
+    by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
+    return _settings_of(values, values["side"], robot_of(values), wearer_of(values), anfis=anfis, robot_by_mass=by_mass)
+
+
+def urdf_settings_of(values: Mapping[str, Any], robot: UrdfModel) -> Settings:
+    """Return the settings that parameter values describe for an arm from a URDF, or raise ParameterError."""
+    limits = []
+    for name, given, own in zip(values["joint_names"], values["max_effort"], robot.max_effort, strict=True):
+        if not (given or own):
+            raise ParameterError(
+                f"max_effort of {name}", given, "greater than 0, because the URDF has no usable effort limit"
+            )
+        limits.append(given or own)
+    values = {**values, "max_effort": tuple(limits)}
+    wearer = wearer_of(values, robot.length, values["wearer.links"])
+    return _settings_of(values, "left", robot.scaled(values["gain"], values["gravity"]), wearer)
+
+
+def _settings_of(
+    values: Mapping[str, Any], side: str, robot: Arm, wearer: tuple[Sequence[float], Sequence[float]], **own: Any
+) -> Settings:
+    mass, cog = wearer
+    errors = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
+    sized = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
     return Settings(
-        side=values["side"],
-        robot=robot_of(values),
+        side=side,
+        robot=robot,
         wearer_mass=mass,
         wearer_cog=cog,
         use_imu=values["use_imu"],
-        anfis=anfis,
         terms=term_settings_of(values),
-        model_error=ModelError(*(values.get(param.name, param.default) for param in MODEL_PARAMETERS)),
-        robot_by_mass=ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"]),
+        model_error=ModelError(*sized),
         payload_mass=values["payload.mass"],
         payload_cog=tuple(values["payload.cog"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
+        **own,
     )
-
-
-def urdf_settings_of(values: Mapping[str, Any], model: GravityModel) -> Settings:
-    """Return the settings that parameter values describe for the arm `model`, or raise ParameterError."""
-    limits = []
-    for name, given, own in zip(values["joint_names"], values["max_effort"], model.max_effort, strict=True):
-        if not (given or own):
-            raise ParameterError(f"max_effort of {name}", given, "greater than 0, because the URDF has no effort limit")
-        limits.append(given or own)
-    law = UrdfLaw(model, values["gain"], values["gravity"])
-    others = {name: values[name] for name in ("max_effort_rate", "tilt_timeout", "use_imu")}
-    return Settings("left", None, URDF_LAW, urdf=law, max_effort=tuple(limits), **others)
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
@@ -276,11 +322,16 @@ def robot_of(values: Mapping[str, Any]) -> ArmModel:
         return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, across)
 
 
-def wearer_of(values: Mapping[str, Any]) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mass and centre of gravity (4,) of the wearer on each link; explicit values override the table's."""
+def wearer_of(
+    values: Mapping[str, Any], length: Vector | None = None, links: Sequence[int] = PAPER_LINKS
+) -> tuple[Sequence[float], Sequence[float]]:
+    """Return mass and centre of gravity (n,) of the wearer on each link; explicit values override the table's.
+
+    length: of the links, (n,) m; None: `link_length`. links: as in `Wearer.on_links`.
+    """
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
     with named("wearer."):
-        load = Wearer(**person).on_links(values["link_length"])
+        load = Wearer(**person).on_links(values["link_length"] if length is None else length, links)
     return load.mass.tolist(), load.cog.tolist()

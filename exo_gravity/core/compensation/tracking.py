@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.numbers import Vector
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ MOTION, TRACKER = MotionTuning(), TrackerTuning()
 class Observation(NamedTuple):
     """One pose, passed in both directions of motion."""
 
-    theta: Vector  #: (4,) rad
+    theta: Vector  #: (n,) rad
     direction: Vector  #: (3,), gravity's unit vector in the base frame
-    effort: Vector  #: (4,) Nm as commanded, mean of both directions
-    friction: Vector  #: (4,) Nm, half of their difference
-    spread: Vector  #: (4,) Nm, standard error of `effort`
+    effort: Vector  #: (n,) Nm as commanded, mean of both directions
+    friction: Vector  #: (n,) Nm, half of their difference
+    spread: Vector  #: (n,) Nm, standard error of `effort`
     load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
     load_lever: float = 0.0  #: m, its distance from the elbow
-    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (4,)
+    speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (n,)
 
 
 class Sweep(NamedTuple):
@@ -83,19 +83,19 @@ class Sweep(NamedTuple):
 class Station(NamedTuple):
     """A pose that is measured while all joints sweep through it `cycles` times, there and back."""
 
-    theta: tuple[float, ...]  #: (4,) rad
+    theta: tuple[float, ...]  #: (n,) rad
     speed: float = 0.1  #: rad/s, of the sweep
     amplitude: float = MOTION.amplitude  #: rad, on each side of the pose
     cycles: int = 2
 
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the sweep begins and where it turns back, (4,) rad each."""
+        """Where the sweep begins and where it turns back, (n,) rad each."""
         return np.array(self.theta) - self.amplitude, np.array(self.theta) + self.amplitude
 
 
 class Line:
-    """The motion from `start` to `end`, (4,) rad; the joint with the longest way turns at `speed` rad/s at most.
+    """The motion from `start` to `end`, (n,) rad; the joint with the longest way turns at `speed` rad/s at most.
 
     duration: s.
     """
@@ -110,7 +110,7 @@ class Line:
         self.duration = self._length / self._speed + self._ramp if self._length else 0.0
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return position (4,) rad and velocity (4,) rad/s at `time` s after the start."""
+        """Return position (n,) rad and velocity (n,) rad/s at `time` s after the start."""
         time = min(max(time, 0.0), self.duration)
         rising, falling = min(time, self._ramp), max(0.0, time - self.duration + self._ramp)
         travelled = MOTION.acceleration * (rising**2 - falling**2) / 2 + self._speed * (time - rising)
@@ -123,12 +123,13 @@ class Line:
 
 
 def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
-    """Return what `sweeps` show at a pose, and the largest change (4,) in Nm of the effort from one cycle to another.
+    """Return what `sweeps` show at a pose, and the largest change (n,) in Nm of the effort from one cycle to another.
 
     They alternate between there and back. What is expected at an angle should be subtracted from the effort: the rest
     does not change along a sweep (gravity does, and by up to 0.3 % more than in proportion).
     """
-    bins = np.zeros((len(sweeps), MOTION.bins, JOINT_COUNT))  # mean effort in order of the angle
+    count = sweeps[0].effort.shape[-1]
+    bins = np.zeros((len(sweeps), MOTION.bins, count))  # mean effort in order of the angle
     for number, sweep in enumerate(sweeps):
         effort = sweep.effort[::-1] if number % 2 else sweep.effort
         bins[number] = [part.mean(axis=0) for part in np.array_split(effort, MOTION.bins)]
@@ -136,7 +137,7 @@ def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
     gravity = (there + back) / 2.0
     cycles = gravity.mean(axis=1)
     friction = (there - back).mean(axis=(0, 1)) / 2.0
-    scatter = gravity.reshape(-1, JOINT_COUNT).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
+    scatter = gravity.reshape(-1, count).std(axis=0, ddof=1) / np.sqrt(max(1.0, gravity[..., 0].size / 2.0))
     theta = np.mean([sweep.position.mean(axis=0) for sweep in sweeps], axis=0)
     direction = mean_direction(np.concatenate([sweep.direction for sweep in sweeps]))
     seen = Observation(theta, direction, cycles.mean(axis=0), friction, np.hypot(scatter, MOTION.resolution))
@@ -150,30 +151,31 @@ def mean_direction(directions: np.ndarray) -> np.ndarray:
 
 
 def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
-    """Return the share (4,) of the measured way that each joint went in every one of `sweeps` through `station`."""
+    """Return the share (n,) of the measured way that each joint went in every one of `sweeps` through `station`."""
     ways = np.min([np.abs(sweep.position[-1] - sweep.position[0]) for sweep in sweeps], axis=0)
     return np.asarray(ways / (2.0 * MOTION.window * station.amplitude))
 
 
 class Tracker:
-    """Moves the four joints along lines, one after the other, and takes the samples of sweeps.
+    """Moves all joints along lines, one after the other, and takes the samples of sweeps.
 
-    rate: control cycles per s. max_effort: (4,) Nm. lines: to follow, each taken when it begins; the owner sets them
-    before the first step. friction: (4,) Nm, compensated in the direction of motion, as far as the owner knows it.
-    saturated: (4,) s for which each joint has wanted more than its `max_effort`. error: (4,) rad by which the arm is
-    behind its path. correction: (4,) Nm, what the controller added to gravity and friction in the last step.
+    rate: control cycles per s. max_effort: (n,) Nm. lines: to follow, each taken when it begins; the owner sets them
+    before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
+    saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
+    behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
-        self.friction = np.full(JOINT_COUNT, TRACKER.usual_friction)
-        self.saturated = np.zeros(JOINT_COUNT)
-        self.error = np.zeros(JOINT_COUNT)
-        self.correction = np.zeros(JOINT_COUNT)
+        count = len(max_effort)
+        self.friction = np.full(count, TRACKER.usual_friction)
+        self.saturated = np.zeros(count)
+        self.error = np.zeros(count)
+        self.correction = np.zeros(count)
         self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
         self._max_effort = np.array(max_effort)
-        self._integral = np.zeros(JOINT_COUNT)
-        self._slide = np.zeros(JOINT_COUNT)  # Nm that compensate friction
-        self._effort: Torque = (0.0,) * JOINT_COUNT
+        self._integral = np.zeros(count)
+        self._slide = np.zeros(count)  # Nm that compensate friction
+        self._effort: Torque = (0.0,) * count
         self.lines: Iterator[Line] = iter(())
         self._line = Line(self.error, self.error)
         self._time = math.inf  # s, on the present line; it is over
@@ -190,15 +192,15 @@ class Tracker:
         return sweeps
 
     def shift(self, change: np.ndarray) -> None:
-        """Take over a `change` (4,) Nm of the expected torque, so that the effort does not step."""
+        """Take over a `change` (n,) Nm of the expected torque, so that the effort does not step."""
         self._integral -= change
 
     def step(
         self, dt: float, position: Vector, velocity: Vector, expected: Torque, direction: Vector, matrix: np.ndarray
     ) -> Torque:
-        """Return the effort (4,) in Nm, `dt` s after the last one.
+        """Return the effort (n,) in Nm, `dt` s after the last one.
 
-        position, velocity: (4,), rad and rad/s. expected: (4,) Nm, gravity's torque. direction: (3,), of gravity, for
+        position, velocity: (n,), rad and rad/s. expected: (n,) Nm, gravity's torque. direction: (3,), of gravity, for
         the samples. matrix: (4, 4) kg m^2, the approximate mass matrix.
         """
         if self._time > self._line.duration:
@@ -215,11 +217,11 @@ class Tracker:
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
         self._compensate_friction(dt, coming, speed_error)
-        self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(JOINT_COUNT))
+        self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
-        """Compensate friction by and by towards `heading` (4,) rad/s, and no further in a joint that is ahead."""
+        """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
         most, way = TRACKER.friction_rate * self.friction * dt, np.sign(heading)
         wanted = self.friction * np.clip(heading / TRACKER.full_friction_speed, -1.0, 1.0)
         change = np.clip(wanted - self._slide, -most, most)

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_PAYLOAD, ArmModel
-from exo_gravity.core.arm.gravity import Torque, exact_torque
-from exo_gravity.core.arm.kinematics import links_of
+from exo_gravity.core.arm.arm import MAX_PAYLOAD
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
@@ -53,7 +52,7 @@ WEIGHING = WeighingTuning()
 
 
 class Weighed(NamedTuple):
-    """A result: the mass in kg, what is random of its standard deviation, and dz/dq, (4,) m."""
+    """A result: the mass in kg, what is random of its standard deviation, and dz/dq, (n,) m."""
 
     mass: float
     deviation: float
@@ -71,13 +70,15 @@ def refusal(s: Settings, terms: Sequence[str], rate: float) -> Reason:
     if rate < WEIGHING.least_rate:
         slow = f"joint states come at {rate:.0f} Hz, must be {WEIGHING.least_rate:g} or more"
         return Reason(WeighingRefused.SLOW, slow)
+    if not s.robot.has_hand:
+        return Reason(WeighingRefused.NO_HAND, "urdf.hand does not say which link holds a load")
     return NO_REASON
 
 
 class Weighing:
     """One weighing, from the first call of `torque` on.
 
-    names: of the joints (4,). rate: of the calls, Hz. empty: result of the empty hand, if known.
+    names: of the joints (n,). rate: of the calls, Hz. empty: result of the empty hand, if known.
     result: None while there is none. trouble: why there is none. elapsed: s since it began.
     """
 
@@ -157,9 +158,9 @@ class Weighing:
     def torque(
         self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
     ) -> Torque:
-        """Return `torque` (4,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over."""
+        """Return `torque` (n,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over."""
         if self._matrix is None:
-            self._matrix, dt = links_of(self._settings.moving).matrix(theta), 0.0
+            self._matrix, dt = self._settings.moving.links.matrix(theta), 0.0
             self._begin(theta, velocity, tilt)
         if self.is_over:
             return torque
@@ -178,7 +179,7 @@ class Weighing:
         and of the whole model with it.
         """
         s, error, gravity = self._settings, self._settings.model_error, self._settings.arm.gravity
-        self._lever = np.array(exact_torque(s.unit_load, theta, tilt))  # dz/dq, m
+        self._lever = np.array(s.unit_load.torque(theta, tilt))  # dz/dq, m
         fastest = max(map(abs, velocity))
         if np.linalg.norm(self._lever) < WEIGHING.least_lever:
             pose = "bend the elbow to a right angle, or raise the arm to the side"
@@ -187,9 +188,9 @@ class Weighing:
             return
         if fastest > WEIGHING.start_speed:
             self.trouble = Reason(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
-        wearer = ArmModel(s.arm.length, s.wearer_cog, s.wearer_mass, gravity=gravity)
-        self._worn = np.array(exact_torque(wearer, theta, tilt))  # Nm
-        by_tilt = np.array([exact_torque(s.arm, theta, axis) for axis in AXES]).T  # (4, 3) Nm/rad
+        wearer = s.robot.massless(gravity).with_wearer(s.wearer_mass, s.wearer_cog)
+        self._worn = np.array(wearer.torque(theta, tilt))  # Nm
+        by_tilt = np.array([s.arm.torque(theta, axis) for axis in AXES]).T  # (n, 3) Nm/rad
         covariance = np.diag(np.hypot(error.torque, WEIGHING.least_error) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T
         weight = np.linalg.solve(covariance, self._lever)
         self._weight = weight / (weight @ self._lever)  # 1/m
@@ -240,7 +241,7 @@ class Weighing:
         return bool(self.trouble)
 
     def _finish(self, sweeps: Sequence[Sweep], shares: np.ndarray) -> None:
-        """Fit the mass to the sweeps, of whose way each joint must have followed MOTION.followed; shares: (4,)."""
+        """Fit the mass to the sweeps, of whose way each joint must have followed MOTION.followed; shares: (n,)."""
         seen, unrest = average(sweeps)
         error, weight, gravity = self._settings.model_error, self._weight, self._settings.arm.gravity
         scale = self._settings.arm.gain * gravity

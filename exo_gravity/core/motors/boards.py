@@ -1,15 +1,17 @@
 """What keeps the boards of an arm's motors from serving it, as far as their frames show it.
 
 A board that is set up otherwise than its parameters say is silent, or reports too seldom: without its own sentence, a
-start would wait for "no reply". A motor whose temperature has another offset than we assume heats unseen.
+start would wait for "no reply". Boards that can be asked for their settings are asked, while their motors are off: a
+start waits until each setting is known to be as the parameters say. A motor whose temperature has another offset than
+we assume heats unseen.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.motors.frames import ELSEWHERE, MALFORMED, Frame
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, JointMotor, JointSample
-from exo_gravity.core.motors.wire_formats import MALFORMED
 
 
 @dataclass(frozen=True)
@@ -20,6 +22,10 @@ class BoardCheck:
     recent: float = 1.0  #: s for which a malformed frame counts as the reason for a missing reply
     window: float = 0.5  #: s over which status frames are counted, so that a start knows before its calm second is over
     share: float = 0.9  #: of the control rate that status frames must reach: the rest is jitter of that count
+    #: s after which a board is asked for a setting again, and s for which its answer counts; a start takes 1 s at
+    #: least: a board that has restarted, or was written to by a tool, is found out before
+    ask_again: float = 0.5
+    valid: float = 1.0
     restart: float = 2.0  #: s without a reply after which a motor may have been switched off and on
     coldest: int = 5  #: degC that a motor in a room reads at least when it is switched on,
     hottest: int = 60  #: and at most; one that is warmer may have worked before, unless the others are cold
@@ -42,6 +48,9 @@ class Boards:
         self._count = [0] * len(motors)
         self._rate = [math.inf] * len(motors)  # Hz of status frames, as counted last
         self._heard = [(-math.inf, "")] * len(motors)  # s, and what the motor sent that was no reply
+        # What each board has told of its settings, and when, by number.
+        self._settings: list[dict[int, tuple[float, float]]] = [{} for _ in motors]
+        self._asked = [0] * len(motors)  # questions so far
         self._started = math.inf  # s
 
     def take(self, joint: int, sample: JointSample) -> None:
@@ -55,13 +64,36 @@ class Boards:
         if (elapsed := now - self._since[joint]) >= CHECK.window:
             self._rate[joint], self._since[joint], self._count[joint] = self._count[joint] / elapsed, now, 0
 
-    def heard(self, joint: int, kind: str, data: bytes, now: float) -> None:
-        """Take a frame of the motor of `joint` that is not its reply: MALFORMED or SERVO, at `now` s."""
-        motor = self._motors[joint]
+    def question(self, joint: int, now: float) -> tuple[Frame, ...]:
+        """Return what the board of `joint` is to be asked at `now` s; nothing if it has just told all its settings."""
+        due = [
+            setting
+            for setting in self._motors[joint].settings
+            if now - self._told(joint, setting.number)[1] >= CHECK.ask_again
+        ]
+        if not due:
+            return ()
+        self._asked[joint] += 1
+        return (due[self._asked[joint] % len(due)].question,)
+
+    def told(self, joint: int, data: bytes, now: float) -> None:
+        """Take the answer of the board of `joint`, at `now` s."""
+        number, value = self._motors[joint].wire_format.unpack_setting(data)
+        self._settings[joint][number] = value, now
+
+    def _told(self, joint: int, number: int) -> tuple[float, float]:
+        """Return the value of a setting, and when the board told it: -inf for never."""
+        return self._settings[joint].get(number, (math.nan, -math.inf))
+
+    def heard(self, joint: int, kind: str, frame: Frame, now: float) -> None:
+        """Take a frame of the motor of `joint` that is not its reply: MALFORMED, SERVO or ELSEWHERE, at `now` s."""
+        motor, (frame_id, data) = self._motors[joint], frame
         if kind == MALFORMED:
             *most, last = map(str, motor.wire_format.reply_lengths)
             lengths = f"{', '.join(most)} or {last}" if most else last
             what = f"sent {len(data)} bytes [{data.hex(' ')}] as its reply: must be {lengths} bytes"
+        elif kind == ELSEWHERE:
+            what = f"replies with the ID {frame_id}: set master_id = {frame_id}, or {motor.reply_id} on the motor"
         else:
             what = (
                 "does not reply, but sends status frames: set it to MIT mode if it is a V1 or V2 board in servo mode; "
@@ -79,6 +111,8 @@ class Boards:
             heard, sentence = self._heard[joint]
             if heard > self._replied[joint] and now - heard < CHECK.recent:
                 return sentence
+            if now - self._replied[joint] < CHECK.recent and (wrong := self._wrong_setting(joint, now)):
+                return wrong
             if motor.wire_format.replies:
                 continue
             if now - max(self._started, self._replied[joint]) > CHECK.silence:
@@ -91,6 +125,19 @@ class Boards:
                     f"motor {motor.can_id} sends {self._rate[joint]:.0f} status frames a second, rate = {rate:g} needs "
                     f"at least that many: set {MAX_STATUS_RATE:g} on its board"
                 )
+        return ""
+
+    def _wrong_setting(self, joint: int, now: float) -> str:
+        """Return which setting of a board is not as it must be, or not known at `now` s; '' for none."""
+        motor = self._motors[joint]
+        for setting in motor.settings:
+            value, told = self._told(joint, setting.number)
+            if now - told > CHECK.valid:
+                return f"motor {motor.can_id} to tell its {setting.name}"
+            if not setting.low <= value <= setting.high:
+                name, right = f"{setting.name} (register {setting.number})", 0.5 * (setting.low + setting.high)
+                known = f", or {setting.parameter} {setting.unit * value:g} in the file" if setting.parameter else ""
+                return f"motor {motor.can_id} to be set right: its {name} is {value:g}, must be {right:g}{known}"
         return ""
 
     @property

@@ -4,36 +4,48 @@ A `JointMotor` translates a joint's effort and damping to the frames of its wire
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, WIRE_RANGE_BOUNDS, MotorSpec
-from exo_gravity.core.motors.wire_formats import FORMATS, MIT, Frame, WireFormat
-from exo_gravity.core.numbers import JOINT_COUNT, one_float
+from exo_gravity.core.motors.ak import MIT, USUAL_MOTORS
+from exo_gravity.core.motors.families import FORMATS, MOTORS, format_of
+from exo_gravity.core.motors.frames import EXTENDED, Frame, MotorSpec, Setting, WireFormat
+from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import Param
 from exo_gravity.core.vocabulary import Source
 
-# In the format `mit` the first byte of a reply is the motor's ID. The position of our commands is 0, unless they hold a
-# joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like replies.
+# In the format `mit` the first byte of an AK motor's reply is its ID. The position of our commands is 0, unless they
+# hold a joint (`MotorBus`), so their first byte is 0x7f or 0x80: with IDs below 0x7f their echoes cannot look like
+# replies.
 MAX_CAN_ID = 126
+MAX_MASTER_ID = 0x7FE
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
 # rad: 12.5 in the manual, 12.56 or 12.566 in firmware. Another one is a mistake that would scale every angle.
 POSITION_RANGE_BOUNDS = (12.4, 12.6)
+# By which factor a wire range of speed or torque may differ from the motor's usual one: firmware was met with 0.45 of
+# it and with 1.4; a slip of the decimal point is refused.
+WIRE_RANGE_FACTOR = 3.0
 TORQUE_PER_AMPERE_BOUNDS = (0.02, 5.0)  # Nm/A at the output
 # s without a command after which a motor lets go. A shorter one fires in an ordinary stall of the computer, and drops
 # the arm without damping; a longer one leaves a motor pushing after its host has died.
 TIMEOUT_BOUNDS = (0.15, 0.5)
 OPTIONS = "can.options"  # parameters below this prefix go to python-can unchanged
-BITRATE = 1_000_000  # bit/s, of AK motors as delivered
+BITRATE = 1_000_000  # bit/s, of AK and Damiao motors as delivered
+DATA_BITRATE = 5_000_000  # bit/s, of the data of CAN FD frames, as Damiao motors and OpenArm's documents have it
+MAX_DATA_BITRATE = 8_000_000  # bit/s, of CAN FD
 # Status frames a second that are to be set on V3 boards: the most they can send, because each cycle waits for one; on a
-# slow bus fewer, or four boards would fill it.
+# slow bus fewer, or the paper's four boards would fill it.
 MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
 SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
-# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one.
-NEED_BITRATE = ("cantact", "gs_usb", "ixxat", "kvaser", "pcan", "slcan", "usb2can", "vector")
+# python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one, or at the one
+# that their adapter had last. test/hardware/test_bit_rates.py compares them with python-can's sources.
+NEED_BITRATE = (
+    "canalystii", "cantact", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi", "nican", "nixnet", "pcan",
+    "robotell", "seeedstudio", "slcan", "systec", "usb2can", "vector",
+)  # fmt: skip
 
 
 class JointSample(NamedTuple):
@@ -43,8 +55,10 @@ class JointSample(NamedTuple):
     velocity: float  #: rad/s
     effort: float  #: Nm
     temperature: int | None  #: degC, None if the firmware reports none
-    error: int | None  #: a code of MOTOR_ERRORS, None if the firmware reports none
+    error: int | None  #: the board's code of an error, 0 for none; None if the firmware reports none
     time: float  #: s on the clock of the bus, when the frame arrived
+    on: bool | None = None  #: whether the motor is on; None from boards that do not say
+    trouble: str = ""  #: what an error means, or why the motor has switched itself off
 
 
 UNKNOWN = JointSample(math.nan, math.nan, math.nan, None, None, -math.inf)  # before the first frame
@@ -61,7 +75,10 @@ class JointMotor:
     torque_scale: float = 1.0  #: real output torque per commanded Nm (users report 0.75 for one AK80-9)
     wire_format: WireFormat = MIT  #: of the motor's board
     timeout: float = 0.0  #: s without a command after which the firmware lets go; 0: never
+    master_id: int = 0  #: arbitration ID of replies, where it can be chosen; 0: the usual one
     command_id: int = field(init=False)  #: the arbitration ID of commands
+    reply_id: int = field(init=False)  #: the arbitration ID of replies or status frames
+    settings: Sequence[Setting] = field(init=False)  #: that the board must have
     #: the frames that switch the motor on, before its next command; that switch it off; and that make its present angle
     #: zero, none if its board has no such frame
     enter: tuple[Frame, ...] = field(init=False)
@@ -75,8 +92,11 @@ class JointMotor:
     peak_damping: float = field(init=False)  #: Nm s/rad at the joint, the most that a command can ask for
 
     def __post_init__(self) -> None:
-        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= MAX_CAN_ID:
-            raise ParameterError("can_id", self.can_id, f"a whole number from 1 to {MAX_CAN_ID}")
+        if (family := self.wire_format.family) != self.spec.family:
+            raise ParameterError("wire_format", self.wire_format.name, f"that of a {self.spec.name}, not of {family}")
+        last = self.wire_format.last_id
+        if not isinstance(self.can_id, int) or not 1 <= self.can_id <= last:
+            raise ParameterError("can_id", self.can_id, f"a whole number from 1 to {last} for a {self.spec.name}")
         if self.direction not in (1, -1):
             raise ParameterError("direction", self.direction, "1 or -1")
         limit = self.spec.position_range - math.pi
@@ -84,15 +104,17 @@ class JointMotor:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
         shortest, longest = TIMEOUT_BOUNDS
-        if self.timeout != 0.0 and not shortest <= self.timeout <= longest:
-            expected = (
-                f"0 (never) or from {shortest:g} to {longest:g} s: set it in the motor's firmware (docs/wiring.md)"
-            )
-            raise ParameterError("motor_timeout", self.timeout, expected)
         spec, board = self.spec, self.wire_format
+        if (self.timeout or board.needs_timeout) and not shortest <= self.timeout <= longest:
+            never = "" if board.needs_timeout else "0 (never) or "
+            expected = f"{never}from {shortest:g} to {longest:g} s: set it in the motor's firmware (docs/wiring.md)"
+            raise ParameterError("motor_timeout", self.timeout, expected)
+        reply_id = board.reply_id(self.can_id, self.master_id)
         frames = {"enter": board.on, "exit": board.off, "set_zero": board.zero}
         derived: dict[str, object] = {
             "command_id": board.first_id + self.can_id,
+            "reply_id": reply_id,
+            "settings": tuple(board.settings(spec, self.can_id, reply_id, self.timeout)),
             **{name: tuple((first + self.can_id, data) for first, data in own) for name, own in frames.items()},
             "rated_effort": spec.rated_torque * min(1.0, self.torque_scale),
             "peak_effort": min(spec.peak_torque, spec.torque_range) * self.torque_scale,
@@ -122,17 +144,22 @@ class JointMotor:
 
     def sample(self, data: bytes | bytearray, time: float) -> JointSample:
         """Return what a reply or status frame that arrived at `time` s says of the joint. Raises FrameError."""
-        _, position, velocity, torque, temperature, error = self.wire_format.unpack_reply(self.spec, self.can_id, data)
+        board = self.wire_format
+        _, position, velocity, torque, temperature, error, on = board.unpack_reply(self.spec, self.can_id, data)
         sign = self.direction
         effort = sign * torque * self.torque_scale
-        return JointSample(sign * (position - self.zero), sign * velocity, effort, temperature, error, time)
+        trouble = board.error_text(error) if error else ""
+        if error in board.let_go:
+            error = 0
+        angle, speed = sign * (position - self.zero), sign * velocity
+        return JointSample(angle, speed, effort, temperature, error, time, on, trouble)
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
 
 
-LARGEST_ZERO = max(spec.position_range for spec in MOTORS.values())  # rad; `JointMotor` has the limit of each motor
+LARGEST_ZERO = POSITION_RANGE_BOUNDS[1]  # rad; `JointMotor` has the limit of each motor
 SIMULATED_BUSES = ("udp_multicast", "virtual")  # interfaces of python-can that lead to no motor
 VIRTUAL_CAN = "vcan"  # begins Linux's names of CAN interfaces without an adapter: only programs are behind one
 
@@ -142,24 +169,26 @@ MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
     Param("can.channel", "", "python-can channel, e.g. can0; with two buses one per motor, e.g. can0,can0,can1,can1",
           fixed=True, required=True),
-    Param("motor", list(USUAL_MOTORS), "motor types", choices=tuple(MOTORS), fixed=True),
+    Param("motor", list(USUAL_MOTORS), "motor types", choices=MOTORS, fixed=True),
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
     Param("direction", [1, 1, 1, 1], "1 or -1: joint angle = direction * (motor angle - zero)", (-1, 1), fixed=True),
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
           fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
-    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit for V1 and V2, mit_v3 for V3",
-          choices=tuple(FORMATS), fixed=True),
+    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit_v3 for V3 boards of AK motors, mit for "
+          "others", choices=FORMATS, fixed=True),
+    Param("master_id", [0] * 4, "CAN ID of a Damiao motor's replies; 0: its can_id + 16", (0, MAX_MASTER_ID),
+          fixed=True),
     Param("position_range", [0.0] * 4, "position range of the firmware's wire format; 0: the usual one of the motor",
           (0.0, POSITION_RANGE_BOUNDS[1]), "rad", fixed=True),
     Param("velocity_range", [0.0] * 4, "velocity range of the firmware's wire format; 0: the usual one of the motor",
-          (0.0, WIRE_RANGE_BOUNDS[1]), "rad/s", fixed=True),
+          unit="rad/s", fixed=True),
     Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
-          (0.0, WIRE_RANGE_BOUNDS[1]), "Nm", fixed=True),
+          unit="Nm", fixed=True),
     Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one of the "
           "motor", (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
-    Param("motor_timeout", [0.0] * 4, "time without a command after which the firmware lets go, 0.15 to 0.5; 0: never",
-          unit="s", fixed=True),
+    Param("motor_timeout", [0.0] * 4, "time without a command after which the firmware lets go, 0.15 to 0.5; 0: never, "
+          "not for Damiao", unit="s", fixed=True),
 )
 # fmt: on
 # Of parameters whose bounds begin at 0, which stands for the usual value: those of any other value.
@@ -168,41 +197,46 @@ _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param
 
 
 def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
-    """Return the four motors that parameter values describe, or raise ParameterError."""
+    """Return the motors that parameter values describe, one per joint, or raise ParameterError."""
     ids = values["can_id"]
     if len(set(ids)) != len(ids):
-        raise ParameterError("can_id", ids, "4 different IDs")
-    return tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
+        raise ParameterError("can_id", ids, f"{len(ids)} different IDs")
+    motors = tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
+    for motor in motors:
+        if motor.reply_id != motor.command_id and motor.reply_id < EXTENDED and motor.reply_id & 0xFF in ids:
+            expected = f"without the last two hexadecimal digits of a can_id, {ids}: that motor would obey the replies"
+            raise ParameterError("master_id", motor.master_id, expected)
+    return motors
 
 
-def channels_of(channel: str) -> list[str]:
-    """Return the channel of each motor (4,) that the value of `can.channel` names. Raises ParameterError."""
+def channels_of(channel: str, count: int) -> list[str]:
+    """Return the channel of each of `count` motors that the value of `can.channel` names. Raises ParameterError."""
     names = [name.strip() for name in channel.split(",")]
-    if len(names) not in (1, JOINT_COUNT) or not all(names):
-        expected = f"one channel for all motors, or {JOINT_COUNT} with commas between them, one for each motor"
+    if len(names) not in (1, count) or not all(names):
+        expected = f"one channel for all motors, or {count} with commas between them, one for each motor"
         raise ParameterError("can.channel", channel, expected)
-    return names * (JOINT_COUNT // len(names))
+    return names * (count // len(names))
 
 
 def source_of_bus(interface: str, channel: str) -> Source:
     """Return whether the motors on a bus are real: the values of `can.interface` and `can.channel`."""
     if interface in SIMULATED_BUSES:
         return Source.SIMULATED
-    is_virtual = any(name.startswith(VIRTUAL_CAN) for name in channels_of(channel))
+    is_virtual = any(name.strip().startswith(VIRTUAL_CAN) for name in channel.split(","))
     return Source.UNKNOWN if is_virtual else Source.REAL
 
 
-def buses_of(channel: str, options: Mapping[str, Any]) -> dict[str, tuple[list[int], dict[str, Any]]]:
-    """Return the motors (0..3) on each bus, by its channel, and its options for python-can. Raises ParameterError.
+def buses_of(channel: str, options: Mapping[str, Any], count: int) -> dict[str, tuple[list[int], dict[str, Any]]]:
+    """Return which of `count` motors, from 0 on, are on each bus, by its channel, and its options for python-can.
 
-    An option that is a list has an entry for each motor.
+    An option that is a list has an entry for each motor. Raises ParameterError.
     """
     buses: dict[str, tuple[list[int], dict[str, Any]]] = {}
-    for joint, name in enumerate(channels_of(channel)):
+    for joint, name in enumerate(channels_of(channel, count)):
         own = {}
         for key, value in options.items():
-            if isinstance(value, list) and len(value) != JOINT_COUNT:
-                raise ParameterError(f"{OPTIONS}.{key}", value, f"one value, or {JOINT_COUNT}, one for each motor")
+            if isinstance(value, list) and len(value) != count:
+                raise ParameterError(f"{OPTIONS}.{key}", value, f"one value, or {count}, one for each motor")
             own[key] = value[joint] if isinstance(value, list) else value
         motors, first = buses.setdefault(name, ([], own))
         if own != first:
@@ -216,12 +250,16 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
 
     A range that is usual on V1 and V2 boards is refused for another: it would scale every torque without an error.
     """
-    plain, board = MOTORS[given["motor"]], FORMATS[given["wire_format"]]
+    plain, board = MOTORS[given["motor"]], format_of(given["motor"], given["wire_format"])
     usual = board.ranged(plain)
     for name in ("velocity_range", "torque_range"):
         own = getattr(usual, name)
         if given[name] == getattr(plain, name) != own:
             raise ParameterError(name, given[name], f"{own:g} or 0 for an {plain.name} with wire_format = {board.name}")
+        low, high = own / WIRE_RANGE_FACTOR, own * WIRE_RANGE_FACTOR
+        if given[name] and not low <= given[name] <= high:
+            expected = f"0, the usual one, or from {low:g} to {high:g} for motor = {plain.name}"
+            raise ParameterError(name, given[name], expected)
     if given["torque_per_ampere"] and board.replies:
         expected = f"0 with wire_format = {board.name}, whose replies carry the torque itself"
         raise ParameterError("torque_per_ampere", given["torque_per_ampere"], expected)
@@ -231,7 +269,7 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     names = "position_range", "velocity_range", "torque_range", "torque_per_ampere"
     spec = replace(usual, **{name: given[name] for name in names if given[name]})
     mounting = given["can_id"], given["direction"], given["zero"], given["torque_scale"]
-    return JointMotor(spec, *mounting, board, given["motor_timeout"])
+    return JointMotor(spec, *mounting, board, given["motor_timeout"], given["master_id"])
 
 
 class FrameBits(NamedTuple):
@@ -243,6 +281,9 @@ class FrameBits(NamedTuple):
 
 COMMAND_BITS, REPLY_BITS = FrameBits(124, 135), FrameBits(118, 135)  # of V1 and V2 boards
 V3_COMMAND_BITS, STATUS_BITS = FrameBits(146, 160), FrameBits(141, 160)
+# Of CAN FD frames with 11-bit IDs and 8 bytes: at the bit rate of arbitration, and at that of data.
+FD_BITS = FrameBits(32, 34)
+FD_COMMAND_BITS, FD_REPLY_BITS = FrameBits(106, 113), FrameBits(99, 113)
 
 
 @dataclass(frozen=True)
@@ -254,15 +295,23 @@ class Traffic:
     data (ISO 11898-1), 34 + 8 n bits are subject to stuffing, with a 29-bit ID 20 more, and 13 are not. It has at most
     (34 + 8 n - 1) // 4 stuff bits (Davis et al. 2007, "Controller Area Network schedulability analysis", eq. 1). The
     actual number depends on the bytes (test/core/test_bus_load.py).
+
+    Of a CAN FD frame with 8 bytes, 17 bits before the data and 13 after them have the bit rate of arbitration, and 96
+    that of data, of which 69 are subject to stuffing (ISO 11898-1:2015: a stuff count, 17 bits of CRC, 6 fixed stuff
+    bits).
     """
 
     replying: int  #: motors of V1 and V2 boards
     reporting: int = 0  #: motors of V3 boards
     bitrate: int = BITRATE  #: bit/s
+    data_bitrate: int = 0  #: bit/s, of the data of CAN FD frames; 0: frames of classic CAN
 
     def __post_init__(self) -> None:
         if not isinstance(self.bitrate, int) or not 10_000 <= self.bitrate <= 1_000_000:
             raise ParameterError("can.options.bitrate", self.bitrate, "a whole number from 10000 to 1000000 bit/s")
+        if self.data_bitrate and not self.bitrate <= self.data_bitrate <= MAX_DATA_BITRATE:
+            expected = f"a whole number from {self.bitrate}, the bit rate, to {MAX_DATA_BITRATE} bit/s"
+            raise ParameterError("can.options.data_bitrate", self.data_bitrate, expected)
 
     @property
     def status_rate(self) -> float:
@@ -271,10 +320,13 @@ class Traffic:
 
     def load(self, rate: float, worst: bool = False) -> float:
         """Return the share of the bus that `rate` cycles a second take, for typical or for `worst` stuffing."""
-        kinds = COMMAND_BITS, REPLY_BITS, V3_COMMAND_BITS, STATUS_BITS
-        command, reply, v3_command, status = (bits.most if worst else bits.typical for bits in kinds)
-        cycle = self.replying * (command + reply) + self.reporting * v3_command
-        return (rate * cycle + self.reporting * self.status_rate * status) / self.bitrate
+        kinds = COMMAND_BITS, REPLY_BITS, V3_COMMAND_BITS, STATUS_BITS, FD_BITS, FD_COMMAND_BITS, FD_REPLY_BITS
+        command, reply, v3_command, status, *fd = (bits.most if worst else bits.typical for bits in kinds)
+        exchange = (command + reply) / self.bitrate  # s
+        if self.data_bitrate:
+            exchange = 2.0 * fd[0] / self.bitrate + (fd[1] + fd[2]) / self.data_bitrate
+        reports = self.reporting * (rate * v3_command + self.status_rate * status) / self.bitrate
+        return rate * self.replying * exchange + reports
 
     @property
     def largest_rate(self) -> float:
@@ -291,22 +343,33 @@ class Traffic:
         if (share := self.load(rate)) > 1.0:
             motors, capacity = self.replying + self.reporting, self.bitrate / 1000.0
             fits = f"at most {int(self.largest_rate)} Hz, the capacity of the CAN bus"
-            raise ParameterError(
-                "rate", rate, f"{fits}: {motors} motors need {share * capacity:.0f} kbit/s of its {capacity:g}"
-            )
+            need = f"{share * capacity:.0f} kbit/s of its {capacity:g}"
+            if self.data_bitrate:
+                need = f"{share:.0%} of its time"
+            raise ParameterError("rate", rate, f"{fits}: {motors} motors need {need}")
 
 
 def traffic_of(values: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Traffic]:
-    """Return the traffic on each bus of the four motors, by its channel; options: of python-can.
+    """Return the traffic on each bus of an arm's motors, by its channel; options: of python-can.
 
     Raises ParameterError.
     """
     traffic, interface = {}, values["can.interface"]
-    for name, (motors, own) in buses_of(values["can.channel"], options).items():
+    for name, (motors, own) in buses_of(values["can.channel"], options, len(values["wire_format"])).items():
         bitrate = own.get("bitrate")
         if bitrate is None and interface in NEED_BITRATE:
             expected = f"set for {interface}, as on the motors, e.g. {BITRATE}"
             raise ParameterError(f"{OPTIONS}.bitrate", bitrate, expected)
-        replying = sum(FORMATS[values["wire_format"][joint]].replies for joint in motors)
-        traffic[name] = Traffic(replying, len(motors) - replying, bitrate or BITRATE)
+        kinds = [values["motor"][joint] for joint in motors]
+        if is_fd(own) and (classic := [kind for kind in kinds if not MOTORS[kind].can_fd]):
+            raise ParameterError(f"{OPTIONS}.fd", True, f"false: a {classic[0]} on this bus does not speak CAN FD")
+        data_bitrate = own.get("data_bitrate", DATA_BITRATE) if is_fd(own) else 0
+        boards = [format_of(values["motor"][joint], values["wire_format"][joint]) for joint in motors]
+        replying = sum(board.replies for board in boards)
+        traffic[name] = Traffic(replying, len(motors) - replying, bitrate or BITRATE, data_bitrate)
     return traffic
+
+
+def is_fd(options: Mapping[str, Any]) -> bool:
+    """Return whether a bus with these options of python-can carries our frames as CAN FD."""
+    return options.get("fd") is True

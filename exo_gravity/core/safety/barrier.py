@@ -27,7 +27,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.descent import DESCENT
-from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_COMMAND, MAX_EFFORT_RATE, WALL, Limits
+from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_EFFORT_RATE, WALL, Limits
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ class Barrier:
         share: 0..1, the factor (n,) on effort and soft wall where torque begins.
         before: the torque of the last drive, (n,) Nm.
 
-        Raises ParameterError if an effort is NaN or beyond MAX_COMMAND.
+        Raises ParameterError if an effort is NaN or beyond `max_command`.
         """
         step, step_of_damping = MAX_EFFORT_RATE * dt, DESCENT.damping_rate * dt
         shaped, dampings, acted = [], [], set()
         for i, (name, joint) in enumerate(zip(self._limits.joint_names, joints, strict=True)):
-            if not abs(effort[i]) <= MAX_COMMAND:
-                raise ParameterError(f"effort of {name}", effort[i], f"from -{MAX_COMMAND:g} to {MAX_COMMAND:g} Nm")
+            if not abs(effort[i]) <= (most := self._limits.max_command[i]):
+                raise ParameterError(f"effort of {name}", effort[i], f"from -{most:g} to {most:g} Nm")
             spring, wall = self._wall(i, joint)
             permitted = self._permitted(i, joint)
             wanted = share[i] * (effort[i] + spring)

@@ -41,7 +41,7 @@ DELIVERY = Delivery()
 
 
 class DeliveryMonitor:
-    """Compares commanded with replied torque, joint by joint. missing: (4,) whether a joint does not deliver."""
+    """Compares commanded with replied torque, joint by joint. missing: (n,) whether a joint does not deliver."""
 
     def __init__(self, limits: Limits, peak_effort: Sequence[float]) -> None:
         self._limits = limits
@@ -59,7 +59,7 @@ class DeliveryMonitor:
 
     @property
     def missing(self) -> tuple[bool, ...]:
-        """Whether each joint (4,) does not deliver its torque."""
+        """Whether each joint (n,) does not deliver its torque."""
         return tuple(evidence >= DELIVERY.evidence for evidence in self._evidence)
 
     def step(
@@ -70,9 +70,9 @@ class DeliveryMonitor:
         A joint without a new reply keeps its evidence.
 
         dt: s that the loop ran since the last replies.
-        joints: (4,) the replies.
-        effort: (4,) Nm, commanded.
-        damping: (4,) Nm s/rad, commanded.
+        joints: (n,) the replies.
+        effort: (n,) Nm, commanded.
+        damping: (n,) Nm s/rad, commanded.
         """
         self._time += dt
         fault = None

@@ -150,9 +150,9 @@ class JointDescent:
 
 
 class ArmDescent:
-    """The four joints of an arm on their way down, from `effort` (4,) Nm and `damping` (4,) Nm s/rad.
+    """The joints of an arm on their way down, from `effort` (n,) Nm and `damping` (n,) Nm s/rad.
 
-    max_effort: (4,) Nm, which the torque of a joint exceeds only where `effort` does.
+    max_effort: (n,) Nm, which the torque of a joint exceeds only where `effort` does.
     """
 
     def __init__(
@@ -165,7 +165,7 @@ class ArmDescent:
 
     @property
     def applied(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Torque (4,) in Nm and damping (4,) in Nm s/rad to apply now."""
+        """Torque (n,) in Nm and damping (n,) in Nm s/rad to apply now."""
         return tuple(joint.effort for joint in self._joints), tuple(joint.damping for joint in self._joints)
 
     def step(
@@ -173,8 +173,8 @@ class ArmDescent:
     ) -> None:
         """Advance by `dt` s to `now` (s) with the newest readings.
 
-        silent: (4,) whether the joint's motor does not reply.
-        unsent: (4,) whether its last command did not leave: it holds what it had.
+        silent: (n,) whether the joint's motor does not reply.
+        unsent: (n,) whether its last command did not leave: it holds what it had.
         """
         columns = zip(self._joints, samples, silent, self._silent, unsent, strict=True)
         for joint, sample, is_silent, was_silent, is_unsent in columns:

@@ -8,9 +8,6 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
-from exo_gravity.core.numbers import JOINT_COUNT
-
 
 class State(str, Enum):
     """The state of the arm between off and carried."""
@@ -31,7 +28,7 @@ CARRYING = (State.PROVING, State.RAMPING_IN, State.ACTIVE)
 class Efforts(NamedTuple):
     """What the motors are asked to apply, in answer to the samples of one cycle."""
 
-    effort: Sequence[float] | None  #: (4,) Nm, or None to withdraw.
+    effort: Sequence[float] | None  #: (n,) Nm, or None to withdraw.
     answered: float  #: s, when the joint states that it answers were taken.
     damped: bool  #: Whether the load is changing, so that the motors are to damp the joints.
     held: bool  #: Whether they are computed from a tilt that is late.
@@ -59,9 +56,10 @@ class Drive(NamedTuple):
     send: tuple[Send, ...]  #: (n,)
     powered: bool  #: whether one of them may be on
 
-
-COMMANDS = (Send.COMMAND,) * JOINT_COUNT
-OFF = Drive(NO_TORQUE, NO_TORQUE, (Send.POLL,) * JOINT_COUNT, False)
+    @classmethod
+    def off(cls, count: int) -> "Drive":
+        """Return what `count` motors receive that are off: nothing to apply."""
+        return cls((0.0,) * count, (0.0,) * count, (Send.POLL,) * count, False)
 
 
 # After a fault, zeros and signs are checked again: an encoder may have lost its turn count, or a motor its power.
@@ -105,17 +103,20 @@ class FaultCode(str, Enum):
         "a motor's angle has turned otherwise than its velocity says: wrong `velocity_range`, or a slipping encoder",
     )
     # The start gate
-    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from 0 at the first start"
+    IMPLAUSIBLE_ZERO = "implausible_zero", "a joint is over 0.5 rad (AK80-9: 0.34) from `home` at the first start"
     TORQUE_WHILE_HANGING = (
         "torque_while_hanging",
-        "at the first start, more than 1.5 Nm are asked for on a joint of an arm that hangs",
+        "at the first start, an arm that hangs is asked for more than 1.5 Nm, or a third of `max_effort`",
     )
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
     SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
     # The efforts
     COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`", RESUME
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics say why", RESUME
-    COMMAND_IMPOSSIBLE = "command_impossible", "an effort is NaN, beyond 40 Nm, misnamed or missing"
+    COMMAND_IMPOSSIBLE = (
+        "command_impossible",
+        "an effort is NaN, beyond 40 Nm (large motors: twice their peak torque), misnamed or missing",
+    )
     UNEXPLAINED_TORQUE = (
         "unexplained_torque",
         "the efforts exceed what gravity needs of any load up to `largest_moment`, plus `largest_addition`",

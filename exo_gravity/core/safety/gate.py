@@ -4,9 +4,8 @@ import math
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import JOINT_COUNT, limited
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
@@ -60,6 +59,9 @@ class HangingArm:
     #: Nm asked for on a joint: gravity of a few degrees, the whole arm of a wearer of 75 kg included. Hanging, friction
     #: alone holds it. A trunk's IMU that is mounted otherwise than it is set asks for more
     torque: float = 1.5
+    #: of `max_effort`, where that is more: a worn arm of 75 kg lies against a trunk that leans by 0.12 rad, and 2.1 Nm
+    #: are asked for at its abduction
+    share: float = 1.0 / 3.0
     moved: float = 0.06  #: rad that a joint may turn after it was confirmed: a wearer breathes, and hangs on
     valid: float = 10.0  #: s for which the confirmation holds
     patience: float = 60.0  #: s, longer than `enable_timeout`, that a start waits for it
@@ -108,8 +110,9 @@ def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | Non
 
     What assistance and terms may add, `largest_addition`, they may add here too.
     """
-    for name, torque, addition in zip(limits.joint_names, effort, limits.largest_addition, strict=True):
-        most = HANGING_ARM.torque + addition
+    columns = zip(limits.joint_names, effort, limits.max_effort, limits.largest_addition, strict=True)
+    for name, torque, permitted, addition in columns:
+        most = max(HANGING_ARM.torque, HANGING_ARM.share * permitted) + addition
         if not abs(torque) <= most:
             reason = (
                 f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
@@ -176,8 +179,8 @@ class SwitchOnCheck:
     pushes separates 1 from 0 by nine standard deviations of a noise of 0.15 Nm at 100 Hz. A motor that has not shown it
     after a pair may have missed its ENTER: it gets another one, until the time-out.
 
-    effort: (4,) Nm to apply now.
-    enter: (4,) which motors to switch on again now.
+    effort: (n,) Nm to apply now.
+    enter: (n,) which motors to switch on again now.
     done: whether the check has ended.
     """
 
@@ -185,18 +188,19 @@ class SwitchOnCheck:
         self.done = False
         self._names = limits.joint_names
         self._torque = [min(SWITCH_ON.torque, most) for most in limits.max_effort]
-        self.effort, self.enter = list(NO_TORQUE), [False] * JOINT_COUNT
-        self._last_time = [-math.inf] * JOINT_COUNT
-        self._commanded = list(NO_TORQUE)  # Nm, as the replies show it
-        self._products = list(NO_TORQUE)  # of replied and commanded torque, summed since the last pair of pushes
-        self._squares = list(NO_TORQUE)  # of commanded torque
-        self._is_on = [False] * JOINT_COUNT
+        count = len(self._names)
+        self.effort, self.enter = [0.0] * count, [False] * count
+        self._last_time = [-math.inf] * count
+        self._commanded = [0.0] * count  # Nm, as the replies show it
+        self._products = [0.0] * count  # of replied and commanded torque, summed since the last pair of pushes
+        self._squares = [0.0] * count  # of commanded torque
+        self._is_on = [False] * count
         self._elapsed, self._pushes = 0.0, 0
 
     def step(self, dt: float, joints: Sequence[JointSample], damping: Sequence[float]) -> Fault | None:
         """Advance by `dt` s with the replies to the last commands; return the fault that they show, if any.
 
-        damping: (4,) Nm s/rad, last sent; its torque is part of the replies, and a light joint moves.
+        damping: (n,) Nm s/rad, last sent; its torque is part of the replies, and a light joint moves.
         """
         self._elapsed += dt
         self.enter = [False] * len(self.enter)
@@ -216,10 +220,11 @@ class SwitchOnCheck:
                 if self.enter[i] and self._elapsed >= SWITCH_ON.timeout - 1e-9:
                     reason = (
                         f"{name}: the motor did not switch on: {share * 100:.0f} % of the commanded torque replied; "
-                        "a V3 board ignores commands while its configuration cable is plugged in"
+                        "a V3 board ignores commands while its configuration cable is plugged in, a V1 or V2 board "
+                        "while it is in servo mode (set MIT mode with the vendor's tool)"
                     )
                     return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
-            self._products, self._squares = list(NO_TORQUE), list(NO_TORQUE)
+            self._products, self._squares = [0.0] * len(self._names), [0.0] * len(self._names)
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
             target = 0.0 if all(self._is_on) else -torque if pushes % 2 else torque
@@ -240,9 +245,9 @@ class SignCheck:
 
     No joint is damped before it has moved the right way: a reversed motor that damps would drive it, without end.
 
-    torque: (4,) Nm, the largest push on each joint; a joint with 0 is skipped.
-    effort: (4,) Nm to apply now.
-    damped: (4,) which joints have moved the right way: these may be damped.
+    torque: (n,) Nm, the largest push on each joint; a joint with 0 is skipped.
+    effort: (n,) Nm to apply now.
+    damped: (n,) which joints have moved the right way: these may be damped.
     done: whether every joint has passed. pushes: whether it pushes any joint at all.
     hint: what the wearer should do.
     """

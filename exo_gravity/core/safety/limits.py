@@ -6,10 +6,12 @@ docs/safety_case.md compares the defaults with those of other systems.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 from exo_gravity.core.arm.arm import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import USUAL_MOTORS
+from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import (
     MAX_STATUS_RATE,
     MOTOR_PARAMETERS,
@@ -18,12 +20,14 @@ from exo_gravity.core.motors.joint_motor import (
     JointSample,
     channels_of,
 )
-from exo_gravity.core.motors.specs import MOTORS, USUAL_MOTORS, error_text
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, for_joints
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
-MAX_COMMAND = 40.0  # Nm: no arm needs half of it, so a larger effort command is wrong
+# An effort command beyond these is wrong: no joint with small motors needs half of the first, in Nm; and a large motor
+# gives its peak torque at most.
+MAX_COMMAND, MAX_OF_PEAK = 40.0, 2.0
+MAX_EFFORT = 500.0  # Nm, of any motor that a person's arm may hang in
 CONFIRM, HANGING = START_POSES = ("confirm", "hanging")
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
@@ -74,7 +78,7 @@ WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming(
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits that the worn arm must never exceed: one entry per joint (4,), or one number for all joints.
+    """The limits that the worn arm must never exceed: one entry per joint (n,), or one number for all joints.
 
     The fields with a description are parameters of `can_bridge`. Raises ParameterError that names the invalid value.
     """
@@ -87,7 +91,7 @@ class Limits:
     max_effort: Sequence[float] = owned(
         tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS),
         "torque limit, by default the motors' rated torque",
-        (0.0, max(spec.peak_torque for spec in MOTORS.values())),
+        (0.0, MAX_EFFORT),
         "Nm",
     )
     driven_speed: float = owned(
@@ -111,29 +115,45 @@ class Limits:
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
     largest_moment: Sequence[float] = owned(
-        (0.0,) * 4,
+        (0.0,) * JOINT_COUNT,
         "M1 to M4, the largest first moments of robot plus wearer, as `budget` prints them: efforts that no load up to "
-        "these needs are a fault; zeros: not checked",
+        "these needs are a fault; zeros: not checked, as on any arm but the paper's",
         (0.0, MAX_MOMENT),
         "kg m",
     )
     largest_addition: Sequence[float] = owned(
-        (0.0,) * 4,
+        (0.0,) * JOINT_COUNT,
         "torque that efforts may add to gravity compensation when `largest_moment` is given: the sum of the bounds of "
         "assistance and terms in use, `inertial`, a calibration",
         (0.0, 10.0),
         "Nm",
     )
-    #: (4,) rad from `home` at the first start; `limits_of` takes it from the motors
+    home: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "angles of the arm while it hangs, where a start from unknown zeros begins",
+        (-3.15, 3.15),
+        "rad",
+    )
+    #: (n,) rad from `home` at the first start; `limits_of` takes it from the motors
     home_tolerance: Sequence[float] = tuple(MOTORS[name].home_tolerance for name in USUAL_MOTORS)
-    channels: Sequence[str] = ("",) * JOINT_COUNT  #: of the motors' buses
-    #: (4,) rad, the hanging arm, from which joint angles are measured
-    home: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0, 0.0)
+    #: (n,) Nm beyond which an effort command is wrong; `limits_of` takes it from the motors
+    max_command: Sequence[float] = (MAX_COMMAND,) * JOINT_COUNT
+    channels: Sequence[str] = ()  #: of the motors' buses, (n,); () if that does not matter
 
     def __post_init__(self) -> None:
-        if len(set(self.joint_names)) != JOINT_COUNT or not all(self.joint_names):
-            raise ParameterError("joint_names", list(self.joint_names), "4 different names")
-        check_owned(self)
+        names = self.joint_names
+        if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS or not all(names):
+            raise ParameterError("joint_names", list(names), f"1 to {MAX_JOINTS} different names")
+        check_owned(self, len(names))
+        for name in ("max_velocity", "home_tolerance", "max_command"):
+            object.__setattr__(self, name, for_joints(getattr(self, name), len(names)))
+        object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
+        if any(self.largest_moment) and len(names) != JOINT_COUNT:
+            raise ParameterError("largest_moment", list(self.largest_moment), "zeros for another arm than the paper's")
+        columns = zip(names, self.position_min, self.home, self.position_max, self.home_tolerance, strict=True)
+        for name, low, home, high, tolerance in columns:
+            if not low - tolerance <= home <= high + tolerance:
+                raise ParameterError(f"home of {name}", home, f"within its limits, {low:g} to {high:g} rad")
         if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
             expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
             raise ParameterError("position_max", list(self.position_max), expected)
@@ -148,8 +168,8 @@ class Limits:
         low, high = self.position_min[i], self.position_max[i]
         faults = []
         if joint.error:
-            text = error_text(joint.error)
-            faults.append(Fault(FaultCode.MOTOR_ERROR, f"{name}: the motor reports error {joint.error} ({text})"))
+            reason = f"{name}: the motor reports error {joint.error} ({joint.trouble})"
+            faults.append(Fault(FaultCode.MOTOR_ERROR, reason))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
             faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason))
@@ -165,7 +185,7 @@ class Limits:
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", True, "configure and activate once at the start, without an operator", fixed=True),
+    Param("autostart", False, "configure and activate once at the start, without an operator", fixed=True),
     Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
     Param(
@@ -182,8 +202,9 @@ CAN_BRIDGE = (
 def limits_of(values: Mapping[str, Any]) -> Limits:
     """Return the limits that `can_bridge`'s parameter values describe, or raise ParameterError."""
     given = {param.name: values[param.name] for param in LIMIT_PARAMETERS}
-    given["channels"] = channels_of(values["can.channel"])
+    given["channels"] = channels_of(values["can.channel"], len(values["joint_names"]))
     given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
+    given["max_command"] = tuple(max(MAX_COMMAND, MAX_OF_PEAK * MOTORS[name].peak_torque) for name in values["motor"])
     shortest = READING.reply_timeout
     given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
     return Limits(tuple(values["joint_names"]), **given)

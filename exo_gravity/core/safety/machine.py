@@ -22,14 +22,12 @@ import math
 import operator
 from collections.abc import Iterable, Sequence
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, COMMANDS, OFF, Drive, Efforts, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.drive import CARRYING, Drive, Efforts, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import (
     HANGING_ARM,
     START_GATE,
@@ -73,25 +71,27 @@ class SafetyMachine:
         self.acted: dict[str, float] = {}
         self.ride = RideThrough(limits.command_timeout)
         self._period = period
+        count = len(limits.joint_names)
+        self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
         #: the last hand on every drive
-        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * JOINT_COUNT)
-        self._replies = [motor.wire_format.replies for motor in motors] or [True] * JOINT_COUNT
+        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
+        self._replies = [motor.wire_format.replies for motor in motors] or [True] * count
         self.power = tuple(map(MotorPower, self._replies))
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
-        self._sent = OFF  # last sent to the motors
-        self._descent = ArmDescent(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE)
-        self._rise = GuidedMotion(JOINT_COUNT)  # of the torque, where it begins
+        self._sent = self._off = Drive.off(count)  # last sent to the motors
+        self._descent = ArmDescent(0.0, self._none, self._none, self._none)
+        self._rise = GuidedMotion(count)  # of the torque, where it begins
         self._stall = StallWatch(limits.joint_names, period)
         self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
-        self._rest = RestTracker()
+        self._rest = RestTracker(count)
         self._readings = Readings(limits)
         self.pose = PoseQuestion(limits.joint_names)
         self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._switching = SwitchingOn(self._replies)
         self._switch_on = SwitchOnCheck(limits)
-        self._signs = SignCheck(limits.joint_names, NO_TORQUE)
+        self._signs = SignCheck(limits.joint_names, self._none)
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
@@ -176,14 +176,14 @@ class SafetyMachine:
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
-        self._sent, self._left = Drive(tuple(effort), tuple(damping), COMMANDS, True), effort
+        self._sent, self._left = Drive(tuple(effort), tuple(damping), self._commands, True), effort
         self._change_power(PowerChange.TAKEN_OVER)
         self.state = State.ACTIVE
         self._on(StateEvent.DISABLE, now)
 
     def probe(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
-        self._descent = ArmDescent(now, NO_TORQUE, (DAMPING,) * len(self.power), self.limits.max_effort)
+        self._descent = ArmDescent(now, self._none, (DAMPING,) * len(self.power), self.limits.max_effort)
         self._change_power(PowerChange.PROBED)
 
     def is_at_rest(self, now: float) -> bool:
@@ -211,7 +211,7 @@ class SafetyMachine:
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove()
-        self._sent = self._drive(effort or NO_TORQUE, efforts.damped)
+        self._sent = self._drive(effort or self._none, efforts.damped)
         return self._sent
 
     def _read(self, joints: Sequence[JointSample]) -> None:
@@ -248,9 +248,20 @@ class SafetyMachine:
             self._attempts += 1
         if self._readings.fault:
             return self._readings.fault
+        if self.state in CARRIED and (found_off := self._found_off()):
+            return found_off
         if efforts.effort is None:
             return Fault(FaultCode.COMMAND_WITHDRAWN, "the compensator withdrew its efforts; see its diagnostics")
         return self.ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
+
+    def _found_off(self) -> Fault | None:
+        """Return the fault of a motor that was switched on, and whose replies say that it is off."""
+        motors = zip(self.limits.joint_names, self.power, self._readings.joints, strict=True)
+        for name, power, joint in motors:
+            if power.state is Power.ON and power.is_told_off:
+                why = f": {joint.trouble}" if joint.trouble else ""
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, f"{name}: its motor says that it is off{why}")
+        return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
         if self.state in CARRIED:
@@ -334,7 +345,7 @@ class SafetyMachine:
         """
         count = len(self.power)
         if not self._switching.done:
-            return self._powered(NO_TORQUE, NO_TORQUE, self._switching.step())
+            return self._powered(self._none, self._none, self._switching.step())
         if self._signs.pushes:
             pushed, again, damped = self._signs.effort, list(self._delivery.missing), self._signs.damped
         else:
@@ -350,7 +361,7 @@ class SafetyMachine:
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
         joints = self._readings.joints
         if self.state is State.RAMPING_IN:
-            self._rise.step(self._dt, [joint.velocity for joint in joints], NO_TORQUE, effort)
+            self._rise.step(self._dt, [joint.velocity for joint in joints], self._none, effort)
             if self._rise.is_over:
                 self._on(StateEvent.RAMPED)
         is_guided = damped or self.state is State.RAMPING_IN
@@ -360,7 +371,7 @@ class SafetyMachine:
         shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
         self.acted.update(dict.fromkeys(shaped.acted, self._now))
         damping = [max(self._guard, own) for own in shaped.damping]
-        return self._powered(shaped.effort, damping, COMMANDS)
+        return self._powered(shaped.effort, damping, self._commands)
 
     def _descend(self) -> Drive:
         """Return a drive that lowers the arm, or stands once it is down."""
@@ -378,7 +389,7 @@ class SafetyMachine:
         send = self._sends()
         for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
             asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
-            is_off = is_missing and abs(joint.effort) < POWER.off_share * abs(asked)
+            is_off = power.is_told_off or (is_missing and abs(joint.effort) < POWER.off_share * abs(asked))
             if is_off and power.state is Power.ON and power.may_return and not joint.error:
                 power.may_return = False
                 self._readings.doubt()
@@ -397,7 +408,7 @@ class SafetyMachine:
             self._on(StateEvent.FOUND_ON)
             return self._descend()
         if self._all_off:
-            return OFF._replace(send=tuple(self._sends()))
+            return self._off._replace(send=tuple(self._sends()))
         self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
         return self._powered(*self._descent.applied, self._sends())
 

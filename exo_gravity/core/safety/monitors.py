@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Fault, FaultCode
 
 
@@ -30,19 +29,19 @@ REST, RIDE = Rest(), Ride()
 
 
 class RestTracker:
-    """Whether an arm is at rest, judged by position: a damped arm can creep at less than one code of the velocity.
+    """Whether an arm of `count` joints is at rest, judged by position: a damped arm can creep at less than one code.
 
     since: s, the time since which no replying joint has turned by more than `REST.turn`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, count: int) -> None:
         self.since = -math.inf
-        self._reference: Sequence[JointSample] = (UNKNOWN,) * JOINT_COUNT
+        self._reference: Sequence[JointSample] = (UNKNOWN,) * count
 
     def step(self, now: float, joints: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Take the newest readings at `now` s.
 
-        silent: (4,) whether the joint's motor does not reply.
+        silent: (n,) whether the joint's motor does not reply.
         """
         columns = zip(joints, self._reference, silent, strict=True)
         if any(

@@ -15,11 +15,11 @@ g M, is a speed of about g patience / l = 0.4 rad/s.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode
-from exo_gravity.core.safety.limits import MAX_COMMAND, Limits
+from exo_gravity.core.safety.limits import Limits
 
 GRAVITY = 9.81  # m/s^2
 ALONG_BASE = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
@@ -44,31 +44,32 @@ MOTION = MotionLimits()
 class MotionMonitor:
     """The unexplained impulse of each joint. gravity: (3,) unit vector in the arm's base frame; may be set anytime.
 
-    limits.largest_moment: (4,) kg m; zeros switch the monitor off. impulse: (4,) Nm s. full: (4,) Nm, the largest load.
+    limits.largest_moment: (n,) kg m; zeros switch the monitor off, as they must for another arm than the paper's.
+    impulse: (n,) Nm s. full: (n,) Nm, the largest load.
     """
 
     def __init__(self, limits: Limits) -> None:
         self.gravity: tuple[float, float, float] = ALONG_BASE
         self._limits = limits
         self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
-        one, two, three, four = self._load
-        full = two + three + four
-        self.full = (one + full, full, three + four, four)
+        self._is_on = any(self._load[1:])
+        self.full = tuple(accumulate(self._load[::-1]))[::-1]
         self.reset()
 
     def reset(self) -> None:
         """Forget the past."""
-        self.impulse = list(NO_TORQUE)
-        self._slow: list[float] = []  # the torque, low-passed, (4,) Nm
+        self.impulse = [0.0] * len(self.full)
+        self._slow: list[float] = []  # the torque, low-passed, (n,) Nm
 
     def step(
         self, dt: float, joints: Sequence[JointSample], effort: Sequence[float], age: float = 0.0
     ) -> tuple[Sequence[float], Fault | None]:
-        """Return what is explained of the `effort` (4,) Nm in the pose of `joints`, and a fault if too little is.
+        """Return what is explained of the `effort` (n,) Nm in the pose of `joints`, and a fault if too little is.
 
         age: s since the pose that the effort answers. An impossible effort is returned as it is.
         """
-        if not self.full[1] or not all(abs(torque) <= MAX_COMMAND for torque in effort):
+        asked = zip(effort, self._limits.max_command, strict=True)
+        if not self._is_on or not all(abs(torque) <= most for torque, most in asked):
             return effort, None
         fastest = max([abs(joint.velocity) for joint in joints])
         lowest, highest = self.explained([joint.position for joint in joints])

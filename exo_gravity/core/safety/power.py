@@ -1,8 +1,9 @@
 """Whether each motor is on, as far as its replies and silences tell, and what it is sent for that.
 
 No frame of an AK motor says whether it is on. What is known follows from what it was sent, whether it has replied, and
-what torque it shows. `NEXT` has the transitions of a motor, `SENT` what a motor receives in each state. Both hold for
-every family: where two differ, they are what is safe on both.
+what torque it shows. The replies of other families say it (`JointSample.on`), and are believed. `NEXT` has the
+transitions of a motor, `SENT` what a motor receives in each state. Both hold for every family: where two differ, they
+are what is safe on both.
 
 - Only an operator's enable switches a motor on. There is one exception: a motor that is found off while it carries its
   joint, and was never silent for long, has restarted or obeyed a foreign EXIT. It is switched on again once, and comes
@@ -36,6 +37,7 @@ class PowerTuning:
     #: that dips is back by then.
     cut: float = 0.2
     off_share: float = 0.25  #: of the torque asked for, less of which a motor gives that does not deliver: it is off
+    told_off: int = 2  #: replies in a row that say that a motor is off; one may be wrong, or older than its ENTER
     exit_period: float = 0.5  #: s between two EXIT frames to a motor that is off, in case it was switched on unseen
 
 
@@ -108,6 +110,7 @@ class MotorPower:
         self._newest = -math.inf  # s, of its last reply
         self._silent_for = self._heard_for = 0.0  # s
         self._torque = 0.0  # Nm, smoothed since it replies
+        self._told_off = 0  # replies in a row that said that it is off
         self._exits: list[float] = []  # s, of the last two
 
     @property
@@ -122,8 +125,13 @@ class MotorPower:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether it has shown no torque for long enough to be off."""
-        return self._heard_for >= POWER.read_time
+        """Whether it has shown no torque for long enough to be off, or its replies say that it is."""
+        return self._heard_for >= POWER.read_time or self.is_told_off
+
+    @property
+    def is_told_off(self) -> bool:
+        """Whether its replies say that it is off."""
+        return self._told_off >= POWER.told_off
 
     def change(self, change: PowerChange) -> None:
         """Go to the state that `NEXT` has for this change; stay where it has none."""
@@ -135,6 +143,7 @@ class MotorPower:
         elif self.state in (Power.UNSURE, Power.UNKNOWN):
             self.may_return = False
             self._torque = self._heard_for = 0.0
+            self._told_off = 0
         elif self.state is Power.LEAVING:
             self._exits = []
 
@@ -143,6 +152,7 @@ class MotorPower:
         if is_silent:
             self._silent_for += dt
             self._torque = self._heard_for = 0.0
+            self._told_off = 0
             self.change(PowerChange.SILENT)
             if self._silent_for >= POWER.cut:
                 self.change(PowerChange.CUT)
@@ -152,12 +162,20 @@ class MotorPower:
         if joint.time > self._newest:
             self._torque += min(1.0, dt / POWER.smoothing) * (joint.effort - self._torque)
             self._heard_for += dt
-            is_confirmed = len(self._exits) == 2 and joint.time >= self._exits[1]
-            if is_confirmed and (self._board == 0 or abs(joint.effort) < POWER.torque):
+            self._told_off = self._told_off + 1 if joint.on is False else 0
+            if self._is_confirmed_off(joint):
                 self.change(PowerChange.CONFIRMED)
         self._newest = max(self._newest, joint.time)
-        if abs(self._torque) > POWER.torque and self.state in (Power.UNSURE, Power.UNKNOWN):
+        shows_torque = joint.on is None and abs(self._torque) > POWER.torque
+        if (joint.on or shows_torque) and self.state in (Power.UNSURE, Power.UNKNOWN):
             self.change(PowerChange.SHOWN_ON)
+
+    def _is_confirmed_off(self, joint: JointSample) -> bool:
+        """Return whether a new reading shows that the motor has obeyed EXIT."""
+        is_answer = len(self._exits) == 2 and joint.time >= self._exits[1]
+        if joint.on is not None:
+            return is_answer and not joint.on
+        return is_answer and (self._board == 0 or abs(joint.effort) < POWER.torque)
 
     def send(self, now: float) -> Send:
         """Return what the motor is sent at `now` s."""

@@ -1,8 +1,8 @@
-"""What no working IMU does: exceed its ranges, repeat values, contradict gravity or itself, run by a wrong clock.
+"""What an IMU reports, and what no working one does: exceed its ranges, repeat values, run slowly or by a wrong clock.
 
 A value at the end of the sensor's range is saturated: only its sign is known. One beyond the range cannot come from
-the sensor: a unit or a parameter is wrong. While a person moves, the accelerometer also measures the movement, so each
-check against it waits until a movement cannot be the reason. The limits were set on the trials of docs/imu.md.
+the sensor: a unit or a parameter is wrong. The limits were set on the trials of docs/imu.md; `agreement` has the checks
+against gravity.
 """
 
 import math
@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
-from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, dot, plus, rotated, three_floats, up_in_body
+from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, plus, three_floats, up_in_body
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trunk.inputs import NOT_REPORTED
 
 # The usual widest ranges of a MEMS sensor, and those that any sensor may have.
 GYROSCOPE_RANGE, GYROSCOPE_RANGES = 34.9, (1.0, 200.0)  # rad/s; 2000 deg/s
 ACCELEROMETER_RANGE, ACCELEROMETER_RANGES = 156.9, (15.0, 4000.0)  # m/s^2; 16 g
 RANGES = {"angular_velocity": "gyroscope_range", "linear_acceleration": "accelerometer_range"}
-UPWARD = (0.0, 0.0, 1.0)
 
 
 class ImuSample(NamedTuple):
@@ -30,8 +30,24 @@ class ImuSample(NamedTuple):
     orientation: Sequence[float] | None = None  #: (x, y, z, w), world from IMU, world z up
 
 
+def reported_vector(values: Sequence[float], covariance: float) -> Sequence[float] | None:
+    """Return the vector (3,) of a message, None if the IMU does not measure it.
+
+    covariance: its first entry. By REP-145 -1 says so; but many drivers set -1 for values that they measure and whose
+    covariance they do not know (0 would say that). So the values decide: what is not measured is 0 or NaN.
+    """
+    is_there = any(values) and not any(map(math.isnan, values))
+    return None if covariance == NOT_REPORTED and not is_there else values
+
+
+def reported_orientation(values: Sequence[float], covariance: float) -> Sequence[float] | None:
+    """Return the quaternion (4,) of a message, None if the IMU has none: by its covariance, or 0 0 0 0 or all NaN."""
+    is_there = any(values) and not all(map(math.isnan, values))
+    return None if covariance == NOT_REPORTED or not is_there else values
+
+
 class Contradiction(ParameterError):
-    """The samples contradict each other: the estimate begins anew once gyroscope and accelerometer agree on a turn."""
+    """The samples contradict each other: the estimate begins anew, and is used once they agree on a turn."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +78,42 @@ def in_range(name: str, values: Sequence[float] | None, limit: float) -> tuple[F
 def check_unit(acceleration: Floats3, last: Floats3 | None) -> None:
     """Raise ParameterError for an accelerometer that is dead, or in g; last: the acceleration before, None at first."""
     if math.dist(acceleration, ZERO) < SAMPLE.smallest:
-        is_dead, in_si = max(map(abs, acceleration)) < SAMPLE.dead, plus(ZERO, acceleration, STANDARD_GRAVITY)
-        if is_dead or (last and math.dist(in_si, last) < SAMPLE.same * STANDARD_GRAVITY):
-            raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g, and not dead")
+        if max(map(abs, acceleration)) < SAMPLE.dead:
+            expected = "9.8 m/s^2 upward at rest: the accelerometer is dead, or its driver removes gravity"
+            raise ParameterError("linear_acceleration", acceleration, expected)
+        converted = plus(ZERO, acceleration, STANDARD_GRAVITY)
+        if last and math.dist(last, converted) < SAMPLE.same * STANDARD_GRAVITY < math.dist(last, acceleration):
+            raise ParameterError("linear_acceleration", acceleration, "in m/s^2, not in g")
+
+
+@dataclass(frozen=True)
+class RateLimits:
+    """How seldom samples may come."""
+
+    least: float = 20.0  #: Hz, what is promised, and the smallest value of the parameter `rate`
+    interval: float = 0.06  #: s between two samples that are too slow: some jitter of 20 Hz is permitted
+    longest: float = 1.0  #: s; beyond, the driver paused or was started again
+    samples: int = 5  #: in a row
+
+
+class RateCheck:
+    """Samples that come too seldom: between two of them a trunk turns unseen."""
+
+    limits = RateLimits()
+    _slow = 0  # intervals in a row
+    _time = 0.0  # s, their sum
+
+    def check(self, dt: float) -> None:
+        """Take the s between two samples; raise ParameterError once they come too seldom."""
+        limits = self.limits
+        if not limits.interval < dt <= limits.longest:
+            self._slow, self._time = 0, 0.0
+            return
+        self._slow, self._time = self._slow + 1, self._time + dt
+        if self._slow >= limits.samples:
+            rate = self._slow / self._time
+            expected = f"{limits.least:g} or more; they come at {rate:.0f} Hz: set a higher rate in the IMU's driver"
+            raise ParameterError("samples a second", round(rate, 1), expected)
 
 
 @dataclass(frozen=True)
@@ -126,143 +175,6 @@ class EqualValues:
         norm = math.hypot(*acceleration)
         apart = math.dist(up, plus(ZERO, acceleration, 1.0 / norm))
         return apart > self.limits.turn and abs(norm / STANDARD_GRAVITY - 1.0) < self.limits.near_gravity
-
-
-@dataclass(frozen=True)
-class ReportedLimits:
-    """How far a reported orientation may differ from the accelerometer, near rest."""
-
-    near_rest: float = 0.1  #: share of 1 g by which the acceleration may differ
-    largest: float = math.radians(20.0)  #: rad
-    time: float = 0.5  #: s; less than the time to the first tilt, so that a wrong orientation is never used
-
-
-@dataclass(frozen=True)
-class TurnLimits:
-    """How the turns by gyroscope and accelerometer are compared.
-
-    Lengths are those of the change of gravity's unit vector, accelerations are shares of 1 g.
-    """
-
-    time: float = 1.0  #: s over which the two turns are compared
-    clear: float = 0.04  #: the smallest turn that is compared: 2.3 degrees,
-    clear_of_motion: float = 6.0  #: and this many times the deviation from 1 g,
-    deviation_time: float = 0.15  #: s, over which that is averaged
-    unlike: float = 0.55  #: share of the gyroscope's turn by which the two differ where axes or signs are wrong,
-    alike: float = 0.3  #: and where they are right
-    lever: float = 0.42 / STANDARD_GRAVITY  #: s^2: from the axis of a turn to the IMU, 0.42 m, which a swing explains
-    most: float = 0.3  #: that a swing explains at most
-    velocity: float = 0.009  #: s 1 g, that a movement may add beyond this; at most 0.0082 in 30 of 32 random days
-    notice: float = 0.0003  #: s 1 g, from which on the whole difference counts as uncertainty
-    memory: float = 2.0  #: s, after which differences are forgotten
-    agreement_time: float = 0.6  #: s of like turns after which a suspect estimate is trusted,
-    rest_time: float = 3.0  #: or s at rest, where the estimate is right whatever the gyroscope measures
-    at_rest: float = 0.03  #: deviation from 1 g
-
-
-@dataclass(frozen=True)
-class MeanLimits:
-    """How far the mean acceleration in the world may be from gravity."""
-
-    time: float = 2.0  #: s of samples in the mean
-    shortest: float = 0.5  #: s; fewer samples are not judged
-    offset: float = 0.04  #: share of 1 g: bias and scale of an accelerometer that was never calibrated
-    walk: float = 0.67 / STANDARD_GRAVITY  #: s: 0.67 m/s; an IMU that is swung in a circle by hand needs 0.45
-    direction_time: float = 0.3  #: s for which a movement keeps its direction
-
-
-class Agreement:
-    """The orientation against the accelerometer. Every method raises where no movement explains the difference.
-
-    Turns: gravity must have turned by gyroscope and accelerometer alike over the last second. The more the
-    acceleration's length deviates from 1 g, the larger a turn must be to be compared.
-
-    Mean: the mean acceleration in the world must be gravity, because a velocity is bounded. Over a time T a change of
-    velocity by v shifts the mean by v / T. For a person who starts to walk v is known; for any other movement it is the
-    deviation of the acceleration from its mean times the time for which it keeps its direction.
-    """
-
-    reported, turn, mean = ReportedLimits(), TurnLimits(), MeanLimits()
-    contradiction = 0.0  #: rad by which the two turns differ, while they clearly do
-    square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
-    _deviation = 0.0  # of the acceleration's length from 1 g, a running mean, as a share
-    _up = _apart = ZERO  # running means: gravity's direction by the estimate, and less the accelerometer's
-    _unlike = 0.0  # s 1 g, by which the turns have differed
-    _agreed = _rest = _contradicted = _age = 0.0  # s
-    _mean = ZERO  # acceleration in the world, in 1 g
-
-    def __init__(self, is_suspect: bool = False) -> None:
-        #: whether the two must agree on a turn, or the trunk rest, before the estimate is used
-        self.is_suspect = is_suspect
-
-    def check_reported(self, dt: float, up: Floats3, acceleration: Floats3) -> None:
-        """Check a reported orientation: one that the driver does not have, or upside down.
-
-        up: the world's z axis in the IMU's axes. Raises ParameterError.
-        """
-        norm = math.hypot(*acceleration)
-        if abs(norm / STANDARD_GRAVITY - 1.0) < self.reported.near_rest:
-            contradicts = dot(up, acceleration) < norm * math.cos(self.reported.largest)
-            self._contradicted = self._contradicted + dt if contradicts else 0.0
-        if self._contradicted > self.reported.time:
-            limit = math.degrees(self.reported.largest)
-            expected = f"within {limit:g} degrees of the accelerometer at rest: check the IMU's axes, units and signs"
-            raise ParameterError("gravity_in_imu", [round(-component, 2) for component in up], expected)
-
-    def check(self, dt: float, quaternion: Quaternion, acceleration: Floats3, last: float, swing: float) -> None:
-        """Compare a fused orientation, world from IMU, with the mean acceleration, in 1 g, of the `dt` s that it ends.
-
-        last: length of the last acceleration, in 1 g. swing: rad/s^2, the angular acceleration and the square of the
-        angular velocity.
-        """
-        limits = self.turn
-        self._age += dt
-        self._deviation += (abs(last - 1.0) - self._deviation) * min(1.0, dt / limits.deviation_time)
-        self._check_mean(dt, rotated(quaternion, acceleration))
-        up, share = up_in_body(quaternion), dt / limits.time
-        apart = plus(up, acceleration, -1.0 / math.hypot(*acceleration))
-        if self._age == dt:
-            self._up, self._apart = up, apart
-        turned, unlike = plus(up, self._up, -1.0), plus(apart, self._apart, -1.0)
-        self._up, self._apart = plus(self._up, turned, share), plus(self._apart, unlike, share)
-        self._unlike -= self._unlike * dt / limits.memory
-        self.contradiction = 0.0
-        size, difference = math.hypot(*turned), math.hypot(*unlike)
-        self._rest = self._rest + dt if size <= limits.clear and self._deviation < limits.at_rest else 0.0
-        if size > max(limits.clear, limits.clear_of_motion * self._deviation):
-            self._compare(dt, turned, size, difference, swing)
-        if self._agreed >= limits.agreement_time or self._rest >= limits.rest_time:
-            self.is_suspect = False
-
-    def _compare(self, dt: float, turned: Floats3, size: float, difference: float, swing: float) -> None:
-        """Compare a clear turn, `size` of `turned`, with the accelerometer's, which differs by `difference`."""
-        limits = self.turn
-        # Before and just after the first tilt nothing is lost by a refusal.
-        explained = min(limits.most, limits.lever * swing) if self._age > self.mean.time else 0.0
-        excess = difference - limits.unlike * size - explained
-        if difference < limits.alike * size:
-            self._agreed += dt
-            self._unlike = max(0.0, self._unlike - 2.0 * dt * size)
-        elif excess > 0.0:
-            self._unlike += dt * excess
-            self.contradiction = difference * self._unlike / limits.notice
-            if self._unlike > limits.velocity:
-                expected = "the turn that the accelerometer shows: check the gyroscope's unit, axes and signs"
-                raise Contradiction("turn by angular_velocity", [round(v, 3) for v in turned], expected)
-
-    def _check_mean(self, dt: float, acceleration: Floats3) -> None:
-        """Compare the mean acceleration in the world, in 1 g, with gravity."""
-        limits = self.mean
-        span = min(self._age, limits.time)
-        share, change = dt / span, plus(acceleration, self._mean, -1.0)
-        self._mean = plus(self._mean, change, share)
-        self.square += share * ((1.0 - share) * dot(change, change) - self.square)
-        shift = math.dist(self._mean, UPWARD)
-        limit = limits.offset + (limits.walk + limits.direction_time * math.sqrt(self.square)) / span
-        if shift > limit and self._age >= limits.shortest:
-            mean = [round(STANDARD_GRAVITY * component, 2) for component in self._mean]
-            expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: check units, axes and signs"
-            raise Contradiction("mean linear_acceleration in the world", mean, expected)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ IMU = (
     Param("serial.baud", 115200, "the sensor's baud rate", (4800, 921600), fixed=True),
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
-          (-1.0, 1.0), fixed=True),
-    Param("rate", 100.0, "nominal sample rate of the IMU", (20.0, 2000.0), "Hz", fixed=True),
+          (-1.0, 1.0), fixed=True, vector=True),
+    Param("rate", 100.0, "nominal sample rate of the IMU", (imu_checks.RateLimits.least, 2000.0), "Hz", fixed=True),
     Param("gyroscope_range", imu_checks.GYROSCOPE_RANGE, "rate at which the gyroscope saturates",
           imu_checks.GYROSCOPE_RANGES, "rad/s", fixed=True),
     Param("accelerometer_range", imu_checks.ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",

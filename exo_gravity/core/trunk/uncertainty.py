@@ -46,6 +46,11 @@ class TiltUncertainty:
         """Create it for samples that are usually `period` s apart."""
         self.period = period  #: s
 
+    @property
+    def unmeasured(self) -> float:
+        """Rotation that was lost of late, in gaps and saturation, rad."""
+        return math.sqrt(self._lost + self.run * self.run)
+
     def add_unmeasured(self, dt: float, change: float, unknown: float, repeated: float) -> bool:
         """Add the rotation that was not measured in `dt` s; return whether the estimate must begin anew.
 

@@ -12,7 +12,6 @@ import can
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.joint_motor import channels_of
-from exo_gravity.core.numbers import JOINT_COUNT
 
 SYSFS = Path("/sys")
 CLASSES = {"socketcan": "net", "slcan": "tty"}  # in sysfs, of the channels of an interface
@@ -46,14 +45,14 @@ def check_serial(interface: str, channel: str, expected: str, sysfs: Path = SYSF
         )
 
 
-def serials_of(serial: str, channel: str) -> tuple[str, ...]:
-    """Return the number of each motor's adapter (n,) that the value of `can.serial` names. Raises ParameterError.
+def serials_of(serial: str, channel: str, count: int) -> tuple[str, ...]:
+    """Return the number of the adapter of each of `count` motors that the value of `can.serial` names.
 
-    channel: the value of `can.channel`.
+    channel: the value of `can.channel`. Raises ParameterError.
     """
-    names, channels = [name.strip() for name in serial.split(",")], channels_of(channel)
+    names, channels = [name.strip() for name in serial.split(",")], channels_of(channel, count)
     if len(names) == 1:
-        names *= JOINT_COUNT
+        names *= count
     if len(names) != len(channels) or len(set(zip(channels, names, strict=True))) != len(set(channels)):
         raise ParameterError("can.serial", serial, f"one number, or one for each motor, as can.channel = {channel}")
     return tuple(names)

@@ -23,9 +23,8 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import JointMotor, buses_of, channels_of
-from exo_gravity.core.motors.wire_formats import EXTENDED, ID_BITS, Frame
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.motors.frames import EXTENDED, ID_BITS, Frame
+from exo_gravity.core.motors.joint_motor import JointMotor, buses_of, channels_of, is_fd
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.adapter import check_serial
 from exo_gravity.hardware.clock import Clock
@@ -40,9 +39,13 @@ Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options o
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason."""
+    """Open a python-can bus of any kind. Raises BusError that names the bus and the reason.
+
+    By these settings alone: python-can's own files and variables (~/.canrc, CAN_CONFIG) belong to other programs.
+    """
     try:
-        bus = can.Bus(interface=interface, channel=channel, **options)
+        number = int(channel) if channel.isdecimal() else channel  # of a channel of an adapter with several
+        bus = can.Bus(channel=number, interface=interface, ignore_config=True, **options)
         if bus.channel_info == can.BusABC.channel_info:  # some backends leave it "unknown"
             bus.channel_info = f"{interface} {channel}"
         return bus
@@ -51,13 +54,21 @@ def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.Bu
 
 
 class CanPort:
-    """Sends and receives classic CAN frames. Not thread-safe: one thread owns it.
+    """Sends and receives frames of classic CAN, or of CAN FD. Not thread-safe: one thread owns it.
 
     reopen: opens the bus again and raises BusError if it cannot; None if a failed bus must stay failed.
+    is_fd: whether it sends CAN FD frames.
     """
 
-    def __init__(self, bus: can.BusABC, clock: Clock, reopen: Callable[[], can.BusABC] | None = None) -> None:
+    def __init__(
+        self,
+        bus: can.BusABC,
+        clock: Clock,
+        reopen: Callable[[], can.BusABC] | None = None,
+        is_fd: bool = False,
+    ) -> None:
         self.name = str(bus.channel_info)  #: name of the bus
+        self.is_fd = is_fd
         self._marks_echoes = not isinstance(bus, SocketcanBus)
         # Frames that were sent and come back, unmarked.
         self._awaited: deque[Frame] = deque(maxlen=MOST_AWAITED if isinstance(bus, UdpMulticastBus) else 0)
@@ -75,7 +86,7 @@ class CanPort:
             bus = self._bus or self._reopening()
             self._awaited.append(frame)
             try:
-                bus.send(message_of(frame))
+                bus.send(message_of(frame, self.is_fd))
             except Exception as error:
                 self._has_lost = True
                 failure = self._failed(bus, error)
@@ -175,19 +186,21 @@ class ArmOnBus:
     motors: Sequence[JointMotor]  #: From shoulder to elbow.
     limits: Limits  #: That it must never exceed.
     period: float  #: s of a control cycle.
-    joints: Sequence[int] = field(default=range(JOINT_COUNT), kw_only=True)  #: (0..3) That are to be reached.
-    serials: Sequence[str] = field(default=("",) * JOINT_COUNT, kw_only=True)  #: (4,) Of adapters; '' for any.
+    joints: Sequence[int] = field(default=(), kw_only=True)  #: From 0 on, that are to be reached; () for all.
+    serials: Sequence[str] = field(default=(), kw_only=True)  #: (n,) Of adapters, '' for any; () for any.
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "joints", tuple(self.joints) or tuple(range(len(self.motors))))
+        object.__setattr__(self, "serials", tuple(self.serials) or ("",) * len(self.motors))
 
     @property
     def parts(self) -> "list[ArmOnBus]":
         """The arm's part on each of its buses."""
-        interface, channel, options = self.address
-        buses = buses_of(channel, options).items()
+        (interface, channel, options), count = self.address, len(self.motors)
+        buses = buses_of(channel, options, count).items()
         parts = ((name, own, [joint for joint in on if joint in self.joints]) for name, (on, own) in buses)
         return [
-            replace(
-                self, address=(interface, name, own), joints=joints, serials=(self.serials[joints[0]],) * JOINT_COUNT
-            )
+            replace(self, address=(interface, name, own), joints=joints, serials=(self.serials[joints[0]],) * count)
             for name, own, joints in parts
             if joints
         ]
@@ -195,19 +208,21 @@ class ArmOnBus:
     def open(self, address: Address) -> can.BusABC:
         """Open one of its buses. Raises BusError, also if it has another adapter."""
         interface, channel, _ = address
-        check_serial(interface, channel, dict(zip(channels_of(self.address[1]), self.serials, strict=True))[channel])
+        channels = channels_of(self.address[1], len(self.motors))
+        check_serial(interface, channel, dict(zip(channels, self.serials, strict=True))[channel])
         return open_bus(*address)
 
     def ports(self, clock: Clock, failures: list[BusError] | None = None) -> list[CanPort | None]:
-        """Open its buses; return the port of each joint's motor (4,), None for one that is not to be reached.
+        """Open its buses; return the port of each joint's motor (n,), None for one that is not to be reached.
 
         failures: receives the error of each bus that cannot be opened, instead of its ports. Without it, raises
         BusError.
         """
-        ports: list[CanPort | None] = [None] * JOINT_COUNT
+        ports: list[CanPort | None] = [None] * len(self.motors)
         for part in self.parts:
             try:
-                port = CanPort(self.open(part.address), clock, partial(self.open, part.address))
+                is_fd_bus = is_fd(part.address[2])
+                port = CanPort(self.open(part.address), clock, partial(self.open, part.address), is_fd_bus)
             except BusError as error:
                 if failures is None:
                     for opened in filter(None, ports):
@@ -233,10 +248,19 @@ def awaited(ports: Sequence[CanPort], timeout: float) -> tuple[Sequence[CanPort]
         return ports, min(timeout, POLL_TIME)
 
 
-def message_of(frame: Frame) -> can.Message:
-    """Return python-can's message of a frame, whose ID contains `EXTENDED` if it has 29 bits."""
+def message_of(frame: Frame, is_fd: bool = False) -> can.Message:
+    """Return python-can's message of a frame, whose ID contains `EXTENDED` if it has 29 bits.
+
+    is_fd: whether it is one of CAN FD, with its data at the higher bit rate.
+    """
     frame_id, data = frame
-    return can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=frame_id >= EXTENDED)
+    return can.Message(
+        arbitration_id=frame_id & ID_BITS,
+        data=data,
+        is_extended_id=frame_id >= EXTENDED,
+        is_fd=is_fd,
+        bitrate_switch=is_fd,
+    )
 
 
 def _close(bus: can.BusABC) -> None:

@@ -1,10 +1,10 @@
-"""The AK motors of one arm, in MIT mode: command all, collect the replies until a deadline.
+"""The motors of one arm, in MIT mode: command all, collect the replies until a deadline.
 
 They are on one python-can bus or on several. All buses are sent their commands before the replies of all are awaited.
 One that fails does not keep the others from theirs.
 
-The wire formats of the boards (core/wire_formats) may differ. A motor of V1 and V2 boards replies only when commanded,
-200-400 us later. A V3 board sends status frames on its own timer: the first one after a command is its reply.
+Families and wire formats of the motors (core/motors) may differ. Most motors reply only when commanded, 200-400 us
+later. A V3 board of an AK motor sends status frames on its own timer: the first one after a command is its reply.
 Frames of other devices are ignored and counted by kind.
 
 A motor obeys every sender. A command to one of our motors that we did not send is answered at once with our own, under
@@ -12,7 +12,9 @@ full damping: until then the other sender's torque acts, and no damping. What it
 up, so for a while all our commands to that motor also hold the joint.
 
 What a motor is sent is the safety machine's decision (core/safety/power.py): this only carries it out. A motor gets one
-frame a cycle, whose reply is awaited: its reply has the ID of the command, and would collide with a second one.
+frame a cycle, whose reply is awaited: its reply has the ID of the command, and would collide with a second one. Motors
+whose replies have an ID of their own may get more. While such a motor is off, its board is also asked for its settings
+(core/motors/boards.py).
 """
 
 import contextlib
@@ -24,20 +26,22 @@ import can
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.boards import Boards
-from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
-from exo_gravity.core.motors.wire_formats import (
+from exo_gravity.core.motors.frames import (
+    ALIAS,
     BROADCAST_ID,
     COMMAND,
+    ELSEWHERE,
     EXTENDED,
     MALFORMED,
     OTHER,
     REPLY,
     SERVO,
+    SETTING,
     Frame,
     WireFormat,
 )
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import OFF, Drive, Send
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
+from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
 from exo_gravity.hardware.can.request_age import Requests
@@ -50,7 +54,8 @@ CORRECTION_PERIOD = 0.001  # s between two corrections of a motor: two correctin
 CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected; the hold fades meanwhile
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
-HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint
+HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint,
+HOLD_STEP = 0.01  # s for which it does so at once, at most: after a stall of the loop the torque must not step
 FOREIGN_COMMAND = "foreign command"
 AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
@@ -58,7 +63,7 @@ AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus
 class MotorBus:
     """The motors of one arm, with different IDs. Not thread-safe: one thread owns it.
 
-    bus: of all motors; or the port of each (4,), None if it is not open: such a joint counts as at rest, without
+    bus: of all motors; or the port of each (n,), None if it is not open: such a joint counts as at rest, without
         torque, and is sent nothing.
     note: called with each drive before its frames are sent.
     reopen: opens `bus` again after a failure.
@@ -73,33 +78,35 @@ class MotorBus:
         reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
+        count = len(motors)
         #: The newest reading of each joint, UNKNOWN before the first reply.
-        self.samples: list[JointSample] = [UNKNOWN] * JOINT_COUNT
+        self.samples: list[JointSample] = [UNKNOWN] * count
         self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind
         self.foreign_commands = 0  #: count of commands to these motors from another sender
         self.foreign_command = ""  #: the last of them, in words
         self.boards = Boards(motors)  #: what keeps them from serving this arm
         self.clock = clock
         self._now = clock.monotonic
-        self._ports = [CanPort(bus, clock, reopen)] * JOINT_COUNT if isinstance(bus, can.BusABC) else list(bus)
+        self._ports = [CanPort(bus, clock, reopen)] * count if isinstance(bus, can.BusABC) else list(bus)
         self._buses = list(dict.fromkeys(port for port in self._ports if port))
         self._failed: dict[CanPort, BusError] = {}  # in this cycle
         self._motors = tuple(motors)
         self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
-        ids: dict[tuple[CanPort | None, WireFormat], list[int]] = {}
+        # The ID of each motor's replies by its own ID, on each bus, for each wire format.
+        self._ids: dict[tuple[CanPort | None, WireFormat], dict[int, int]] = {}
         for port, motor in zip(self._ports, motors, strict=True):
-            ids.setdefault((port, motor.wire_format), []).append(motor.can_id)
-        self._ids = [(port, board, frozenset(can_ids)) for (port, board), can_ids in ids.items()]
+            self._ids.setdefault((port, motor.wire_format), {})[motor.can_id] = motor.reply_id
         self.replies = tuple([motor.wire_format.replies for motor in motors])  #: whether each (n,) replies to commands
         self._asked = frozenset(joint for joint in self._joints if self.replies[joint])
         self._joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+        self._aliased: set[int] = set()  # IDs of motors whose board obeys other IDs, too
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
-        self._drive = OFF  # last sent
+        self._drive = Drive.off(count)  # last sent
         self._has_sent = False  # anything: another owner's motors are left alone
-        self._corrected = [-math.inf] * JOINT_COUNT  # s
-        self._contested = [-math.inf] * JOINT_COUNT  # s of the last foreign command to the motor
-        self._held = [math.nan] * JOINT_COUNT  # rad
+        self._corrected = [-math.inf] * count  # s
+        self._contested = [-math.inf] * count  # s of the last foreign command to the motor
+        self._held = [math.nan] * count  # rad
         self._note = note
         self._answered: set[int] = set()
         self._requests = [Requests() for _ in motors]
@@ -156,6 +163,8 @@ class MotorBus:
                     continue
                 self._requests[joint].sent(now, len(due))
             frames[own] += due
+            if drive.send[joint] is Send.POLL:
+                frames[own] += self.boards.question(joint, now)
         for own, all_due in frames.items():
             self._send(own, *all_due, may_be_lost=True)
         self.unsent = tuple([port in self._failed for port in self._ports])
@@ -165,9 +174,9 @@ class MotorBus:
         for port in self._buses:
             if port not in self._failed:
                 port.confirm()
-        if count < JOINT_COUNT:
+        if count < len(self.samples):
             missing = AT_REST._replace(time=max(self.samples[joint].time for joint in self._joints))
-            self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(JOINT_COUNT))
+            self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(len(self.samples)))
         self._raise_failure()
         return len(self._answered) == count
 
@@ -235,30 +244,39 @@ class MotorBus:
         """Return the kind of a frame, and the ID of its motor: BROADCAST_ID for all V3 boards of a bus, 0 for none."""
         if message.is_error_frame:
             return "error frame", 0
-        if message.is_fd:
+        if message.is_fd and not port.is_fd:
             return "FD frame", 0
         frame_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
-        for own, board, can_ids in self._ids:
+        for (own, board), reply_ids in self._ids.items():
             if own is not port:
                 continue
-            kind, can_id = board.classify(frame_id, message.data, can_ids, message.is_remote_frame)
-            if kind == COMMAND:
-                return ("echo", 0) if port.is_echo(message) else (FOREIGN_COMMAND, can_id)
+            kind, can_id = board.classify(frame_id, message.data, reply_ids, message.is_remote_frame)
+            if kind in (COMMAND, ALIAS):
+                if port.is_echo(message):
+                    return "echo", 0
+                is_obeyed = kind == COMMAND or can_id in self._aliased
+                return (FOREIGN_COMMAND, can_id) if is_obeyed else ("foreign frame", 0)
             if kind != OTHER:
                 return kind, can_id
         return "foreign frame", 0
 
     def _take(self, port: CanPort, message: can.Message) -> None:
         kind, can_id = self._sort(port, message)
+        if kind == SETTING:
+            self.boards.told(self._joint_of[can_id], bytes(message.data), self._now())
+            return
         if kind != REPLY:
             self.ignored[kind] += 1
             if kind == FOREIGN_COMMAND:
                 for joint in self._commanded(port, can_id):
                     self._oppose(joint, bytes(message.data))
-            elif kind in (MALFORMED, SERVO):
-                self.boards.heard(self._joint_of[can_id], kind, bytes(message.data), self._now())
+            elif kind in (MALFORMED, SERVO, ELSEWHERE):
+                frame = message.arbitration_id, bytes(message.data)
+                self.boards.heard(self._joint_of[can_id], kind, frame, self._now())
             return
         joint, now = self._joint_of[can_id], self._now()
+        if len(message.data) == self._motors[joint].wire_format.alias_length:
+            self._aliased.add(can_id)
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
@@ -280,7 +298,8 @@ class MotorBus:
         position = sample.position
         if self._hold(joint, sample.time):
             away = position - self._held[joint]
-            step = max(HOLD_SPEED * (sample.time - self.samples[joint].time), abs(away) - HOLD_REACH)
+            passed = min(HOLD_STEP, sample.time - self.samples[joint].time)
+            step = max(HOLD_SPEED * passed, abs(away) - HOLD_REACH)
             position = self._held[joint] + math.copysign(min(step, abs(away)), away)
         self._held[joint] = position
 
@@ -311,7 +330,7 @@ class MotorBus:
         if foreign in [data for _, data in motor.set_zero]:
             self._held[joint] = math.nan  # not held in this contest: a reply may still count from the old zero
         command = self._command(joint, now)
-        is_exit = foreign in [data for _, data in motor.exit]
+        is_exit = foreign in motor.wire_format.stops
         if is_exit or now - self._corrected[joint] >= CORRECTION_PERIOD:
             self._send(self._ports[joint], *(motor.enter if is_exit else ()), command)
             self._corrected[joint] = now

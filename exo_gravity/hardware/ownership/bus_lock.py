@@ -18,14 +18,13 @@ import re
 import socket
 import stat
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.safety.drive import COMMANDS, OFF, Drive
-from exo_gravity.core.safety.limits import DAMPING, MAX_COMMAND
+from exo_gravity.core.numbers import MAX_JOINTS
+from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
@@ -37,9 +36,9 @@ NAME = "\0exo_gravity/"  # the first character makes a socket's name abstract
 FOLDERS = ("/run/lock", "/dev/shm", "/tmp")
 FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a pipe there
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
-NOTE = struct.Struct("=10d")  # the first fields of `DriveNotes`, written at once
-# Of motors that may be on: the first frames hold.
-UNKNOWN_DRIVE = Drive(NO_TORQUE, (DAMPING,) * JOINT_COUNT, COMMANDS, True)
+# By the number of joints: the first fields of `DriveNotes`, written at once.
+NOTES = [struct.Struct(f"={3 + 2 * count}d") for count in range(MAX_JOINTS + 1)]
+UNKNOWN_DRIVE = Drive((), (), (), True)  # of motors that may be on
 
 
 class DriveNotes(ctypes.Structure):
@@ -52,8 +51,8 @@ class DriveNotes(ctypes.Structure):
     _fields_ = (
         ("time", ctypes.c_double),  #: s, of the last note
         ("_powered", ctypes.c_double),
-        ("_effort", ctypes.c_double * JOINT_COUNT),
-        ("_damping", ctypes.c_double * JOINT_COUNT),
+        ("_count", ctypes.c_double),
+        ("_values", ctypes.c_double * (2 * MAX_JOINTS)),
         ("heartbeat", ctypes.c_double),  #: s, at which the watchdog last ran; 0 before it runs
         ("_owner", ctypes.c_char * 512),
     )
@@ -61,13 +60,23 @@ class DriveNotes(ctypes.Structure):
 
     def note(self, drive: Drive) -> None:
         """Note what the motors are about to receive, and whether one may be on."""
-        NOTE.pack_into(self, 0, self.clock.monotonic(), drive.powered, *drive.effort, *drive.damping)
+        count = len(drive.effort)
+        NOTES[count].pack_into(self, 0, self.clock.monotonic(), drive.powered, count, *drive.effort, *drive.damping)
 
     @property
     def drive(self) -> Drive:
-        """What the motors received last."""
+        """What the motors received last; of as many motors as were noted, of none before the first note."""
         powered = bool(self._powered)
-        return Drive(tuple(self._effort), tuple(self._damping), COMMANDS if powered else OFF.send, powered)
+        count = int(self._count) if self._count in range(MAX_JOINTS + 1) else 0
+        values = self._values[: 2 * count]
+        send = Send.COMMAND if powered else Send.POLL
+        return Drive(tuple(values[:count]), tuple(values[count:]), (send,) * count, powered)
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether these are no notes: numbers that no drive has."""
+        drive = self.drive
+        return self._count != len(drive.effort) or not all(abs(x) <= MAX_EFFORT for x in drive.effort + drive.damping)
 
     @property
     def owner(self) -> str:
@@ -107,7 +116,7 @@ class BusLock:
             os.ftruncate(self.descriptor, mmap.PAGESIZE)
         self.notes = DriveNotes.from_buffer(mmap.mmap(self.descriptor, mmap.PAGESIZE))  #: the shared page
         self.notes.clock = clock
-        if not all(abs(value) <= MAX_COMMAND for value in self.notes.drive.effort + self.notes.drive.damping):
+        if self.notes.is_damaged:
             self.problem = f"{path}: damaged"
         if self.problem:
             self.notes.note(UNKNOWN_DRIVE)
@@ -125,15 +134,16 @@ class BusLock:
 class ArmNotes:
     """The notes of all buses of an arm as one; every bus has the notes of the whole arm.
 
-    pages: of the bus of each joint's motor (4,).
-    joints: (0..3) on whose buses to note.
+    pages: of the bus of each joint's motor (n,).
+    joints: from 0 on, on whose buses to note; None for all.
     clock: of the times of the notes.
     """
 
-    def __init__(self, pages: Sequence[DriveNotes], joints: Sequence[int] = range(JOINT_COUNT)) -> None:
+    def __init__(self, pages: Sequence[DriveNotes], joints: Sequence[int] | None = None) -> None:
         self.clock = pages[0].clock
         self._pages = pages
-        self.noted = list({id(pages[joint]): pages[joint] for joint in joints}.values())  #: those of these joints
+        noted = pages if joints is None else [pages[joint] for joint in joints]
+        self.noted = list({id(page): page for page in noted}.values())  #: those of these joints
 
     def of(self, joints: Sequence[int]) -> "ArmNotes":
         """Return the notes of the buses of these joints alone."""
@@ -146,10 +156,17 @@ class ArmNotes:
 
     @property
     def drive(self) -> Drive:
-        """What the motors received last; powered if they may be on on one bus."""
-        drives = [page.drive for page in self._pages]
-        effort, damping = zip(*((drive.effort[i], drive.damping[i]) for i, drive in enumerate(drives)), strict=True)
-        return Drive(effort, damping, COMMANDS, any(drive.powered for drive in drives))
+        """What the motors received last; powered if they may be on on one bus.
+
+        Without torque, under full damping, where that is not known: the notes may be those of another arm.
+        """
+        drives, count = [page.drive for page in self._pages], len(self._pages)
+        columns = [
+            (drive.effort[i], drive.damping[i]) if len(drive.effort) == count else (0.0, DAMPING)
+            for i, drive in enumerate(drives)
+        ]
+        effort, damping = zip(*columns, strict=True)
+        return Drive(effort, damping, (Send.COMMAND,) * count, any(drive.powered for drive in drives))
 
     @property
     def time(self) -> float:
@@ -179,13 +196,25 @@ class ArmLock:
         except BaseException:
             self.release()
             raise
-        self.of_joints = [own[joint] for joint in range(JOINT_COUNT)]  #: (4,) of the bus of each joint's motor
+        self.of_joints = [own[joint] for joint in range(len(arm.motors))]  #: (n,) of the bus of each joint's motor
         self.notes = ArmNotes([lock.notes for lock in self.of_joints])
 
     def release(self) -> None:
         """Give up all buses: they are free once the watchdog has ended, too."""
         for lock in self.locks:
             lock.release()
+
+
+@contextlib.contextmanager
+def borrowed(address: Address) -> Iterator[str]:
+    """Keep others from the bus at `address`, whose notes stay as they are; yields who holds it already, or ''."""
+    try:
+        lock = _lock(address, 0.0, COMPUTER_CLOCK, asks=False)
+    except BusError:
+        yield _holder(address)
+        return
+    with lock:
+        yield ""
 
 
 def is_asked_for(lock: socket.socket) -> bool:

@@ -138,8 +138,9 @@ class Watchdog:
         receiver, self._sender = Pipe(duplex=False)
         pages, locks = [own.descriptor for own in lock.of_joints], [own.socket.fileno() for own in lock.locks]
         shared = (receiver.fileno(), *pages, *locks)
+        arguments = map(str, (os.getpid(), len(pages), *shared))
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *map(str, (os.getpid(), *shared))],
+            [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *arguments],
             pass_fds=shared,
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keeps Ctrl-C and Ctrl-Z in the terminal away from it

@@ -27,7 +27,6 @@ from queue import SimpleQueue
 
 import can
 
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour
@@ -122,22 +121,23 @@ def write_log(lines: SimpleQueue[str]) -> None:
 
 
 def main() -> None:
-    """Entry point of the process; arguments: the bridge's PID, and the descriptors of pipe, notes and locks.
+    """Entry point of the process.
 
-    The notes are those of the bus of each joint's motor, the locks those of the buses.
+    Arguments: the bridge's PID, the number of joints, and the descriptors of pipe, notes and locks. The notes are those
+    of the bus of each joint's motor, the locks those of the buses.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     favour(20)
-    bridge, receiver, *shared = map(int, sys.argv[1:])
-    pages = {page: DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)) for page in shared[:JOINT_COUNT]}
-    locks = [socket.socket(fileno=lock) for lock in shared[JOINT_COUNT:]]
+    bridge, count, receiver, *shared = map(int, sys.argv[1:])
+    pages = {page: DriveNotes.from_buffer(mmap.mmap(page, mmap.PAGESIZE)) for page in shared[:count]}
+    locks = [socket.socket(fileno=lock) for lock in shared[count:]]
     log: SimpleQueue[str] = SimpleQueue()
     writer = threading.Thread(target=write_log, args=(log,), daemon=True)
     writer.start()
     code = guard(
         lambda: os.kill(bridge, signal.SIGKILL),
-        ArmNotes([pages[page] for page in shared[:JOINT_COUNT]]),
+        ArmNotes([pages[page] for page in shared[:count]]),
         Connection(receiver, writable=False),
         log.put,
         lambda: any(map(is_asked_for, locks)),

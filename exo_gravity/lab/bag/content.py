@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from exo_gravity.core.params import Param, params_of
+from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.source import source_of
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
 
@@ -47,6 +49,11 @@ def leaf(topic: str) -> str:
 def arm_of(name: str) -> str:
     """Return the namespace of a topic or node without slashes, 'arm' for the root namespace."""
     return name.rpartition("/")[0].strip("/") or "arm"
+
+
+def source_key(arm: str) -> str:
+    """Return the key of an arm's source in `custom_data` of metadata.yaml: 'source.right'."""
+    return f"source.{arm}"
 
 
 def is_wanted(topic: str, msgtype: str) -> bool:
@@ -92,15 +99,24 @@ class Bag:
     trunk: np.ndarray = field(default_factory=lambda: np.empty((0, 7)))
     #: its tilt as published on `/imu/pitch_yaw`, (n, 3): s since the start, pitch and roll in rad
     tilt: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    sources: dict[str, Source] = field(default_factory=dict)  #: what the arms' nodes say of them, by arm
+
+    def source(self, arm: str) -> Source:
+        """Return whether `arm` was simulated: as its nodes say, else by their parameters."""
+        from exo_gravity.lab.inputs.arms import recorded_of  # not for the nodes that record and show
+        from exo_gravity.lab.inputs.parameter_file import node_of
+
+        has_simulator = node_of(arm, "simulator") in self.parameters
+        return self.sources.get(arm) or source_of(recorded_of(self.parameters, arm, "can_bridge"), has_simulator)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return the time series, a row for each arm, sample and joint: columns of equal length by their names.
 
         subject: the session's code; arm, joint; time_s since the start; step: of the script from 1 on, and its action,
         0 and '' outside of it; carried: whether the motors carried the arm; position_rad, velocity_rad_per_s,
-        torque_nm as measured, command_nm as requested, NaN where unknown.
+        torque_nm as measured, command_nm as requested, NaN where unknown; source: simulated, real or unknown.
         """
-        arms = [_columns(recording) for recording in self.recordings]
+        arms = [_columns(recording, self.source(recording.name)) for recording in self.recordings]
         columns = {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
         return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
 
@@ -114,7 +130,7 @@ class Bag:
         return pandas.DataFrame(self.columns())
 
 
-def _columns(recording: Recording) -> dict[str, np.ndarray]:
+def _columns(recording: Recording, source: Source) -> dict[str, np.ndarray]:
     time, joints = recording.time, len(recording.joint_names)
     step, action = np.zeros(len(time), int), np.full(len(time), "", object)
     for number, one in enumerate(recording.steps, 1):
@@ -131,6 +147,7 @@ def _columns(recording: Recording) -> dict[str, np.ndarray]:
         "joint": np.tile(np.array(recording.joint_names, object), len(time)),
         **{name: np.repeat(column, joints) for name, column in shared.items()},
         **{name: np.ravel(column) for name, column in zip(names, values, strict=True)},
+        "source": np.full(len(time) * joints, source.value, object),
     }
 
 

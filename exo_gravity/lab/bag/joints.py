@@ -27,11 +27,16 @@ class JointSeries(NamedTuple):
 
 
 class JointArrays:
-    """Collects the joint states of one topic. fields: those of a message that are kept."""
+    """Collects the joint states of one topic.
 
-    def __init__(self, topic: str, fields: Sequence[str] = FIELDS) -> None:
-        self.topic, self.fields, self.count = topic, tuple(fields), 0
+    fields: those of a message that are kept.
+    every: of the messages with the same joints, the first of so many is kept.
+    """
+
+    def __init__(self, topic: str, fields: Sequence[str] = FIELDS, every: int = 1) -> None:
+        self.topic, self.fields, self.every, self.count = topic, tuple(fields), every, 0
         self.decoder = Decoder(JOINT_STATE)
+        self._seen: dict[tuple[str, ...], int] = {}  # messages by their joints, also those that are not kept
         self._parts: dict[tuple[str, ...], list[Part]] = {}  # by the joints, in order of appearance
 
     def add(self, ordinals: np.ndarray, batch: Batch) -> None:
@@ -43,6 +48,9 @@ class JointArrays:
                 self.decoder.damaged += len(index)
                 self.decoder.problem = f"a joint state has {given} values for the joints {', '.join(names)}"
                 continue
+            seen = self._seen.get(names, 0)
+            self._seen[names] = seen + len(index)
+            index, numbers = (column[-seen % self.every :: self.every] for column in (index, numbers))
             stamp = numbers["header.stamp.sec"].astype(np.int64) * 1_000_000_000 + numbers["header.stamp.nanosec"]
             # float32 is 1000 times finer than a position code.
             values = np.full((len(index), len(self.fields), len(names)), np.nan, np.float32)

@@ -46,7 +46,7 @@ class Layout(NamedTuple):
     """Where the numbers lie in messages of one length."""
 
     numbers: np.dtype[np.void]  #: by their paths, such as 'header.stamp.sec'
-    constant: tuple[slice, ...]  #: bytes that messages of this layout share: header, lengths and texts
+    constant: np.dtype[np.void]  #: bytes that messages of this layout share: header, lengths and texts, as words
     texts: dict[str, tuple[str, ...]]  #: by their paths
 
 
@@ -125,7 +125,19 @@ def layout_of(message: bytes, msgtype: str) -> Layout:
         raise DataError(f"a message is damaged, or is not a {msgtype} in CDR ({error})") from None
     formats, offsets = zip(*walk.numbers.values(), strict=True) if walk.numbers else ((), ())
     form: Any = {"names": [*walk.numbers], "formats": formats, "offsets": offsets, "itemsize": len(message)}
-    return Layout(np.dtype(form), _joined(walk.constant), walk.texts)
+    return Layout(np.dtype(form), _words(walk.constant, len(message)), walk.texts)
+
+
+def _words(parts: list[slice], size: int) -> np.dtype[np.void]:
+    """Return the bytes `parts` of a message of `size` bytes as words, which may overlap: words are compared fast."""
+    words: dict[int, int] = {}  # where each begins: its bytes
+    for part in _joined(parts):
+        length = part.stop - part.start
+        width = next(width for width in (8, 4, 2, 1) if width <= length)
+        words |= dict.fromkeys((*range(part.start, part.stop - width, width), part.stop - width), width)
+    names, formats = [str(at) for at in words], [f"u{width}" for width in words.values()]
+    form: Any = {"names": names, "formats": formats, "offsets": [*words], "itemsize": size}
+    return np.dtype(form)
 
 
 def _joined(parts: list[slice]) -> tuple[slice, ...]:
@@ -159,7 +171,7 @@ class Decoder:
                     chosen, rows = chosen[1:], rows[1:]
                     continue
                 layout, _ = self._known[length]
-                yield Decoded(chosen[same], layout, np.ascontiguousarray(rows[same]).view(layout.numbers)[:, 0])
+                yield Decoded(chosen[same], layout, rows[same].view(layout.numbers)[:, 0])
                 chosen, rows = chosen[~same], rows[~same]
             for index, row in zip(chosen, rows, strict=True):  # layouts that change with every message
                 if own := self._layout(row):
@@ -185,16 +197,22 @@ class Decoder:
             return None
 
 
+def records_at(data: np.ndarray, start: np.ndarray, form: np.dtype[np.void]) -> np.ndarray:
+    """Return the records (n,) of a form that begin at `start` (n,) in data, (bytes,) uint8, which holds all of them."""
+    count = max(len(data) - form.itemsize + 1, 0)
+    # Whole records are copied several times as fast as rows of bytes are.
+    raw = np.ndarray(count, np.dtype((np.void, form.itemsize)), data, strides=(1,))
+    return raw[start].view(form)
+
+
 def _rows(data: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
-    """Return the messages (n, length) of equal length at `start` in data."""
+    """Return the messages (n, length) of equal length at `start` in data, as bytes."""
     if not length:
         return np.empty((len(start), 0), np.uint8)
-    return np.lib.stride_tricks.sliding_window_view(data, length)[start]
+    return records_at(data, start, np.dtype((np.void, length))).view(np.uint8).reshape(-1, length)
 
 
 def _equal(rows: np.ndarray, layout: Layout, one: np.ndarray) -> np.ndarray:
     """Return whether each row shares the constant bytes of the message `one`."""
-    same = np.ones(len(rows), bool)
-    for part in layout.constant:
-        same &= (rows[:, part] == one[part]).all(axis=1)
+    same: np.ndarray = rows.view(layout.constant)[:, 0] == one.view(layout.constant)[0]
     return same

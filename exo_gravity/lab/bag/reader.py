@@ -22,7 +22,7 @@ from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
-from exo_gravity.core.vocabulary import NONE
+from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
 from exo_gravity.lab.bag.content import (
@@ -65,17 +65,20 @@ class Plausible:
 
 
 PLAUSIBLE = Plausible()
+KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
 
 
-def read_bag(path: str | Path) -> Bag:
+def read_bag(path: str | Path, every: int = 1) -> Bag:
     """Read a recording: a rosbag2 folder, or an .mcap or .db3 file, complete or cut short.
+
+    every: of each arm's samples, the first of so many is kept. Each has the command that was in force.
 
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
-    storage, contents = Storage(path), _Contents()
+    storage, contents = Storage(path), _Contents(every)
     for rows in storage.rows(content.is_wanted):
         contents.add(rows)
     contents.conclude(storage)
@@ -107,6 +110,7 @@ def read_bag(path: str | Path) -> Bag:
     return Bag(
         Path(path), start, recordings, events, contents.parameters, tuple(contents.notes), tuple(contents.problems),
         contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
+        contents.sources,
     )  # fmt: skip
 
 
@@ -174,15 +178,17 @@ def _pitch_and_roll(tilt: np.ndarray) -> np.ndarray:
 
 
 class _Contents:
-    """Collects the messages of a recording, topic by topic."""
+    """Collects the messages of a recording, topic by topic. every: see `read_bag`."""
 
-    def __init__(self) -> None:
+    def __init__(self, every: int) -> None:
+        self.every = every
         self.joints: dict[str, JointArrays] = {}
         self.parameters: dict[str, str] = {}
         self.losses = ""
         self.session = Session()
         self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
+        self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
         self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
         self.notes: list[str] = []
@@ -203,7 +209,8 @@ class _Contents:
             ordinals = self._count + chosen
             if msgtype == JOINT_STATE:
                 if topic not in self.joints:
-                    self.joints[topic] = JointArrays(topic, FIELDS if leaf(topic) == STATES else ("effort",))
+                    kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
+                    self.joints[topic] = JointArrays(topic, *kept)
                 self.joints[topic].add(ordinals, batch)
             elif topic in (content.IMU, content.TILT_TOPIC):
                 (self.trunk if topic == content.IMU else self.tilt).add(ordinals, batch)
@@ -327,6 +334,10 @@ class _Contents:
         for entry in status.values:
             if entry.key == "state" and entry.value and leaf(status.name) == BRIDGE:
                 self._states.setdefault(arm_of(status.name), []).append((row, entry.value))
+        if leaf(status.name) == "simulator":
+            self.sources[arm_of(status.name)] = Source.SIMULATED
+        elif leaf(status.name) == BRIDGE and values.get("source") in KNOWN:
+            self.sources.setdefault(arm_of(status.name), Source(values["source"]))
 
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""

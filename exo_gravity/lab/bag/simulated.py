@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.safety.drive import State
-from exo_gravity.core.vocabulary import TEXT
+from exo_gravity.core.vocabulary import TEXT, Source
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import JOINT_STATE, STRING, Event, NodeStatus
 from exo_gravity.lab.bag.layout import TYPES
@@ -41,6 +41,8 @@ def write_recordings(
     ]
     messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
+    for arm in arms:
+        writer.describe(content.source_key(arm.name), Source.SIMULATED.value)
     for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
         writer.add_topic(topic, kind, offered_qos(True, topic in (content.PARAMETERS, content.SESSION), 1))
     writer.write([_serialised(start, *message) for message in messages])
@@ -53,7 +55,7 @@ def _of_arm(arm: Recording) -> Iterator[Unsent]:
     """Yield the states of an arm and its bridge, the commands, and the steps of the script."""
     carried = [(now, State.ACTIVE) for span in arm.carried or () for now in span]
     for now, state in (*carried, (float(arm.time[-1]), State.DISABLED)):
-        yield _status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value)
+        yield _status(now, 0, f"{arm.name}/can_bridge", state.value, state=state.value, source=Source.SIMULATED.value)
     for index, step in enumerate(arm.steps):
         text = json.dumps({"step": index, "action": step.action, "duration": step.end - step.start})
         yield f"/{arm.name}/{content.STEPS}", step.start, STRING, (text,)

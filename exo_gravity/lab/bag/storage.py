@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from io import BytesIO
+from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,16 +33,20 @@ from mcap.records import Channel, Chunk, Schema
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.clock import LATEST, SECOND
-from exo_gravity.lab.bag.layout import Batch
+from exo_gravity.lab.bag.layout import Batch, records_at
 
 MAGIC = b"\x89MCAP0\r\n"
 ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
-MESSAGE = struct.Struct("<H4xQ8x")  # channel, log time; the serialised message follows
+HEAD = np.dtype(  # of a message's record; the serialised message follows
+    {"names": ["size", "channel", "time"], "formats": ["<u8", "<u2", "<u8"], "offsets": [1, 9, 15], "itemsize": 31}
+)
+LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most
 BLOCK = 2**20  # bytes that are decompressed at once
+REPAIRED = "_repaired"  # with which the names of complete copies end
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
 Topic = tuple[str, str]  # name, type
@@ -187,22 +192,29 @@ class Storage:
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
             found: list[tuple[Any, Any, Any]] = []
             try:
-                for row in database.execute(query, list(chosen)):
-                    found.append(row)
-                    if len(found) == ROWS:
-                        yield from self._whole(found, chosen)
-                        found = []
+                cursor = database.execute(query, list(chosen))
+                while True:
+                    for row in islice(cursor, ROWS):  # not fetchmany, which loses the rows before the damage
+                        found.append(row)
+                    if not found:
+                        return
+                    yield from self._whole(found, chosen)
+                    found = []
             except sqlite3.Error as error:  # the rows before the damage are kept
                 self.cut_short = f"{file.name} {error}"
             yield from self._whole(found, chosen)
 
     def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[StoredRows]:
         """Yield rows of a database without those that are damaged, which have values of other types."""
-        whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
-        self.damaged += len(found) - len(whole)
-        if whole:
-            numbers, stamps, data = zip(*whole, strict=True)
-            yield StoredRows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
+        if not found:
+            return
+        numbers, stamps, data = zip(*found, strict=True)
+        if {*map(type, stamps)} != {int} or {*map(type, data)} != {bytes}:
+            whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
+            self.damaged += len(found) - len(whole)
+            yield from self._whole(whole, chosen)
+            return
+        yield StoredRows(chosen, np.array(numbers), _batch(data, np.array(stamps, np.int64)))
 
 
 class _McapFile:
@@ -216,56 +228,52 @@ class _McapFile:
 
     def rows(self, data: bytes | mmap, at: int) -> Iterator[StoredRows]:
         """Yield the messages among the records from `at` on, also those in chunks, up to a cut or damage."""
-        end, size, unpack, unpack_message = len(data), RECORD.size, RECORD.unpack_from, MESSAGE.unpack_from
-        chosen, buffer = self.chosen, np.frombuffer(data, np.uint8)
-        numbers: list[int] = []
-        stamps: list[int] = []
-        starts: list[int] = []
-        ends: list[int] = []
-
-        def taken() -> Iterator[StoredRows]:
-            if numbers:
-                start = np.array(starts) + MESSAGE.size
-                batch = Batch(buffer, start, np.array(ends) - start, plausible(np.array(stamps, np.uint64)))
-                yield StoredRows(chosen, np.array(numbers), batch)
-                for column in (numbers, stamps, starts, ends):
-                    column.clear()
-
+        end, size, unpack, buffer = len(data), RECORD.size, RECORD.unpack_from, np.frombuffer(data, np.uint8)
+        found: list[int] = []  # where records of messages begin
         while at + size <= end:
             opcode, length = unpack(data, at)
             begin, after = at + size, at + size + length
             if after > end:
                 if opcode == Opcode.CHUNK and (content := _of_cut_chunk(bytes(data[begin:]))):
-                    yield from taken()
+                    yield from self._messages(buffer, found)
                     yield from self.rows(content, 0)
                 break
-            at = after
-            if opcode == MESSAGE_OPCODE:
-                if length < MESSAGE.size:
-                    self.storage.damaged += 1
-                    continue
-                number, stamp = unpack_message(data, begin)
-                if number in chosen:
-                    numbers.append(number)
-                    stamps.append(stamp)
-                    starts.append(begin)
-                    ends.append(after)
-                    if len(numbers) >= ROWS:
-                        yield from taken()
+            if opcode == MESSAGE_OPCODE and length >= LEAST:  # nothing else is done for each message
+                found.append(at)
+                at = after
+                if len(found) == ROWS:
+                    yield from self._messages(buffer, found)
                 continue
+            at = after
             if opcode == Opcode.CHUNK:
-                yield from taken()
+                yield from self._messages(buffer, found)
                 if content := self._chunk(bytes(data[begin:after])):
                     yield from self.rows(content, 0)
                     if self.at < len(content):
                         self.storage.damaged += 1
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                yield from self._messages(buffer, found)
                 self._describe(opcode, bytes(data[begin:after]))
             elif opcode == Opcode.DATA_END:
                 self.is_complete = True
                 break
-        yield from taken()
+            elif opcode == MESSAGE_OPCODE:
+                self.storage.damaged += 1
+        yield from self._messages(buffer, found)
         self.at = at
+
+    def _messages(self, data: np.ndarray, found: list[int]) -> Iterator[StoredRows]:
+        """Yield the messages of the chosen topics whose records begin at `found` in data, and empty that list."""
+        if not found:
+            return
+        start = np.array(found)
+        found.clear()
+        head = records_at(data, start, HEAD)
+        chosen = np.isin(head["channel"], np.array([*self.chosen], np.uint16))
+        if chosen.any():
+            start, head = start[chosen], head[chosen]
+            batch = Batch(data, start + HEAD.itemsize, head["size"].astype(np.int64) - LEAST, plausible(head["time"]))
+            yield StoredRows(self.chosen, head["channel"].astype(np.int64), batch)
 
     def _chunk(self, record: bytes) -> bytes | None:
         """Return the records in a chunk; None if it is damaged, and counted."""

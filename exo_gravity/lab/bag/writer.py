@@ -21,7 +21,7 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.bag.storage import REPAIRED, Storage
 
 FLUSH_PERIOD = 0.5  # s
 MAX_WAITING = 2_000  # batches: 100 s at 20 Hz, about 100 MB of two arms at 500 Hz
@@ -89,6 +89,10 @@ class BagWriter:
             pass
         self.lost += len(messages)
 
+    def describe(self, key: str, value: str) -> None:
+        """State something about the recording, for `custom_data` in metadata.yaml."""
+        self._writer.set_custom_data(key, value)
+
     def close(self) -> None:
         """Write the queued messages, the index and metadata.yaml. A failure is in `error`."""
         self._ending.set()
@@ -150,7 +154,7 @@ def repair(path: str | Path) -> tuple[Path, int]:
     source = Storage(path)
     if other := next((file for file in source.files if file.suffix != ".mcap"), None):
         raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
-    folder = source.path.resolve().with_name(f"{source.path.resolve().stem}_repaired")
+    folder = source.path.resolve().with_name(f"{source.path.resolve().stem}{REPAIRED}")
     types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0
     try:
         for count, (topic, msgtype, stamp, data) in enumerate(source.messages(lambda topic, msgtype: bool(msgtype)), 1):

@@ -1,13 +1,18 @@
-"""Finds the AK motors on a bus without moving any, on boards of V1, V2 and V3.
+"""Finds the motors of all families on a bus without moving any.
 
-V1 and V2 boards: a motor that is off still answers a command frame. The scan sends each ID a command with damping
-alone, whose bytes are the same for every motor type: the gains' ranges are, and the other ranges are symmetric. ENTER
-is never sent, so torque never flows; a motor that was left on lowers its joint under damping. IDs above `MAX_CAN_ID`
-are not scanned: there, an echoed command could be taken for a reply.
+Each ID is asked what a motor of each family answers with its state (`WireFormat.questions`), those first that can have
+few IDs: who has answered is not asked again.
 
-V3 boards: they are found by their status frames, and are never sent anything, because a command switches them on. V1
-and V2 boards in servo mode send the same frames. Only their rate tells them apart: 50 a second as delivered, where a V3
-board must be set to 200 at least.
+V1 and V2 boards of AK motors: a motor that is off still answers a command frame. The scan sends each ID a command with
+damping alone, whose bytes are the same for every motor type: the gains' ranges are, and the other ranges are symmetric.
+ENTER is never sent, so torque never flows; a motor that was left on lowers its joint under damping. IDs above
+`MAX_CAN_ID` are not scanned: there, an echoed command could be taken for a reply.
+
+V3 boards of AK motors: they are found by their status frames, and are never sent anything, because a command switches
+them on. V1 and V2 boards in servo mode send the same frames. Only their rate tells them apart: 50 a second as
+delivered, where a V3 board must be set to 200 at least.
+
+Damiao motors: they have a question of their own, which commands nothing.
 """
 
 import contextlib
@@ -19,35 +24,40 @@ from typing import Any, NamedTuple
 import can
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE
-from exo_gravity.core.motors.specs import MOTORS, pack_command
-from exo_gravity.core.motors.wire_formats import COMMAND, EXTENDED, MIT, MIT_V3, REPLY
-from exo_gravity.core.safety.limits import DAMPING
+from exo_gravity.core.motors.ak import FAMILY, MIT
+from exo_gravity.core.motors.families import FAMILIES, MOTORS, every_family
+from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, Frame, WireFormat
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, is_fd
 from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 
-SPEC = next(iter(MOTORS.values()))  # it scales positions alone, with the usual range
-DAMPED = pack_command(SPEC, 0.0, 0.0, 0.0, DAMPING, 0.0)
+SPEC = MOTORS["AK60-6"]  # it scales positions alone, with the usual range
 ALL_IDS = range(1, MAX_CAN_ID + 1)
 REPLY_TIME = 0.01  # s: a motor replies within 0.4 ms; a USB adapter and a busy computer add some
 COMMANDS = 2  # to each ID, in case a frame is lost
 SERVO_RATE = 75.0  # status frames a second below which a board is no V3 board that an arm can use
 STATUS_TIME = 0.12  # s in which the next status frame of a V3 board is awaited
-IDS = frozenset(range(1, 256))
+IDS = dict.fromkeys(range(1, 256), 0)  # that boards which report by themselves may have, and any reply ID
 
 
 class MotorAnswer(NamedTuple):
     """What a motor replied."""
 
     can_id: int
-    reply_id: int  #: Arbitration ID: the motor's own or 0, or that of a V3 board's status frames.
+    reply_id: int  #: Arbitration ID: the motor's own or 0, another one, or that of a V3 board's status frames.
     reply_length: int  #: 6, 7 or 8 bytes.
-    position: float  #: Motor angle in rad.
+    position: float  #: Motor angle in rad, with a wire range of 12.5 rad.
     temperature: int | None  #: degC; None from firmware that replies with 6 or 7 bytes.
-    error: int | None  #: The error byte; None likewise.
+    error: int | None  #: The board's code of an error; None likewise.
     wire_format: str = MIT.name  #: Name of the board's format.
+    family: str = FAMILY  #: Of the motor.
+
+    @property
+    def board(self) -> WireFormat:
+        """The motor's wire format."""
+        return FAMILIES[self.family].formats[self.wire_format]
 
 
 class ArmScan(contextlib.ExitStack):
@@ -103,7 +113,11 @@ class BusScan(contextlib.ExitStack):
         super().__init__()
         self._now = clock.monotonic
         self.name = address[1]
-        self._v3: dict[int, MotorAnswer] = {}  # the newest status of each V3 board
+        boards = [board for family in every_family() for board in family.formats.values()]
+        self._asked = sorted((board for board in boards if board.questions(1)), key=lambda board: board.last_id)
+        self._reporting = [board for board in boards if not board.questions(1)]
+        self._boards: dict[int, WireFormat] = {}  # of each motor that has answered or reported
+        self._v3: dict[int, MotorAnswer] = {}  # the newest status of each board that reports by itself
         self._gaps: dict[int, float] = {}  # s, the shortest between two of their status frames
         lock = BusLock(address, f"calibrate motors (PID {os.getpid()})", clock=clock)
         self.callback(lock.release)
@@ -113,7 +127,7 @@ class BusScan(contextlib.ExitStack):
                     f"CAN bus {self.name}: the last can_bridge died and may have left the motors on: start can_bridge, "
                     "which lets the arm down, and stop it"
                 )
-            self._port = CanPort(open_bus(*address), clock)
+            self._port = CanPort(open_bus(*address), clock, is_fd=is_fd(address[2]))
             self.callback(self._port.close)
             heard_at: dict[int, float] = {}
             for message, kind, answer in self._frames(LISTEN_TIME):
@@ -135,10 +149,13 @@ class BusScan(contextlib.ExitStack):
         """Ask every ID; return who answers, by ID, and what is wrong with the bus or an ID. Raises BusError."""
         found = {can_id: self._v3[can_id] for can_id in can_ids if can_id in self._v3}
         problems: dict[str, None] = {}
-        for can_id in sorted(set(can_ids) - set(found)):
+        asked = [(board, can_id) for can_id in sorted(can_ids) for board in self._asked if can_id <= board.last_id]
+        for board, can_id in asked:
             for sent in range(1, COMMANDS + 1):
+                if can_id in found and sent == 1:
+                    break
                 angles = []
-                for message, answer in self._ask(can_id):
+                for message, answer in self._ask(board, can_id):
                     if answer is None:
                         what = f"a frame with ID {message.arbitration_id} [{message.data.hex(' ')}]"
                         problems[f"ID {can_id}: {what} follows a command, and is no motor's reply"] = None
@@ -169,7 +186,7 @@ class BusScan(contextlib.ExitStack):
         reporting = set(can_ids) & set(self._v3)
         found: dict[int, MotorAnswer] = {}
         for can_id in set(can_ids) - reporting:
-            for _, answer in self._ask(can_id):
+            for _, answer in self._ask(self._boards[can_id], can_id):
                 if answer:
                     found[answer.can_id] = answer
                     if answer.can_id == can_id:
@@ -182,28 +199,48 @@ class BusScan(contextlib.ExitStack):
                 break
         return found
 
-    def _ask(self, can_id: int) -> Iterator[tuple[can.Message, MotorAnswer | None]]:
-        """Send one command; yield the frames with 11-bit IDs that arrive within REPLY_TIME, each with its answer."""
+    def _ask(self, board: WireFormat, can_id: int) -> Iterator[tuple[can.Message, MotorAnswer | None]]:
+        """Ask one motor; yield the frames with 11-bit IDs that arrive within REPLY_TIME, each with its answer."""
         list(self._port.waiting())  # read: what came before is no answer
-        self._port.send((can_id, DAMPED))
-        for message, _, answer in self._frames(REPLY_TIME):
-            if not message.is_extended_id and message.data != DAMPED:  # our own command, echoed by the bus
+        questions = board.questions(can_id)
+        self._port.send(*questions)
+        sent = [data for _, data in questions]
+        for message, _, answer in self._frames(REPLY_TIME, board):
+            if not message.is_extended_id and message.data not in sent:  # our own frame, echoed by the bus
                 yield message, answer
 
-    def _frames(self, duration: float) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
-        """Yield the data frames that arrive within `duration` s, what each is, and the answer in it."""
+    def _frames(
+        self, duration: float, asked: WireFormat | None = None
+    ) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
+        """Yield the data frames that arrive within `duration` s, what each is, and the answer in it.
+
+        asked: whose answers are expected, besides the frames of boards that report by themselves.
+        """
+        own = [(asked, dict.fromkeys(range(1, asked.last_id + 1), 0))] if asked else []
+        boards = [*own, *((board, IDS) for board in self._reporting)]
         end = self._now() + duration
         while (remaining := end - self._now()) > 0.0:
             message = self._port.receive(remaining)
             if message is None or message.is_error_frame or message.is_remote_frame:
                 continue
-            board, flag = (MIT_V3, EXTENDED) if message.is_extended_id else (MIT, 0)
-            kind, can_id = board.classify(message.arbitration_id | flag, message.data, IDS)
-            answer = None
-            if kind == REPLY:
-                reply, length = board.unpack_reply(SPEC, can_id, message.data), len(message.data)
-                state = reply.position, reply.temperature, reply.error
-                answer = MotorAnswer(can_id, message.arbitration_id, length, *state, board.name)
-                if board is MIT_V3:
-                    self._v3[can_id] = answer
+            kind, answer = OTHER, None
+            for board, ids in boards:
+                frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+                kind, can_id = board.classify(frame_id, message.data, ids)
+                if kind == REPLY:
+                    answer = _answer(board, can_id, (message.arbitration_id, bytes(message.data)))
+                    self._boards[can_id] = board
+                    if board in self._reporting:
+                        self._v3[can_id] = answer
+                    break
+                if kind == COMMAND:
+                    break
             yield message, kind, answer
+
+
+def _answer(board: WireFormat, can_id: int, frame: Frame) -> MotorAnswer:
+    """Return what a reply says."""
+    reply_id, data = frame
+    reply = board.unpack_reply(SPEC, can_id, data)
+    state = reply.position, reply.temperature, reply.error
+    return MotorAnswer(can_id, reply_id, len(data), *state, board.name, board.family)

@@ -1,18 +1,20 @@
 """calibrate imu: the mounting of the IMU, from a recording of its samples or from the running driver.
 
 docs/calibration.md has the idea: upright, the accelerometer shows the trunk's z axis (up); the trunk bows about its y
-axis, so y is along bowed x upright. Posture limits that: no person stands upright, or bows straight ahead, to better
-than a degree. The arm's weight shows the mounting to a tenth of one (`with_mounting`): from one lean of the stand the
-rotation that moves gravity, from two leans the heading as well.
+axis, so y is along bowed x upright. The samples then pass through the estimator that `imu` will use: where it gives no
+tilt, or another one than the accelerometer, there is no result. Posture limits that: no person stands upright, or bows
+straight ahead, to better than a degree. The arm's weight shows the mounting to a tenth of one (`with_mounting`): from
+one lean of the stand the rotation that moves gravity, from two leans the heading as well.
 """
 
 import argparse
 import math
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -22,9 +24,11 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.tilt import angle_between
 from exo_gravity.core.compensation.tracking import mean_direction
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Vector
+from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -53,6 +57,9 @@ SENSOR = 5e-3  # rad: 5 mg, the bias of a calibrated accelerometer
 ONE_G = (0.9, 1.1)  # of the accelerometer at rest
 RESTS = 6
 DISTINCT = math.radians(30.0)  # between two rests on different sides
+NO_VECTOR, NO_QUATERNION = (math.nan,) * 3, (math.nan,) * 4
+SETTLED = 1.5  # s of rest at the start of a record after which `imu` has a tilt
+SAME_TILT = math.radians(3.0)  # between accelerometer and `imu` at rest: what `imu` promises
 LARGEST_ERROR = math.radians(0.5)  # of the two directions in which gravity can be off
 LARGEST_HEADING_ERROR = math.radians(1.0)
 NO_HEADING = (
@@ -62,11 +69,22 @@ NO_HEADING = (
 
 
 class ImuRecord(NamedTuple):
-    """Samples in the IMU's axes."""
+    """Samples in the IMU's axes; NaN where the driver does not measure a quantity."""
 
     time: np.ndarray  #: (n,) s
     angular_velocity: np.ndarray  #: (n, 3) rad/s
     acceleration: np.ndarray  #: (n, 3) m/s^2
+    orientation: np.ndarray | None = None  #: (n, 4), x, y, z, w, world from IMU; None if there is none
+
+    def with_turns(self) -> "ImuRecord":
+        """Return the record with the turns of the orientation where the IMU has no gyroscope, as a BNO085."""
+        if self.orientation is None or (np.isfinite(self.angular_velocity).all() and self.angular_velocity.any()):
+            return self
+        world_from_imu = Rotation.from_quat(self.orientation)
+        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.maximum(np.diff(self.time), 1e-6)[
+            :, None
+        ]
+        return self._replace(angular_velocity=np.vstack((turns, turns[-1:])))
 
 
 class Phase(NamedTuple):
@@ -91,8 +109,12 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     The file's `/imu` names the topic. options.rests: a recording of six rests, None for none. options.wait: waits for
     the person. Raises DataError.
     """
-    topic = node_values(load(options.params), NODE, IMU)["input_topic"]
-    found = mounting(read_imu(options.bag or _record(options, say), topic))
+    values = node_values(load(options.params), NODE, IMU)
+    topic = values["input_topic"]
+    record = read_imu(options.bag or _record(options, say), topic)
+    turning = record.with_turns()
+    found = mounting(turning)
+    check_as_imu(record, still_phases(turning), found, values)
     quaternion = found.quaternion.round(6).tolist()
     error = " ".join(f"{angle:.1f}" for angle in np.degrees(found.error))
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
@@ -108,14 +130,23 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
     """Return the samples of `topic` in a recording, in order of their stamps. Raises DataError."""
-    parts = []
+    rows = []
     for found in samples_of(bag, topic, IMU_TYPE):
-        vectors = (found[f"{name}.{axis}"] for name in ("angular_velocity", "linear_acceleration") for axis in "xyz")
         seconds = found["header.stamp.sec"] + found["header.stamp.nanosec"] * 1e-9
-        parts.append(np.column_stack((seconds, *vectors)))
-    values = np.concatenate(parts)
+        columns = [seconds]
+        for name, axes, reported, nothing in (
+            ("angular_velocity", "xyz", reported_vector, NO_VECTOR),
+            ("linear_acceleration", "xyz", reported_vector, NO_VECTOR),
+            ("orientation", "xyzw", reported_orientation, NO_QUATERNION),
+        ):
+            given = np.column_stack([found[f"{name}.{axis}"] for axis in axes]).tolist()
+            covariances = found[f"{name}_covariance"][:, 0].tolist()
+            columns.append([reported(*each) or nothing for each in zip(given, covariances, strict=True)])
+        rows.append(np.column_stack(columns))
+    values = np.concatenate(rows)
     values = values[np.lexsort(values.T[::-1])]
-    return ImuRecord(values[:, 0] - values[0, 0], values[:, 1:4], values[:, 4:7])
+    time, orientation = values[:, 0] - values[0, 0], values[:, 7:]
+    return ImuRecord(time, values[:, 1:4], values[:, 4:7], orientation if np.isfinite(orientation).any() else None)
 
 
 def _record(options: argparse.Namespace, say: Say) -> Path:
@@ -142,9 +173,10 @@ def still_phases(record: ImuRecord) -> list[Phase]:
 
     Raises DataError if the samples are too few or not finite, or if the accelerometer does not show one g at rest.
     """
-    time, rate, force = record
-    if len(time) < 10 or not all(np.all(np.isfinite(values)) for values in record):
-        raise DataError(f"{len(time)} IMU samples, must be 10 or more, all finite")
+    time, rate, force, _ = record
+    for name, measured in (("angular_velocity", rate), ("linear_acceleration", force)):
+        if len(time) < 10 or not np.all(np.isfinite(measured)):
+            raise DataError(f"{len(time)} IMU samples, must be 10 or more, all with a finite {name}")
     median = np.median(rate, axis=0)
 
     def is_still(block: tuple[int, int]) -> bool:
@@ -198,6 +230,42 @@ def mounting(record: ImuRecord) -> Mounting:
     heading = max(level, math.hypot(*sideways) / math.sqrt(len(bows)))
     rotation = Rotation.from_matrix(np.stack((np.cross(y, z), y, z)))
     return Mounting(rotation.as_quat(canonical=True), np.array((level, level, heading)), bow, len(bows))
+
+
+def check_as_imu(record: ImuRecord, phases: Sequence[Phase], found: Mounting, values: Mapping[str, Any]) -> None:
+    """Raise DataError unless `imu` gives the tilt that each still phase of `record` shows.
+
+    found: the mounting. values: of `imu`'s parameters.
+    """
+    settings = (values[name] for name in ("rate", "gyroscope_range", "accelerometer_range"))
+    estimator = TrunkEstimator(found.quaternion.tolist(), *settings)
+    measured = (record.angular_velocity, record.acceleration, record.orientation)
+    columns = [[None] * len(record.time) if values is None else values.tolist() for values in measured]
+    if not np.isfinite(record.angular_velocity).any():
+        columns[0] = [None] * len(record.time)
+    ends = {phase.samples.stop - 1: phase for phase in phases}
+    problem = ""
+    for k, row in enumerate(zip(record.time.tolist(), *columns, strict=True)):
+        answer = None
+        try:
+            answer = estimator.update(ImuSample(*row))
+            problem = "" if answer else problem
+        except ParameterError as error:
+            problem = problem or f"{error.name} must be {error.expected}"  # the first since the last tilt
+        if k not in ends or record.time[k] < SETTLED:
+            continue
+        if answer is None:
+            reason = problem or estimator.settling
+            raise DataError(
+                f"`imu` would give no tilt of these samples {record.time[k]:.0f} s after the first: {reason}"
+            )
+        apart = angle_between(-answer.gravity, estimator.rotation @ ends[k].up)
+        if apart > SAME_TILT:
+            source = "the reported orientation" if record.orientation is not None else "the fused orientation"
+            raise DataError(
+                f"{source}, which `imu` would use, is {math.degrees(apart):.0f} degrees from the accelerometer at rest "
+                f"{record.time[k]:.0f} s after the first sample: check the axes of the IMU's driver"
+            )
 
 
 def _checked_turn(record: ImuRecord, upright: Phase, bowed: Phase, bias: np.ndarray, axis: np.ndarray) -> float:

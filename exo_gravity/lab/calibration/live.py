@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-import yaml
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
@@ -28,6 +27,8 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE
 from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
 
 KEPT = ("can_bridge", "simulator")  # the arm's nodes that run during a calibration, with the shared /imu
@@ -93,7 +94,7 @@ class LiveTour:
 def tour_parameters(
     params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
 ) -> dict[str, Any]:
-    """Return the content of a parameter file in which `calibrator` replaces the compensator of `arm`.
+    """Return the nodes of a file in which `calibrator` replaces the compensator of `arm`, each with its parameters.
 
     changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m as far as known, by default those
     of the robot alone. Raises ParameterError.
@@ -102,22 +103,21 @@ def tour_parameters(
     if list(compensator["joint_names"]) != list(bridge["joint_names"]):
         raise ParameterError("joint_names", compensator["joint_names"], f"{bridge['joint_names']}")
     kept = ("/imu", *(f"{arm.namespace}/{name}" for name in KEPT))
-    content = yaml.safe_load(params.read_text(encoding="utf-8"))
-    nodes = {node: entry for node, entry in content.items() if node in kept}
+    nodes = {node: values for node, values in load(params).items() if node in kept}
     simulator = nodes.get(f"{arm.namespace}/simulator")
     if simulator and (mass := changes.get("tour.load_mass")):
         # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
-        wearer = {"mass": [0.0, 0.0, 0.0, mass], "cog": [0.0, 0.0, 0.0, changes["tour.load_lever"]]}
-        simulator["ros__parameters"]["wearer"] = wearer
+        simulator["wearer.mass"] = [0.0, 0.0, 0.0, mass]
+        simulator["wearer.cog"] = [0.0, 0.0, 0.0, changes["tour.load_lever"]]
     expected = (moments_of(arm.robot) if moments is None else moments).tolist()
     values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
     values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
     values |= {"first_moment": expected[:4], "off_axis": expected[4:], **changes}
-    return {**nodes, f"{arm.namespace}/calibrator": {"ros__parameters": values}}
+    return {**nodes, f"{arm.namespace}/calibrator": values}
 
 
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
-    """Run `nodes`, the content of a parameter file, until the tour is done or has failed; the arm is then down.
+    """Run `nodes`, each with its parameters, until the tour is done or has failed; the arm is then down.
 
     options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file.
     """
@@ -137,7 +137,7 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
 
     with tempfile.TemporaryDirectory() as folder, options.output.with_suffix(".log").open("a", 1) as log:
         path = Path(folder, "params.yaml")
-        path.write_text(yaml.safe_dump(dict(nodes), sort_keys=False), encoding="utf-8")
+        path.write_text(text_of(nodes), encoding="utf-8")
         launcher = Launcher(path, on_line)
         with asking_on_terminal(launcher.asking, say):
             dead = launcher.run(ending)

@@ -15,9 +15,8 @@ from statistics import fmean
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.motors.ak import FAMILY, MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
-from exo_gravity.core.motors.specs import error_text
-from exo_gravity.core.motors.wire_formats import MIT
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
@@ -36,6 +35,11 @@ MOTIONS = (
     "bend the elbow",
 )
 UNCHECKED = "not checked after a power-up"
+SERVO_MODE = (
+    "A V1 or V2 board in servo mode sends the same frames as a V3 board, and obeys none of our commands: read the "
+    "labels of the boards that are shown as mit_v3. Set V1 and V2 boards to MIT mode with the vendor's tool, and begin "
+    "again."
+)
 STORE_ZERO = "store a zero with the vendor's tool while the arm hangs, switch the power off and on, and begin again"
 
 
@@ -69,7 +73,8 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     """
     node, interface = f"{arm.namespace}/can_bridge", arm.can_bridge["can.interface"]
     bus_options = can_options(load(options.params)[node])
-    own = {name: each for name, (_, each) in buses_of(arm.can_bridge["can.channel"], bus_options).items()}
+    buses = buses_of(arm.can_bridge["can.channel"], bus_options, len(arm.motors))
+    own = {name: each for name, (_, each) in buses.items()}
     with ArmScan((interface, name, each) for name, each in own.items()) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         search = MotorSearch(bus, arm, options.wait, say)
@@ -116,29 +121,41 @@ class MotorSearch:
         zeros = []
         rows = zip(self.found.items(), self._arm.motors, at_rest, pose, strict=True)
         for (can_id, (name, direction)), motor, angles, angle in rows:
-            # The scan decodes every reply of a V1 or V2 board with the usual position range.
-            is_mit = self._last[can_id].wire_format == MIT.name
+            found = self._last[can_id]
+            # The scan decodes every reply in MIT mode with the usual position range.
+            is_mit = found.wire_format == MIT.name
             scale = motor.spec.position_range / SPEC.position_range if is_mit else 1.0
             zero = scale * fmean(angles) - direction * math.radians(angle)
             zeros.append(round(zero, 4))
             try:
-                JointMotor(motor.spec, can_id, direction, zero)
-            except ParameterError as error:  # the angle would wrap
-                refusals.append(f"{name}: {error}: {STORE_ZERO}")
+                JointMotor(motor.spec, can_id, direction, zero, wire_format=found.board, timeout=motor.timeout)
+            except ParameterError as error:  # the angle would wrap, or the file names another motor
+                refusals.append(f"{name}: {error}" + (f": {STORE_ZERO}" if error.name == "zero" else ""))
         node, directions = f"{self._arm.namespace}/can_bridge", [direction for _, direction in self.found.values()]
         formats = [self._last[can_id].wire_format for can_id in self.found]
         changes = (
             Change(node, "can_id", list(self.found), "found by moving each joint by hand"),
             Change(node, "wire_format", formats, "as each board answers"),
+            *self._master_ids(node),
             Change(node, "direction", directions, "found by moving each joint by hand in its positive direction"),
             Change(node, "zero", zeros, f"{exactly}; {survival}"),
         )
         return CalibrationResult(changes, (), tuple(refusals), self._arm)
 
+    def _master_ids(self, node: str) -> tuple[Change, ...]:
+        """Return the change of `master_id`, if a motor has one that is its own choice."""
+        answers = [self._last[can_id] for can_id in self.found]
+        if all(answer.family == FAMILY for answer in answers):
+            return ()
+        master_ids = [0 if answer.family == FAMILY else answer.reply_id for answer in answers]
+        return (Change(node, "master_id", master_ids, "on which each motor answers"),)
+
     def _scan(self) -> None:
         answers, problems = self._bus.scan()
         self._last = {answer.can_id: answer for answer in answers}
         self._say(self._table())
+        if any(answer.wire_format == MIT_V3.name for answer in answers):
+            self._say(SERVO_MODE)
         if len(answers) < JOINT_COUNT:
             listed = ", ".join(map(str, self._last)) or "none"
             count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"
@@ -180,8 +197,8 @@ class MotorSearch:
         now = self._clock()
         silent = {can_id for can_id, answered in self._answered.items() if now - answered > HAND.silence}
         self._was_silent |= silent
-        columns = ("ID", "joint", "angle deg", "turned deg", "degC", "error", "reply", "reply ID", "wire format")
-        table = Table(*columns, header_style="bold")
+        state = "ID", "joint", "angle deg", "turned deg", "degC", "error"
+        table = Table(*state, "reply", "reply ID", "family", "wire format", header_style="bold")
         for can_id, answer in sorted(self._last.items()):
             angles = self._angles.get(can_id) or [0.0]
             table.add_row(
@@ -194,9 +211,10 @@ class MotorSearch:
                 if answer.error is None
                 else "none"
                 if not answer.error
-                else f"{answer.error} ({error_text(answer.error)})",
+                else f"{answer.error} ({answer.board.error_text(answer.error)})",
                 f"{answer.reply_length} bytes",
                 hex(answer.reply_id) if answer.reply_id > MAX_CAN_ID else str(answer.reply_id),
+                answer.family,
                 answer.wire_format,
             )
         return table

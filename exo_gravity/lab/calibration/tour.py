@@ -228,7 +228,7 @@ class TourController(SampleController):
         self._has_begun = False
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        position, velocity, *_, times = zip(*samples, strict=True)
+        position, velocity, _, _, _, times, *_ = zip(*samples, strict=True)
         self._has_begun = self._has_begun or self._is_carried()
         if self._has_begun:
             effort = self.tour.step(now, position, velocity, self._tilt)

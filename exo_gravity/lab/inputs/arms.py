@@ -7,17 +7,26 @@ unknown parameter is an error here too. Errors name node and parameter: `/right/
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.compensation.settings import URDF_LAW, Settings, compensator_table, robot_of, settings_of
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import (
+    Settings,
+    compensator_table,
+    robot_of,
+    settings_of,
+    urdf_settings_of,
+    urdf_table,
+)
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
-from exo_gravity.core.params import Param, in_force, values_of
+from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
+from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
 
 
@@ -43,6 +52,32 @@ class ConfiguredArm:
             return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
 
 
+class CarriedArm(NamedTuple):
+    """What carries one arm of a parameter file, the paper's or one from a URDF; checked."""
+
+    name: str  #: the namespace without slashes, 'arm' for the root namespace
+    can_bridge: Mapping[str, Any]  #: all parameter values by name
+    motors: tuple[JointMotor, ...]
+    limits: Limits
+    settings: Settings
+
+
+def carried_arm(nodes: Nodes, namespace: str) -> CarriedArm:
+    """Return what carries the arm of `namespace` ('/right') in the nodes of a parameter file. Raises ParameterError."""
+    node = f"{namespace}/compensator"
+    if nodes.get(node, {}).get("law") != URDF_LAW:
+        arm = read_arm(nodes, namespace)
+        return CarriedArm(arm.name, arm.can_bridge, arm.motors, arm.limits, arm.settings())
+    can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
+    with named(f"{namespace}/can_bridge "):
+        motors, limits = motors_of(can_bridge), limits_of(can_bridge)
+    values = node_values(nodes, node, urdf_table(nodes[node]))
+    with named(f"{node} "):
+        robot = UrdfArm(read_urdf(values["urdf.file"]), values["joint_names"], values["urdf.hand"])
+        settings = urdf_settings_of(values, robot)
+    return CarriedArm(namespace.strip("/") or "arm", can_bridge, motors, limits, settings)
+
+
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     """Return the arm of `namespace` ('/right') in the nodes of a parameter file.
 
@@ -51,7 +86,10 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
     node = f"{namespace}/compensator"
     given = nodes.get(node, {})
-    if given.get("law") == URDF_LAW:  # the law `exact` gives the torques of a URDF of this arm
+    if given.get("law") == URDF_LAW:
+        if not {"robot.mass", "robot.first_moment"}.intersection(given):
+            raise ParameterError(f"{node} law", URDF_LAW, "exact: this is for the paper's arm alone")
+        # The law `exact` gives the torques of a URDF of this arm.
         kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
         nodes = {**nodes, node: {**kept, "law": "exact"}}
     compensator = node_values(nodes, node, compensator_table(given))
@@ -109,4 +147,6 @@ def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dic
     given = yaml.load(parameters[node], Loader)[node]["ros__parameters"]
     given = {new: plain for name, value in given.items() for new, plain in in_force(name, value).items()}
     table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
-    return {param.name: param.default for param in table} | given
+    if given.get("law") == URDF_LAW:
+        table = urdf_table(given)
+    return {param.name: param.default for param in table_for(table, given)} | given

@@ -3,10 +3,11 @@
     /imu: {ros__parameters: {...}}
     /right/can_bridge: {ros__parameters: {can: {interface: socketcan}, ...}}
 
-The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS.
+The tools read it to find out which nodes to start and which arms they have; the nodes read it through ROS. Both read
+the same (ros_yaml.py).
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,12 @@ import yaml
 from exo_gravity import packaged
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
+from exo_gravity.core.params import joint_count
+from exo_gravity.lab.inputs import ros_yaml
+from exo_gravity.lab.inputs.ros_yaml import Nodes
 
-FORM = "/namespace/executable: {ros__parameters: {...}}"
-MAX_LIST = 100  # entries; the longest list of any parameter has 4, and ROS's reader takes minutes for 200,000
-# libyaml is ten times faster; PyYAML is sometimes built without it.
+# Of recordings, whose parameters the recorder writes; libyaml is ten times faster than PyYAML alone.
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
-Nodes = dict[str, dict[str, Any]]  # node name -> dotted parameter name -> value
 
 
 def packaged_config(name: str) -> Path:
@@ -32,49 +32,22 @@ def packaged_config(name: str) -> Path:
 
 
 def load(path: str | Path) -> Nodes:
-    """Return {node name: {dotted parameter name: value}} of a parameter file.
+    """Return {node name: {dotted parameter name: value}} of a parameter file, as the nodes read it.
 
-    Raises ParameterError, which names the file or the entry, if the file is missing, not YAML, or of another form.
+    Raises ParameterError, which names the file, the line or the entry, if the file is missing, not YAML, or of another
+    form, or if ROS would read it in a way that nobody means (ros_yaml.py).
     """
     try:
-        content = yaml.load(Path(path).read_text(encoding="utf-8"), Loader)
+        return ros_yaml.read(Path(path).read_text(encoding="utf-8"), str(path))
     except OSError as error:
         raise ParameterError("params", str(path), f"a readable file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("params", str(path), f"YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(content, dict) or not content:
-        raise ParameterError("params", str(path), f"a mapping of {FORM}")
-    return {str(node): _parameters(str(node), entry) for node, entry in content.items()}
 
 
 def node_of(arm: str, executable: str) -> str:
     """Return the full name of a node of an arm: '/right/can_bridge'; an arm without a namespace is called 'arm'."""
     return f"/{executable}" if arm == "arm" else f"/{arm}/{executable}"
-
-
-def _parameters(node: str, entry: Any) -> dict[str, Any]:
-    if not node.startswith("/") or node.endswith("/"):
-        raise ParameterError("node name", node, f"fully qualified, as in {FORM}")
-    if not isinstance(entry, dict) or set(entry) != {"ros__parameters"}:
-        raise ParameterError(node, entry, f"of the form {FORM}")
-    return dict(_flat(node, "", entry["ros__parameters"] or {}))
-
-
-def _flat(node: str, prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield (dotted name, value) of each parameter; raise ParameterError for values that ROS cannot read."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _flat(node, f"{prefix}.{key}" if prefix else str(key), inner)
-        return
-    if value is None:
-        raise ParameterError(f"{node} {prefix}", value, "given a value, or left out")
-    if isinstance(value, list):
-        if len(value) > MAX_LIST:
-            raise ParameterError(f"{node} {prefix}", value, f"at most {MAX_LIST} entries; it has {len(value):,}")
-        if len({type(item) for item in value}) > 1:
-            # ROS's own reader refuses such a list without naming it.
-            raise ParameterError(f"{node} {prefix}", value, "a list of one type: 1.0, not 1, next to 2.5")
-    yield prefix, value
 
 
 def can_options(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -97,7 +70,7 @@ def check_buses(nodes: Nodes) -> None:
     for node in stages(nodes)[0]:
         given = nodes[node]
         with named(f"{node} "):
-            buses = buses_of(str(given.get("can.channel", node)), can_options(given))
+            buses = buses_of(str(given.get("can.channel", node)), can_options(given), joint_count(given))
         for name, (_, own) in buses.items():
             options = {f"{OPTIONS}.{option}": value for option, value in own.items()}
             what = {"can.channel": name, "can.interface": given.get("can.interface"), **options}

@@ -5,7 +5,8 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.numbers import for_joints
 from exo_gravity.lab.observer.momentum import WearerEstimate, low_passed
 
 
@@ -29,7 +30,7 @@ class ContactWatch:
         self.count = 0
         self.last: tuple[float, int, float] | None = None
         self._tuning = tuning
-        self._slow = NO_TORQUE
+        self._slow: Torque = ()
         self._time = self._touched = -math.inf  # s
 
     def update(self, now: float, estimate: WearerEstimate) -> None:
@@ -40,7 +41,7 @@ class ContactWatch:
             self._slow, dt = estimate.torque, 0.0
         self._slow = low_passed(self._slow, estimate.torque, dt / tuning.followed)
         jumps = list(map(operator.sub, estimate.torque, self._slow))
-        columns = zip(jumps, tuning.least, estimate.distinguishable, strict=True)
+        columns = zip(jumps, for_joints(tuning.least, len(jumps), max), estimate.distinguishable, strict=True)
         sizes = [abs(jump) / least if shown else 0.0 for jump, least, shown in columns]
         joint = max(range(len(sizes)), key=sizes.__getitem__)
         if sizes[joint] > 1.0:

@@ -19,19 +19,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
-from exo_gravity.core.arm.kinematics import ROTORS, LinkInertia, links_of
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import sliding
-from exo_gravity.core.numbers import COVER
+from exo_gravity.core.numbers import COVER, for_joints
 
 
 @dataclass(frozen=True)
 class ObserverTuning:
-    """How fast the estimate is, and the errors that are no parameters."""
+    """How fast the estimate is, and the errors that are no parameters; another arm's joints all get the most."""
 
     bandwidth: float = 15.0  #: rad/s of each of the two low-passes
     max_gap: float = 0.2  #: s between two samples, after which the observer starts anew
@@ -72,19 +70,18 @@ class MomentumObserver:
         s, self._tuning = settings, tuning
         self._error = s.model_error
         self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
-        self._wearer = ArmModel(s.loaded.length, s.wearer_cog, s.wearer_mass, s.loaded.gain, s.loaded.gravity)
-        own, worn = links_of(s.loaded), links_of(self._wearer)
-        rows = zip(own.weights, worn.weights, strict=True)
-        self._links = LinkInertia(tuple([tuple(map(operator.add, *row)) for row in rows]), ROTORS)
+        self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
+        self._wearer = s.robot.massless(s.loaded.gravity).with_wearer(s.wearer_mass, s.wearer_cog)
+        self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
-        self._coulomb = tuple(friction.coulomb) if self._is_known else tuple(tuning.typical_coulomb)
-        self._viscous = tuple(friction.viscous)
-        matrix = self._links.matrix(tuning.reference)
+        self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
+        self._viscous = for_joints(friction.viscous, count)
+        matrix = self._links.matrix(for_joints(tuning.reference, count, max))
         self._code = [2.0 * tuning.bandwidth * tuning.velocity_code * math.hypot(*row) for row in matrix.tolist()]
         self._time = -math.inf
         self._felt: tuple[float, ...] = ZERO
-        self._momentum = self._input = self._inner = self._outer = self._slow = NO_TORQUE
+        self._momentum = self._input = self._inner = self._outer = self._slow = (0.0,) * count
 
     def update(
         self, now: float, joints: Sequence[Sequence[float]], tilt: Tilt, turning: Floats3 = ZERO
@@ -97,7 +94,7 @@ class MomentumObserver:
         """
         theta, velocity, effort = joints
         tuning, bandwidth = self._tuning, self._tuning.bandwidth
-        columns = [exact_torque(self._whole, theta, axis) for axis in AXES]
+        columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
@@ -121,7 +118,7 @@ class MomentumObserver:
             self._outer, self._slow, self._felt = tuple(once), momentum, felt
         self._input, self._momentum = tuple(unexplained), momentum
         lag = list(map(operator.sub, once, self._outer))
-        worn = exact_torque(self._wearer, theta, tilt)
+        worn = tuple(map(operator.mul, self._gain, self._wearer.torque(theta, tilt)))
         shaken = tuning.motion_share * math.dist(felt, self._felt)
         largest = [math.hypot(*column) for column in zip(*columns, strict=True)]  # gravity in any direction
         deviation = [

@@ -11,13 +11,12 @@ joint are taken to be the same over the whole span, as those of a model are: a l
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -41,9 +40,9 @@ class WearerCurve(NamedTuple):
     """The wearer's torque over time: what `MomentumObserver` estimates, n times."""
 
     time: np.ndarray  #: (n,) s
-    torque: np.ndarray  #: (n, 4) Nm
-    deviation: np.ndarray  #: (n, 4) Nm, one standard deviation
-    weight: np.ndarray  #: (n, 4) Nm that carry the wearer's arm
+    torque: np.ndarray  #: (n, m) Nm
+    deviation: np.ndarray  #: (n, m) Nm, one standard deviation
+    weight: np.ndarray  #: (n, m) Nm that carry the wearer's arm
 
 
 class Share(NamedTuple):
@@ -58,14 +57,14 @@ class RunningShare:
 
     def __init__(self) -> None:
         self._given = self._carried = 0.0  # Nm^2, the means of the two sums,
-        self._errors = NO_TORQUE  # and of its deviation's
+        self._errors: Sequence[float] = ()  # and of its deviation's
 
     def update(self, dt: float, estimate: WearerEstimate) -> tuple[float, float] | None:
         """Take an estimate, `dt` s after the last; return the share and its standard deviation, None for no weight."""
         part, weight = dt / (SHARE.window + dt), estimate.weight
         self._given += part * (sum(map(operator.mul, weight, estimate.torque)) - self._given)
         self._carried += part * (sum(w * w for w in weight) - self._carried)
-        columns = zip(self._errors, weight, estimate.deviation, strict=True)
+        columns = zip(self._errors or (0.0,) * len(weight), weight, estimate.deviation, strict=True)
         self._errors = tuple([old + part * (abs(w) * error - old) for old, w, error in columns])
         if self._carried < SHARE.least_weight**2:
             return None
@@ -80,7 +79,7 @@ def observed(
 ) -> WearerCurve:
     """Return what the observer makes of a recording.
 
-    time: (n,) s, in ascending order. joints: position rad, velocity rad/s and measured effort Nm, (n, 4) each; samples
+    time: (n,) s, in ascending order. joints: position rad, velocity rad/s and measured effort Nm, (n, m) each; samples
     with NaN are left out. trunk_at: tilt and angular velocity of the trunk at a time in s, as
     `MomentumObserver.update` takes them.
     """
@@ -90,7 +89,7 @@ def observed(
             last = now
             rows.append((now, *observer.update(now, row, *trunk_at(now))))
     times, *parts = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return WearerCurve(np.array(times), *(np.array(part).reshape(-1, 4) for part in parts))
+    return WearerCurve(np.array(times), *(np.reshape(part, (-1, len(settings.robot.scale))) for part in parts))
 
 
 def while_between(curve: WearerCurve, spans: Iterable[tuple[float, float]]) -> WearerCurve:

@@ -18,12 +18,15 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.progress import track
 
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report.table import shown
+from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view.scene import LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.lab.view.urdf import COLOURS as MATERIALS
@@ -106,6 +109,8 @@ class Stage:
     def __init__(self, bag: Bag, width: int, height: int) -> None:
         arms = [_description(bag, recording.name) for recording in bag.recordings]
         pairs = zip(arms, bag.recordings, strict=True)
+        source = of_all(bag.source(recording.name) for recording in bag.recordings)
+        self._stamp = "SIMULATED" if source is Source.SIMULATED else ""
         self._arms = [(arm, recording.in_order(arm.limits.joint_names)) for arm, recording in pairs]
         self._model = _model(arms, width, height)
         self._dummy = _dummy(arms)
@@ -137,6 +142,7 @@ class Stage:
         picture = Image.fromarray(self._renderer.render())
         height = LINE_HEIGHT * picture.height
         font, draw = ImageFont.load_default(height), ImageDraw.Draw(picture)
+        draw.text((picture.width - height / 2, height / 2), self._stamp, INK, font, "ra")
         draw.text((height / 2, height / 2), f"{time:.1f} s  {_step(self._arms[0][1], time)}", INK, font)
         for view in views:
             self._label(draw, font, view)
@@ -209,6 +215,8 @@ def _description(bag: Bag, name: str) -> ArmDescription:
         if not given:
             node = node_of(name, executable)
             raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
+    if values["compensator"]["law"] == URDF_LAW:
+        raise DataError(f"{name}: a clip shows the paper's arm alone, not one with law {URDF_LAW}")
     return described(**values)
 
 

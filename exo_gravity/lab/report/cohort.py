@@ -1,62 +1,71 @@
-"""Many recordings -> one tidy table: a row for each recording, arm and joint.
+"""Many recordings -> tidy rows: one for each recording, arm and joint.
 
-`summary` is a pure function from a path to rows of plain values: a pool of processes runs it, and a recording that
-fails becomes a row that says why. Rows are kept in a cache by the content of the recording, so that one that has not
-changed is not read again.
+`summary` is a pure function from a path to rows of plain values: processes or the workers of a cluster run it, and a
+recording that fails becomes a row that says why. Rows are kept in a cache by the content of the recording, so that one
+that has not changed is not read again. `overview` shows the rows.
 """
 
 import csv
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from hashlib import blake2b
-from itertools import groupby
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.lab.bag.storage import Storage
+from exo_gravity.lab.bag.storage import REPAIRED, Storage
+from exo_gravity.lab.parallel import Outcome
 from exo_gravity.lab.report.smoothness import spectral_arc_length
-from exo_gravity.lab.report.table import shown
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording
 
 SUFFIXES = (".mcap", ".db3", ".zstd")
 SPEED_RATE = 50.0  # Hz, at which the speed of a movement is taken
 BLOCK = 2**22  # bytes that are hashed at once
-SPAWNED = get_context("spawn")  # the progress bar has a thread, which a forked process would lack
 COLUMNS = (
-    "recording", "date", "subject", "protocol", "arm", "mode", "support", "held", "verdict", "problem", "holds",
-    "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
+    "recording", "date", "subject", "protocol", "arm", "source", "mode", "support", "held", "verdict", "problem",
+    "holds", "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
     "range_of_motion_deg", "rms_torque_nm",
 )  # fmt: skip
 
 Row = dict[str, Any]  # by COLUMNS; None where unknown
+Summaries = Iterable[Outcome[str, list[Row]]]
+
+
+@dataclass(frozen=True)
+class Judging:
+    """How recordings are read and judged."""
+
+    criteria: HoldCriteria
+    min_hold: float  #: s
+    every: int  #: see `read_bag`
 
 
 def recordings_below(path: Path) -> list[Path]:
-    """Return the recordings in a folder and below, in order: folders with a bag's files."""
+    """Return the recordings in a folder and below, in order: folders with a bag's files.
+
+    Copies that `report --repair` wrote are left out where what they are copies of is there.
+    """
     files = (file for file in path.rglob("*") if file.suffix in SUFFIXES and not file.name.startswith("."))
-    return sorted({file.parent for file in files if not file.parent.name.startswith(".")})
+    folders = {file.parent for file in files if not file.parent.name.startswith(".")}
+    repaired = {folder for folder in folders if folder.name.endswith(REPAIRED)}
+    copies = {f for f in repaired if folders & {f.parent, f.with_name(f.name.removesuffix(REPAIRED))}}
+    return sorted(folders - copies)
 
 
-def summary(path: str, criteria: HoldCriteria, min_hold: float) -> list[Row]:
+def summary(path: str, judging: Judging) -> list[Row]:
     """Return the rows of a recording, for each arm and joint; of one that cannot be read, one with the `problem`."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
 
     try:
-        report = trial_report.analyse(read_bag(path), criteria, min_hold)
+        report = trial_report.analyse(read_bag(path, judging.every), judging.criteria, judging.min_hold)
     except (ExoGravityError, OSError) as error:
         return [_failed(path, str(error))]
     shared = {
@@ -75,8 +84,9 @@ def summary(path: str, criteria: HoldCriteria, min_hold: float) -> list[Row]:
         of_arm = {
             **shared,
             "arm": recording.name,
+            "source": report.bag.source(recording.name).value,
             "mode": settings.get("mode"),
-            "support": settings.get("support"),
+            "support": None if settings.get("mode") == "one_g" else settings.get("support"),
             "holds": len(analysis.holds),
             "held_s": sum(hold.duration for hold in analysis.holds),
             "wearer_share": part and float(part.whole.value),
@@ -127,14 +137,17 @@ def smoothness(recording: Recording, analysis: TrialAnalysis) -> float:
 
 
 class Cache:
-    """Rows by the content of their recording and the criteria, in a file."""
+    """Rows by the content of their recording and how it is judged: a line of JSON for each in a file."""
 
-    def __init__(self, path: Path, *settings: object) -> None:
-        self._path, self._settings = path, repr((version(), COLUMNS, *settings))
-        try:
-            self._rows: dict[str, list[Row]] = dict(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, TypeError):  # none yet, or damaged: everything is read again
-            self._rows = {}
+    def __init__(self, path: Path, judging: Judging) -> None:
+        self._path, self._settings = path, repr((version(), COLUMNS, judging))
+        self._rows: dict[str, list[Row]] = {}
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
+            try:
+                key, rows = json.loads(line)
+                self._rows[key] = [dict(row) for row in rows]
+            except (ValueError, TypeError):  # a line that was cut off: that recording is read again
+                continue
 
     def key(self, recording: Path) -> str:
         """Return the key of a recording's content. Raises DataError or OSError if it cannot be read."""
@@ -147,82 +160,50 @@ class Cache:
                     digest.update(block)
         return digest.hexdigest()
 
-    def get(self, key: str, recording: Path) -> list[Row] | None:
-        """Return the rows of a key, as those of the recording at this path; None if it is unknown."""
-        rows = self._rows.get(key)
-        return rows and [{**row, "recording": str(recording)} for row in rows]
+    def get(self, key: str) -> list[Row] | None:
+        """Return the rows of a key; None if it is unknown."""
+        return self._rows.get(key)
 
     def put(self, key: str, rows: list[Row]) -> None:
         """Keep the rows of a key."""
         self._rows[key] = rows
-
-    def save(self) -> None:
-        """Write the file."""
-        whole = self._path.with_suffix(".new")
-        whole.write_text(json.dumps(self._rows), encoding="utf-8")
-        whole.replace(self._path)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(f"{json.dumps([key, rows])}\n")
 
 
 def summaries(
-    recordings: Sequence[Path], criteria: HoldCriteria, min_hold: float, cache: Cache, done: Callable[[Path], None]
+    recordings: Sequence[Path],
+    judging: Judging,
+    cache: Cache,
+    run: Callable[[Callable[[str], list[Row]], Sequence[str]], Summaries],
+    done: Callable[[], object],
 ) -> tuple[list[Row], int]:
     """Return the rows of the recordings in their order, and how many were in the cache.
 
-    done: called for each that is finished.
+    run: yields the outcome of a function for each path, see `lab.parallel`.
+    done: called for each recording that is finished.
     """
-    found: dict[Path, list[Row]] = {}
-    keys: dict[Path, str] = {}
-    for recording in recordings:
+    found: dict[str, list[Row]] = {}
+    keys: dict[str, str] = {}
+    paths = {str(recording.resolve()): recording for recording in recordings}
+    for path, recording in paths.items():
         try:
-            keys[recording] = cache.key(recording)
+            keys[path] = cache.key(recording)
         except (DataError, OSError) as error:
-            found[recording] = [_failed(str(recording), str(error))]
+            found[path] = [_failed(path, str(error))]
         else:
-            if (rows := cache.get(keys[recording], recording)) is not None:
-                found[recording] = rows
-        if recording in found:
-            done(recording)
-    known = sum(recording in keys for recording in found)
-    for recording, rows in _in_processes([r for r in recordings if r not in found], criteria, min_hold):
-        found[recording] = rows
-        if rows[0]["verdict"]:  # what failed is tried again
-            cache.put(keys[recording], rows)
-            cache.save()
-        done(recording)
-    return [row for recording in recordings for row in found[recording]], known
-
-
-def _in_processes(
-    recordings: Sequence[Path], criteria: HoldCriteria, min_hold: float
-) -> Iterator[tuple[Path, list[Row]]]:
-    """Yield each recording with its rows, in the order in which they are finished.
-
-    A process that dies, for want of memory, takes the pool with it: those that were unfinished then run one by one, and
-    the one that ends its process again is the one that fails.
-    """
-    left = dict.fromkeys(recordings)
-    try:
-        with ProcessPoolExecutor(mp_context=SPAWNED) as pool:
-            futures = {pool.submit(summary, str(path), criteria, min_hold): path for path in recordings}
-            for future in _finished(futures):
-                path, rows = futures[future], future.result()
-                del left[path]
-                yield path, rows
-    except BrokenProcessPool:
-        pass
-    for path in left:
-        try:
-            with ProcessPoolExecutor(1, SPAWNED) as pool:
-                yield path, pool.submit(summary, str(path), criteria, min_hold).result()
-        except BrokenProcessPool:
-            yield path, [_failed(str(path), f"{path}: the process that read it was ended, perhaps for want of memory")]
-
-
-def _finished(futures: Iterable[Future[list[Row]]]) -> Iterator[Future[list[Row]]]:
-    waiting = set(futures)
-    while waiting:
-        done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-        yield from done
+            if (rows := cache.get(keys[path])) is not None:
+                found[path] = rows
+        if path in found:
+            done()
+    known = sum(path in keys for path in found)
+    for outcome in run(partial(summary, judging=judging), [path for path in paths if path not in found]):
+        path = outcome.item
+        found[path] = outcome.result or [_failed(path, f"{path}: {outcome.problem}")]
+        if found[path][0]["verdict"]:  # what failed is tried again
+            cache.put(keys[path], found[path])
+        done()
+    return [{**row, "recording": str(named)} for path, named in paths.items() for row in found[path]], known
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -232,62 +213,3 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
         writer.writeheader()
         for row in rows:
             writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})
-
-
-def trials_of(rows: Iterable[Row]) -> list[Row]:
-    """Return a row for each recording and arm, by subject and condition in order of date: the largest of its joints."""
-    result = []
-    for _, group in groupby(rows, lambda row: (row["recording"], row["arm"])):
-        joints = list(group)
-        largest = {
-            key: max((abs(row[key]) for row in joints if row[key] is not None), default=None)
-            for key in ("drift_deg_per_min", "stray_in_10_s_deg", "range_of_motion_deg")
-        }
-        result.append({**joints[0], **largest})
-    return sorted(result, key=lambda row: [str(row[key] or "") for key in ("subject", "mode", "support", "date")])
-
-
-def trends_of(trials: Iterable[Row]) -> Iterator[str]:
-    """Yield, for each subject and condition with three trials or more, how the drift changes from one to the next."""
-    known = [row for row in trials if row["drift_deg_per_min"] is not None]
-    for _, group in groupby(sorted(known, key=_condition), lambda row: _condition(row)[:-1]):
-        rows = list(group)
-        drifts = [row["drift_deg_per_min"] for row in rows]
-        if len(drifts) > 2:
-            slope = float(np.polyfit(np.arange(len(drifts)), drifts, 1)[0])
-            support = "" if rows[0]["support"] is None else f", support {100 * rows[0]['support']:g} %"
-            of = f"{rows[0]['subject'] or 'no subject'}, {rows[0]['arm']}, {rows[0]['mode'] or 'unknown mode'}{support}"
-            yield f"{of}: drift changes by {slope:+.3f} deg/min from one of {len(drifts)} trials to the next"
-
-
-def _condition(row: Row) -> list[str]:
-    return [str(row[key] or "") for key in ("subject", "mode", "support", "arm", "date")]
-
-
-def print_trials(trials: Sequence[Row], console: Console) -> None:
-    """Print a table with a row for each trial, then the trends."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in ("Subject", "Condition", "Date", "Recording", "Arm"):
-        table.add_column(heading)
-    for heading in ("Holds", "Drift\ndeg/min", "Within 10 s\ndeg", "Range\ndeg", "SPARC", "Share\n%"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("Verdict")
-    for row in trials:
-        support = "" if row["support"] is None else f" {100 * row['support']:g} %"
-        share = None if row["wearer_share"] is None else 100.0 * row["wearer_share"]
-        numbers = (
-            (row["drift_deg_per_min"], 2), (row["stray_in_10_s_deg"], 2), (row["range_of_motion_deg"], 0),
-            (row["smoothness_sparc"], 2), (share, 0),
-        )  # fmt: skip
-        texts = (
-            row["subject"], f"{row['mode'] or ''}{support}", row["date"], "/".join(Path(row["recording"]).parts[-2:]),
-            row["arm"], row["holds"],
-        )  # fmt: skip
-        table.add_row(
-            *("" if text is None else escape(str(text)) for text in texts),
-            *("–" if number is None else shown(number, digits) for number, digits in numbers),
-            escape(row["verdict"] or row["problem"]),
-        )
-    console.print(table)
-    for trend in trends_of(trials):
-        console.print(escape(trend))

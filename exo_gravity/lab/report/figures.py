@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, PUSH_COLOUR, joint_colours, make_plain
-from exo_gravity.lab.report.table import joint_labels, per_minute
+from exo_gravity.lab.report.table import UNMOVED, joint_labels, per_minute, shown
+from exo_gravity.lab.report.verdict import unmoved
 from exo_gravity.lab.report.wearer_share import WearerPart
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording, in_blocks
@@ -19,6 +20,7 @@ from exo_gravity.lab.trial.recording import Recording, in_blocks
 INTERVALS = 2_000  # per curve
 WIDTH = 11.0  # inches
 START = 5  # blocks of 0.1 s, from whose mean the drift is drawn
+SEEN = math.radians(0.1)  # rad; a joint that strays less in every hold is a flat line, and is not drawn
 
 
 def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
@@ -61,25 +63,51 @@ def overview(recording: Recording, analysis: TrialAnalysis) -> Figure:
     return figure
 
 
+def _moved(analysis: TrialAnalysis) -> np.ndarray:
+    """Return how far each joint moved in a hold at most, (n,) rad; (0,) without a hold."""
+    moved = [np.fmax(hold.stray, np.abs(hold.drift)) for hold in analysis.holds]
+    return np.max(moved, axis=0) if moved else np.empty(0)
+
+
+def strayed(analysis: TrialAnalysis) -> np.ndarray:
+    """Return which joints (n,) moved visibly in a hold; (0,) without a hold."""
+    return _moved(analysis) >= SEEN
+
+
+def stayed_text(recording: Recording, analysis: TrialAnalysis) -> str:
+    """Return what the joints that `drift` does not draw did in the holds, in a line; '' if it draws all."""
+    moved, still = _moved(analysis), ~strayed(analysis)
+    if not still.any():
+        return ""
+    if moved.max() <= UNMOVED:
+        return f"In the holds, {unmoved(analysis.holds[0])}."
+    names = [name for name, is_still in zip(joint_labels(recording), still, strict=False) if is_still]
+    who = "no joint" if still.all() else f"none of {', '.join(names)}"
+    return f"In the holds {who} moved more than {shown(math.degrees(moved[still].max()), 3)} degrees: not drawn."
+
+
 def drift(recording: Recording, analysis: TrialAnalysis, criteria: HoldCriteria) -> Figure:
-    """Return the deviation of each joint from the start of each hold, and the drift rate of each hold."""
+    """Return the deviation from the start of each hold, of the joints that `strayed`, and the drift rate of all."""
     figure, blocks = Figure(figsize=(WIDTH, 6.6), layout="constrained"), in_blocks(recording)
     upper, lower = np.ravel(figure.subfigures(2, 1, height_ratios=(1.0, 1.1)))
     colours = joint_colours(len(recording.joint_names))
-    axes = np.ravel(upper.subplots(1, len(colours), sharex=True, sharey=True))
-    for joint, (axis, name) in enumerate(zip(axes, joint_labels(recording), strict=True)):
+    names = joint_labels(recording)
+    joints = np.flatnonzero(strayed(analysis)).tolist()
+    axes = np.ravel(upper.subplots(1, len(joints), sharex=True, sharey=True))
+    for joint, axis in zip(joints, axes, strict=True):
         for hold in analysis.holds:
             within = blocks.between(hold.start, hold.end)
             angle = np.degrees(blocks.mean[within, joint])
             time, away = blocks.time[within] - hold.start, angle - angle[:START].mean()
             axis.plot(time, away, color=colours[joint], lw=0.9, alpha=0.75)
-        axis.set_title(name, fontsize=10, color=colours[joint], loc="left", weight="bold")
+        axis.set_title(names[joint], fontsize=10, color=colours[joint], loc="left", weight="bold")
         axis.set_xlabel("Time in the hold (s)")
         axis.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         make_plain(axis)
         axis.margins(x=0)
     axes[0].set_ylabel("Deviation from the start (deg)")
-    reach = max([0.1, *(abs(value) for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value))])
+    drawn = np.abs([value for axis in axes for value in axis.dataLim.intervaly if math.isfinite(value)])
+    reach = max([math.degrees(SEEN), *drawn])
     axes[0].set_ylim(-1.15 * reach, 1.15 * reach)
     _rates(lower.subplots(), recording, analysis, criteria)
     return figure
@@ -116,7 +144,9 @@ def wearer(recording: Recording, part: WearerPart) -> Figure:
     rows = [*curve.torque.T, 100.0 * part.sliding.value]
     bands = [*(COVER * curve.deviation.T), 100.0 * COVER * part.sliding.deviation]
     names = [f"{label} (Nm)" for label in joint_labels(recording)]
-    columns = zip(axes, rows, bands, [*names, "Share over 1 s (%)"], [*colours, INK], strict=True)
+    columns = zip(
+        axes, rows, bands, [*names, "Wearer's share of arm weight, over 1 s (%)"], [*colours, INK], strict=True
+    )
     for axis, values, band, name, colour in columns:
         axis.fill_between(curve.time, values - band, values + band, color=colour, alpha=0.2, lw=0)
         axis.plot(curve.time, values, color=colour, lw=1.0)

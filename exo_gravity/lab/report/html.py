@@ -31,6 +31,8 @@ h1 { margin: 0; font-size: 1.8rem; } h2 { margin: 2.5rem 0 .5rem; } h3 { margin:
 figcaption { color: #5a646d; font-size: .9rem; }
 .verdict { border-left: .4rem solid #009E73; background: #eef7f3; padding: .7rem 1rem; margin: 1.2rem 0; }
 .verdict.not { border-color: #D55E00; background: #fdf1ea; }
+.source { display: inline-block; border: 2px dashed #5a646d; padding: .2rem .8rem; margin: .8rem 0 0;
+          font-weight: 700; }
 .verdict ul { margin: .3rem 0 0; padding-left: 1.2rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
@@ -67,6 +69,11 @@ def verdict(sentence: str, reasons: Iterable[str] = (), good: bool = True) -> st
     return f'<div class="{kind}"><b>{escape(sentence)}</b>{_items(reasons)}</div>'
 
 
+def source(text: str) -> str:
+    """Return a banner that says where the numbers come from."""
+    return f'<p class="source">{escape(text)}</p>'
+
+
 def heading(text: str, level: int = 3) -> str:
     """Return a heading of a section (2) or of a part of one (3)."""
     return f"<h{level}>{escape(text)}</h{level}>"
@@ -84,6 +91,11 @@ def make_plain(axis: "Axes") -> None:
     axis.tick_params(color=FAINT, labelcolor=INK, labelsize=9)
     axis.grid(axis="y", color=GRID_LINE, lw=0.5)
     axis.set_axisbelow(True)
+
+
+def stamp(figure: "Figure", text: str) -> None:
+    """Write a text at the lower right of a figure, which a picture that is copied elsewhere keeps."""
+    figure.text(0.995, 0.004, text, ha="right", va="bottom", color=INK, fontsize=9, weight="bold")
 
 
 def png_of(figure: "Figure", dpi: int = DPI) -> bytes:

@@ -11,13 +11,17 @@ from rich.console import Console
 from rich.markup import escape as marked
 
 from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag, Event
 from exo_gravity.lab.report import figures, html, table, wearer_share
-from exo_gravity.lab.report.verdict import EARLY, Conditions, Report, unmoved
+from exo_gravity.lab.report.verdict import EARLY, Conditions, Report
+from exo_gravity.lab.source import STATEMENTS
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 
 MAX_EVENTS = 200
+# On each figure, unless the arm is known to be real.
+STAMPS = {Source.SIMULATED: "SIMULATED", Source.UNKNOWN: "source unknown", Source.REAL: ""}
 WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
 CAPTIONS = {
     "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
@@ -78,24 +82,25 @@ def write(
         if with_time_series:
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
+            source = report.bag.source(recording.name)
             drawn = {"overview": figures.overview(recording, analysis)}
-            has_moved = any(hold.stray.max() > table.UNMOVED for hold in analysis.holds)
-            if has_moved:
+            if any(figures.strayed(analysis)):
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
             if part := report.wearers.get(recording.name):
                 drawn["wearer"] = figures.wearer(recording, part)
             pictures = []
             for name, figure in drawn.items():
+                html.stamp(figure, STAMPS[source])
                 png = html.png_of(figure)
                 path = folder / f"{recording.name.replace('/', '_')}_{name}.png"
                 path.write_bytes(png)
                 for suffix in formats:
                     html.save_vector(figure, path.with_suffix(f".{suffix}"))
                 pictures.append(html.picture(png, CAPTIONS[name]))
-            if analysis.holds and not has_moved:
-                pictures.append(html.bullets("", [f"In the holds, {unmoved(analysis.holds[0])}."]))
+            if text := figures.stayed_text(recording, analysis):
+                pictures.append(html.bullets("", [text]))
             if part:
-                pictures.append(html.bullets("Wearer", [wearer_share.sentence(part)]))
+                pictures.append(html.bullets("Wearer", [wearer_share.sentence(part, source)]))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
@@ -116,7 +121,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
     for recording, analysis in report.arms:
         table.print_tables(console, recording, analysis)
         if part := report.wearers.get(recording.name):
-            console.print(marked(wearer_share.sentence(part)))
+            console.print(marked(wearer_share.sentence(part, report.bag.source(recording.name))))
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {marked(note)}.")
     for problem in report.bag.problems:
@@ -125,7 +130,8 @@ def print_report(report: Report, console: Console | None = None) -> None:
         console.print(f"[red]{marked(sentence)}.[/]")
     for arm, settings in report.settings.items():
         mode, support, wearer = settings.in_words
-        console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}")
+        source = report.bag.source(arm).value
+        console.print(f"{marked(arm)}: {mode}, support {support}, wearer: {wearer}, source: {source}")
     text, good = report.verdict
     console.print(f"[{'green' if good else 'red'} bold]{marked(text)}[/]")
 
@@ -144,7 +150,7 @@ def _page(report: Report, sections: Sequence[str]) -> str:
     if parameters:
         ending.append(f"<details><summary>Parameters at the start</summary><pre>{escape(parameters)}</pre></details>")
     text, good = report.verdict
-    head = [html.verdict(text, report.failures, good), *_conditions(report)]
+    head = [html.source(STATEMENTS[report.source]), html.verdict(text, report.failures, good), *_conditions(report)]
     when = f"{report.start:%Y-%m-%d %H:%M:%S}, {length:.0f} s, {'/'.join(bag.path.parts[-2:])}"
     return html.document(report.title, when, [*head, *sections, *ending])
 
@@ -154,8 +160,8 @@ def _conditions(report: Report) -> Iterator[str]:
     session = report.bag.session
     given = {"Subject": session.subject, "Protocol": session.protocol, "Note": session.note}
     yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
-    lines = [(arm, *conditions.in_words) for arm, conditions in report.settings.items()]
-    yield html.table(("Arm", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
+    lines = [(arm, report.bag.source(arm).value, *words.in_words) for arm, words in report.settings.items()]
+    yield html.table(("Arm", "Source", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
     recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
     yield f"<p>{escape(f'{_criteria_text(report.criteria)} {recorder}')}</p>"
 

@@ -12,12 +12,13 @@ import numpy as np
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.safety.drive import FaultCode
-from exo_gravity.core.vocabulary import NONE
+from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag.content import BRIDGE, Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report import table
 from exo_gravity.lab.report.wearer_share import WearerPart
+from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.analysis import Hold, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.lab.trial.recording import Recording
 
@@ -124,6 +125,11 @@ class Report:
         return text, not (bad or self.failures)
 
     @property
+    def source(self) -> Source:
+        """Where the numbers of all arms together come from."""
+        return of_all(self.bag.source(recording.name) for recording in self.bag.recordings)
+
+    @property
     def trial(self) -> str:
         """The name of the trial's folder: `trial` records into NAME_DATE_TIME/bag."""
         path = self.bag.path.resolve()
@@ -145,9 +151,12 @@ class Report:
     def row_head(self, arm: str, time: float) -> dict[str, str]:
         """Return the first columns of a row of the CSV files, about `arm` at `time` s."""
         in_force = self.settings[arm].at(time)
+        if in_force.get("mode") == "one_g":  # it does not use the support
+            in_force.pop("support", None)
         settings = {key: str(in_force.get(key, "")) for key in ("side", "mode", "support")}
-        session = self.bag.session
-        return {"trial": self.trial, "subject": session.subject, "arm": arm, **settings, "version": session.version}
+        session, source = self.bag.session, self.bag.source(arm).value
+        of_whom = {"trial": self.trial, "subject": session.subject, "arm": arm, "source": source}
+        return {**of_whom, **settings, "version": session.version}
 
 
 def _falls(report: Report, recording: Recording, analysis: TrialAnalysis) -> Iterator[Worst]:

@@ -12,9 +12,11 @@ import numpy as np
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
+from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, observed, share_of, while_between
@@ -35,7 +37,7 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     Raises ParameterError or DataError that says why it is not known.
     """
     values = recorded_of(bag.parameters, recording.name, "compensator")
-    settings = settings_of({**values, "law": "exact"}) if values else None
+    settings = settings_of({**values, "law": "exact"}) if values and values["law"] != URDF_LAW else None
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
@@ -53,12 +55,13 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve)) if len(curve.time) else None
 
 
-def sentence(part: WearerPart) -> str:
+def sentence(part: WearerPart, source: Source) -> str:
     """Return the share over the recording, with its 95 % band."""
     share = part.whole
+    where = "In the simulation, the" if source is Source.SIMULATED else "The"
     if not np.isfinite(share.value):
-        return "The wearer's arm hung all the time: there was nothing to carry."
+        return f"{where} wearer's arm hung all the time: there was nothing to carry."
     band = COVER * float(share.deviation)
     value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
     caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
-    return f"The wearer carried {value}{caveat}."
+    return f"{where} wearer carried {value}{caveat}."

@@ -16,12 +16,12 @@ from rich.progress import Progress, TaskID
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.lab.bag.simulated import write_recordings
-from exo_gravity.lab.inputs.arms import node_values, read_arm
+from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.run import Trial, TrialEnd
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
-from exo_gravity.sim.params import SIMULATOR, device_of, imu_of, set_faults
+from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
 from exo_gravity.sim.script import TRUNK_ACTIONS, TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading, TrunkSensor, resting
@@ -33,7 +33,8 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
     Raises ParameterError that names the node and the parameter.
     """
     nodes = load(params)
-    simulators = {node: node_values(nodes, node, SIMULATOR) for node in nodes if node.endswith("/simulator")}
+    found = [node for node in nodes if node.endswith("/simulator")]
+    simulators = {node: node_values(nodes, node, simulator_table(nodes[node])) for node in found}
     if not simulators:
         raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
     with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
@@ -46,14 +47,14 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
             true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
             trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
     for node, simulator in simulators.items():
-        arm = read_arm(nodes, node.removesuffix("/simulator"))
+        arm = carried_arm(nodes, node.removesuffix("/simulator"))
         with named(f"{node} "):
             device = device_of(simulator)
             set_faults(device, simulator)
         rate = arm.can_bridge["rate"]
         if with_imu and moves:
             trunk = trunk_imu(imu_of(with_imu), rotation, rate)
-        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings(), rate, trunk)
+        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings, rate, trunk)
         trials.append(OfflineTrial(setup, script, simulator["trial_delay"]))
     return trials
 

@@ -18,7 +18,6 @@ from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE
@@ -32,8 +31,7 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 NOT_OK = 2  # the level of an event, as diagnostic_msgs/DiagnosticStatus has it
 GRACE = 0.5  # s from the end of the script until the arm is let down
-COLUMNS = 1 + 4 * JOINT_COUNT  # of the recording: time, position, velocity, effort, command
-NO_EFFORT = (math.nan,) * JOINT_COUNT
+COLUMNS = ("position", "velocity", "effort", "command")  # of the recording, each of all joints, after the time
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class OfflineTrial:
     """One arm, its controller, and a wearer who performs a script once, `delay` s after the motors are switched on.
 
     compensator: by default one with the arm's settings.
-    wearer: by default one who performs the script.
+    wearer: by default one who performs the script. Raises ParameterError if the script is for another arm.
 
     events: everything that went wrong. trouble: why the trial ended before the script, or ''.
     """
@@ -66,10 +64,12 @@ class OfflineTrial:
         compensator: Compensator | None = None,
         wearer: VirtualWearer | None = None,
     ) -> None:
+        script.check(len(arm.motors))
         self.arm, self.script, self.wearer = arm, script, wearer or VirtualWearer(script)
+        self._no_effort = (math.nan,) * len(arm.motors)
         self.events: list[Event] = []
         self.trouble = ""
-        self.compensator = compensator or Compensator(arm.settings)
+        self.compensator = compensator or Compensator(arm.settings, arm.limits.joint_names)
         self._controller = DirectController(self.compensator, arm.limits)
         self._delay = delay
         self._start = math.inf  # s, of the script
@@ -119,8 +119,8 @@ class OfflineTrial:
         """Give the samples to the compensator, and record them with the efforts that they follow."""
         effort = self._controller.efforts(now).effort
         if not any(self.arm.limits.is_silent(now, sample) for sample in samples):
-            position, velocity, measured, *_, times = zip(*samples, strict=True)
-            for values in ((min(times),), position, velocity, measured, effort or NO_EFFORT):
+            position, velocity, measured, _, _, times, *_ = zip(*samples, strict=True)
+            for values in ((min(times),), position, velocity, measured, effort or self._no_effort):
                 self._rows.extend(values)
         self._controller.take(now, samples)
         reason = self._controller.answer.reason
@@ -152,8 +152,8 @@ class OfflineTrial:
     def _recording(self) -> Recording:
         if not self._rows:
             raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
-        table = np.array(self._rows).reshape(-1, COLUMNS)
-        position, velocity, effort, command = np.split(table[:, 1:], 4, axis=1)
+        table = np.array(self._rows).reshape(-1, 1 + len(COLUMNS) * len(self._no_effort))
+        position, velocity, effort, command = np.split(table[:, 1:], len(COLUMNS), axis=1)
         steps = self.script.steps
         starts = itertools.accumulate((step.duration for step in steps), initial=self._start)
         end = float(table[-1, 0])

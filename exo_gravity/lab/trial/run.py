@@ -16,7 +16,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 
 from exo_gravity.core.errors import ParameterError
@@ -25,6 +24,7 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.parameter_file import load, stages
+from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, Stopping
 from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.session import Session
@@ -79,18 +79,17 @@ class Trial:
 
     def prepare(self, with_recorder: bool = True) -> Path:
         """Write the trial's own parameter file into the new folder, and return its path. Raises ParameterError."""
-        content: dict[str, Any] = yaml.safe_load(self.params.read_text(encoding="utf-8")) if self.params else {}
-        for node, entry in content.items():
+        nodes = load(self.params) if self.params else {}
+        for node, values in nodes.items():
             if node.endswith("/simulator"):
-                entry["ros__parameters"]["trial"] = str(self.path)
+                values["trial"] = str(self.path)
         if with_recorder:
             of_whom = {param.name: getattr(self.session, param.name) for param in params_of(Session)}
-            content[RECORDER] = {"ros__parameters": {"output": str(self.folder / "bag"), "live": True, **of_whom}}
+            nodes[RECORDER] = {"output": str(self.folder / "bag"), "live": True, **of_whom}
         path = self.folder / "params.yaml"
         try:
             self.folder.mkdir(parents=True)
-            text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-            path.write_text(text, encoding="utf-8")
+            path.write_text(text_of(nodes), encoding="utf-8")
         except OSError as error:
             expected = f"a writable folder ({error.strerror})"
             raise ParameterError("output", str(self.folder.parent), expected) from None

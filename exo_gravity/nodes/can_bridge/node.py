@@ -235,9 +235,7 @@ class CanBridge(LifecycleNode):
     def _check_watchdog(self, watchdog: Watchdog, loop: ControlLoop) -> None:
         """Let no motor be switched on before the watchdog watches, and none stay on without it or this node."""
         loop.attended = time.monotonic()
-        boards = loop.bus.boards.hindrance(time.monotonic(), 1.0 / loop.period)
-        setup = Reason(Wait.BOARD_SETUP, boards) if boards else NO_REASON
-        loop.safety.hindrance = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else setup
+        loop.hindrance = Reason(Wait.WATCHDOG, "the watchdog to start") if watchdog.is_starting else NO_REASON
         if not watchdog.alive and loop.safety.state is not State.LETTING_DOWN:
             loop.trip(FaultCode.WATCHDOG_DEAD, "the watchdog process has died, is frozen, or did not start")
 
@@ -249,7 +247,7 @@ class CanBridge(LifecycleNode):
 def _declared(node: Node) -> tuple[dict[str, Any], ArmOnBus]:
     """Declare the parameters; return their values, and the arm that they describe. Raises ParameterError."""
     values = declare(node, CAN_BRIDGE, free_prefix=OPTIONS)
-    serials = serials_of(values["can.serial"], values["can.channel"])
+    serials = serials_of(values["can.serial"], values["can.channel"], len(values["joint_names"]))
     address, motors, limits = bus_of(node, values), motors_of(values), limits_of(values)
     return values, ArmOnBus(address, motors, limits, 1.0 / values["rate"], serials=serials)
 

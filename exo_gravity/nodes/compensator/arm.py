@@ -1,7 +1,6 @@
 """The arm that `compensator` carries: its parameters, what is reported of it, and where its efforts go.
 
-The exoskeleton's own arm has its laws, a wearer, terms, an outer loop and a torque budget. With `law: urdf` it is any
-serial arm, whose URDF comes from a file or from `robot_description`, with gravity compensation alone.
+It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from a file or from `robot_description`.
 """
 
 import threading
@@ -16,20 +15,20 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
-from exo_gravity.core.compensation.settings import URDF_LAW, Settings
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, Reason, WeighingPhase, words
-from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
-from exo_gravity.nodes.ros.parameters import declare
+from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
@@ -39,20 +38,25 @@ JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) 
 Read = Callable[[dict[str, Any]], Settings]
 
 
-def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read]:
+def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm | None]:
     """Declare the parameters of the node's arm. Raises ParameterError.
 
-    Returns their table, their values, and a function that returns the settings that such values describe.
+    Returns their table, their values, a function that returns the settings that such values describe, and the arm from
+    a URDF, to which the positions of its other joints are told; None for the paper's arm.
     """
-    given = node.get_parameters_by_prefix("")
-    if "law" not in given or given["law"].value != URDF_LAW:
+    given = given_to(node)
+    if given.get("law") != URDF_LAW:
         table = settings.compensator_table(given)
-        return table, declare(node, table), lambda values: settings.settings_of(values, _text)
-    table = settings.urdf_table(len(_joint_names(node)), given)
+        return table, declare(node, table), lambda values: settings.settings_of(values, _text), None
+    table = settings.urdf_table(given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
-    model = UrdfArm(_description(node, values), values["joint_names"])
-    return table, values, lambda values: settings.urdf_settings_of(values, model)
+    arm = UrdfArm(_description(node, values), values["joint_names"], values["urdf.hand"])
+    for note in arm.notes:
+        node.get_logger().warning(note)
+    if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
+        arm.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
+    return table, values, lambda values: settings.urdf_settings_of(values, arm), arm
 
 
 def check_side(namespace: str, side: str) -> None:
@@ -67,42 +71,40 @@ def check_side(namespace: str, side: str) -> None:
 
 def sentence(s: Settings) -> str:
     """Return what is compensated, for the log."""
-    mode = f"{s.side} arm, mode {s.mode}, support {s.support:g}, " if s.robot else ""
-    return f"{mode}law {s.law}: compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
+    carried = f"compensates {s.mass:.2f} kg, at most {row(s.max_effort)} Nm"
+    side = "" if s.law == URDF_LAW else f"{s.side} arm, "
+    return f"{side}mode {s.mode}, support {s.support:g}, law {s.law}: {carried}"
 
 
 def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[str, object]:
     """Return what the arm's settings and terms are, for /diagnostics. names: of the joints."""
     s, terms, now = control.settings, control.terms, time.monotonic()
     most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, NONE))
-    values: dict[str, object] = {"law": s.law, "changing load": name}
-    values["load to change (Nm)"] = f"{most:.1f}" if answer.remainder else NONE
-    values["max effort (Nm)"] = row(s.max_effort)
-    values["law in use"] = "exact" if answer.fallback else s.law
-    values["mass carried (kg)"] = f"{s.mass:.3f}"
-    if s.urdf:
-        values["gain"] = row(s.urdf.gain)
-    if s.robot:
-        asked = control.support_request.fresh(now)
-        values |= {
-            "mode": s.mode,
-            "support": s.support,
-            "support in use": row([s.support_now]),
-            "support request": control.support_request.report(now).word,
-            "support requested": NONE if asked is None else row([asked]),
-            "robot mass (kg)": UNKNOWN if s.robot.by_moments else row(s.robot.mass),
-            "robot cog (m)": UNKNOWN if s.robot.by_moments else row(s.robot.cog),
-            "robot moments (kg m)": row(moments_of(s.robot)),
-            "wearer mass (kg)": row(s.wearer_mass),
-            "wearer cog (m)": row(s.wearer_cog),
-            "payload mass (kg)": f"{s.payload_mass:.3f}",
-        }
-    if terms:
-        values["terms"] = words(*terms.active)
-        why_not = terms.assist.reason
-        values |= {"assist": terms.assist.state, "assist reason": why_not.word, "assist text": why_not}
-        values["inertia tank (J)"] = f"{terms.tank.level:.2f}"
-    return values
+    asked, why_not = control.support_request.fresh(now), terms.assist.reason
+    facts = {f"robot {what}": UNKNOWN if known is None else row(known) for what, known in s.robot.facts.items()}
+    return {
+        "law": s.law,
+        "changing load": name,
+        "load to change (Nm)": f"{most:.1f}" if answer.remainder else NONE,
+        "max effort (Nm)": row(s.max_effort),
+        "law in use": "exact" if answer.fallback else s.law,
+        "mass carried (kg)": f"{s.mass:.3f}",
+        "gain": row(s.robot.gain),
+        "mode": s.mode,
+        "support": s.support,
+        "support in use": row([s.support_now]),
+        "support request": control.support_request.report(now).word,
+        "support requested": NONE if asked is None else row([asked]),
+        **facts,
+        "wearer mass (kg)": row(s.wearer_mass),
+        "wearer cog (m)": row(s.wearer_cog),
+        "payload mass (kg)": f"{s.payload_mass:.3f}",
+        "terms": words(*terms.active),
+        "assist": terms.assist.state,
+        "assist reason": why_not.word,
+        "assist text": why_not,
+        "inertia tank (J)": f"{terms.tank.level:.2f}",
+    }
 
 
 def weighing_report(weighing: Weighing | None, number: int, refusal: Reason) -> dict[str, object]:
@@ -134,7 +136,7 @@ def weighing_report(weighing: Weighing | None, number: int, refusal: Reason) -> 
 def warnings_of(control: Compensator, answer: Compensation, names: Sequence[str]) -> dict[CompensatorWarning, str]:
     """Return what `control` works with although it is not as it should be. names: of the joints."""
     warnings: dict[CompensatorWarning, str] = {}
-    problem = control.terms.problem if control.terms else ""
+    problem = control.terms.problem
     if answer.held:
         warnings[CompensatorWarning.LATE_TILT] = answer.held
     if answer.fallback:
@@ -151,19 +153,12 @@ def warnings_of(control: Compensator, answer: Compensation, names: Sequence[str]
 
 
 def _forget_unused(node: Node, used: set[str]) -> None:
-    """Undeclare the parameters of the exoskeleton's own arm, which a file may have, and log them."""
+    """Undeclare the parameters of the paper's arm, which a file may have, and log them."""
     unused = [param.name for param in settings.COMPENSATOR if param.name not in used and node.has_parameter(param.name)]
     for name in unused:
         node.undeclare_parameter(name)
     if unused:
         node.get_logger().warning(f"law {URDF_LAW} takes the arm from its URDF and ignores {', '.join(unused)}")
-
-
-def _joint_names(node: Node) -> list[str]:
-    names = list(node.get_parameter("joint_names").value or ()) if node.has_parameter("joint_names") else []
-    if not 1 <= len(set(names)) == len(names) <= settings.MAX_JOINTS:
-        raise ParameterError("joint_names", names, f"1 to {settings.MAX_JOINTS} different joints of the URDF")
-    return names
 
 
 def _description(node: Node, values: dict[str, Any]) -> str:
@@ -174,10 +169,7 @@ def _description(node: Node, values: dict[str, Any]) -> str:
         if not arrived:
             raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
         return str(message.data)
-    try:
-        return _text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+    return read_urdf(path)
 
 
 def _text(path: str) -> str:

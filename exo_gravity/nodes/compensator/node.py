@@ -66,7 +66,7 @@ class CompensatorNode(Node):
     def __init__(self, context: Context | None = None) -> None:
         super().__init__("compensator", context=context, automatically_declare_parameters_from_overrides=True)
         self._lock = threading.Lock()  # guards the control: joint states arrive on another thread
-        table, values, read = declared(self)
+        table, values, read, self._urdf = declared(self)
         check_side(self.get_namespace(), values.get("side", ""))
         self._names = values["joint_names"]
         settings = read(values)
@@ -74,8 +74,7 @@ class CompensatorNode(Node):
         self._weighing: Weighing | None = None
         self._weighings, self._weighing_refusal = 0, NO_REASON
         self._threads: list[PeriodicThread] = []
-        if self._control.terms:
-            self._serve_wearer(self._control.terms)
+        self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
         self._interface = self._open_interface(values, is_called)
         self._diagnostics = Diagnostics(self)
@@ -105,7 +104,7 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add what only the exoskeleton's own arm has: assistance, support on request, weighing."""
+        """Add assistance, support on request, and weighing."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
         self._threads += [
@@ -158,6 +157,8 @@ class CompensatorNode(Node):
         now = time.monotonic()
         try:
             theta, velocity = self._interface.read(message)
+            if self._urdf:
+                self._urdf.follow(message.name, message.position)
             if self._interface.problem:  # no step: there is no torque to change
                 answer = Compensation.withdrawn(Reason(Withdrawal.OUTPUT_FAULT, self._interface.problem))
             else:
@@ -213,7 +214,6 @@ class CompensatorNode(Node):
 
     def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         settings, terms, last = self._control.settings, self._control.terms, self._weighing
-        assert terms  # else there is no such service
         rate = self._rate.value
         weighing = Weighing(settings, self._names, rate, last.empty if last else None)
         with self._lock:
@@ -232,6 +232,7 @@ class CompensatorNode(Node):
             "reason text": answer.reason,
             "warnings": words(*warnings_of(self._control, answer, self._names)),
             **self._interface.values,
+            **({"joints taken to be at 0": words(*self._urdf.fixed)} if self._urdf else {}),
             "limits acting": words(*[f"max_effort ({self._names[joint]})" for joint in answer.clamped]),
             "rate (Hz)": row([self._rate.update(now, self._answers)], 1),
             "age of joint states (ms)": milliseconds(now - self._last_answer),
@@ -241,7 +242,7 @@ class CompensatorNode(Node):
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else NONE,
             **report(self._control, answer, self._names),
-            **(weighing if self._control.terms else {}),
+            **weighing,
             "refused message": self._refused_topic,
             "refused message text": self._refusal,
         }

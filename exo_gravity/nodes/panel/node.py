@@ -18,10 +18,10 @@ from typing import Any
 from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import Vector3Stamped
 from rcl_interfaces.msg import ParameterEvent
-from rcl_interfaces.srv import SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -31,12 +31,12 @@ from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
-from exo_gravity.nodes.ros.parameters import OtherNodes, declare
+from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, Latest
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
-from exo_gravity.panel.view import PANEL, LoadChanges, Values, joint_rows, setup_of
+from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ class ArmClient:
 
     def __init__(self, node: Node, name: str) -> None:
         self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
+        self.settings = node.create_client(GetParameters, f"/{name}/{COMPENSATOR}/get_parameters")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
 
@@ -171,6 +172,22 @@ class Arms:
         request = ASKED[kind][-1] or SetParametersAtomically.Request(parameters=given)
         return await call(self.clients[arm].services[kind], request)
 
+    async def settings_of(self, arm: str) -> dict[str, Any]:
+        """Return the settings that the arm's compensator has at this moment, {} for an arm without one.
+
+        Raises ExoGravityError if it does not answer.
+        """
+        node = f"/{arm}/{COMPENSATOR}"
+        if node not in self._others.found:
+            return {}
+        known = self._others.values(node)
+        names = [name for name in SETTABLE if name in known]  # an arm of a URDF has none of them
+        answer = await answer_of(self.clients[arm].settings, GetParameters.Request(names=names))
+        if not known or len(answer.values) != len(names):
+            raise ExoGravityError(f"the parameters of {node} are not known yet")
+        values = map(parameter_value_to_python, answer.values)
+        return {name: plain(value) for name, value in zip(names, values, strict=True)}
+
     def _report(self, arm: str) -> dict[str, Any]:
         """Return what the arm's bridge reports; {} if it is silent."""
         return self._statuses.within(TIMING.silent, f"{arm}/{BRIDGE}")
@@ -180,16 +197,24 @@ class Arms:
             self._others.found[event.node].refresh()
 
 
-async def call(client: Client, request: Any) -> str:
-    """Send `request` at once; return '' if it was carried out, else why not."""
+async def answer_of(client: Client, request: Any) -> Any:
+    """Send `request` at once; return the response. Raises ExoGravityError if there is none."""
     sent = client.call_async(request)
     deadline = time.monotonic() + (TIMING.call_timeout if client.service_is_ready() else TIMING.absent_timeout)
     while not sent.done():
         if time.monotonic() > deadline:
             client.remove_pending_request(sent)
-            return f"{client.srv_name} does not answer"
+            raise ExoGravityError(f"{client.srv_name} does not answer")
         await asyncio.sleep(TIMING.look_period)
-    response: Any = sent.result()
+    return sent.result()
+
+
+async def call(client: Client, request: Any) -> str:
+    """Send `request` at once; return '' if it was carried out, else why not."""
+    try:
+        response = await answer_of(client, request)
+    except ExoGravityError as error:
+        return str(error)
     if isinstance(response, SetParametersAtomically.Response):
         is_done, reason = response.result.successful, response.result.reason
     else:
@@ -214,7 +239,7 @@ class Panel(Node):
         if scripts is None or not scripts.is_dir():
             raise ParameterError("trials", values["trials"], "a folder")
         self._recordings = Recordings(values["output"], scripts, self._arms, self._note, time.monotonic)
-        own = {name: values[name] for name in ("language", "dead_man")}
+        own = {name: values[name] for name in ("language", "dead_man", "markers")}
         self._own_setup = {**own, "trials": list(self._recordings.trials)}
         self._shown: Any = None  # the nodes' parameters that the pages have
         self._changes = LoadChanges()

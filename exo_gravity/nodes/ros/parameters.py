@@ -13,7 +13,7 @@ from rclpy.task import Future
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
-from exo_gravity.core.params import Param, values_of
+from exo_gravity.core.params import Param, table_for, values_of
 from exo_gravity.nodes.ros.inner import intercept_changes
 
 T = TypeVar("T")
@@ -29,7 +29,8 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
 
     Raises ParameterError for an impossible value, and for a name that is not in the table.
     """
-    given = {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
+    given = given_to(node)
+    table = table_for(table, given)
     values = values_of(table, given, free_prefix)
     for param in table:
         if node.has_parameter(param.name):
@@ -51,6 +52,11 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
 
     intercept_changes(node, refusal, is_same)
     return values
+
+
+def given_to(node: Node) -> dict[str, Any]:
+    """Return the parameters that `node` was started with, by name."""
+    return {name: plain(parameter.value) for name, parameter in node.get_parameters_by_prefix("").items()}
 
 
 def accept_changes(

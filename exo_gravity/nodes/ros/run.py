@@ -6,6 +6,7 @@ rclpy's own signal handlers close the context before a node can react. Here a si
 
 import contextlib
 import gc
+import inspect
 import os
 import signal
 import sys
@@ -23,10 +24,19 @@ from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.nodes.ros.inner import NodeExecutor
+from exo_gravity.nodes.ros.messages import ERROR, OK, Diagnostics
 
 NEEDED_CHECK_PERIOD = 0.1  # s
 CLOSE_TIMEOUT = 5  # s for the middleware to close
 SWITCH_INTERVAL = 2e-4  # s that a thread may wait for the interpreter's lock; Python's default is 5 ms
+NO_CLOCK_TIMEOUT = 2.0  # s of a clock that stands still, without a publisher of /clock
+NO_CLOCK = "use_sim_time is true, but nobody publishes /clock: this node's clock and timers stand still"
+# Set by exo.launch.py for all nodes but the bridges: it ends them itself, once the arms are down.
+WAITS_FOR_BRIDGES = "EXO_GRAVITY_WAITS_FOR_BRIDGES"
+HELP = """
+Parameters: docs/parameters.md. Start it from a parameter file with `launcher --params FILE`, or alone:
+  {name} --ros-args -r __ns:=/right --params-file FILE
+"""
 
 
 def run(make_node: Callable[[], Node], priority: int = 0) -> int:
@@ -40,12 +50,15 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     failure: an exception raised in one of its threads, or None;
     needed: while it is true, the node keeps running after its launcher has died.
     """
+    executable = os.path.basename(sys.argv[0])
+    if {"-h", "--help"}.intersection(sys.argv[1:]):
+        sys.stdout.write((inspect.getdoc(inspect.getmodule(make_node)) or "") + HELP.format(name=executable))
+        return 0
     keep_to_this_machine()
     ending: list[int] = []
     handle_signals(ending)
     if priority:
         favour(priority)
-    executable = os.path.basename(sys.argv[0])
     with contextlib.suppress(OSError):
         Path("/proc/self/comm").write_text(executable)  # for ps, top and pgrep
     try:
@@ -64,9 +77,11 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     sys.setswitchinterval(SWITCH_INTERVAL)
     executor = NodeExecutor()
     executor.add_node(node)
+    clock = ClockWatch(node)
     try:
         while not ending:
             executor.spin_once(timeout_sec=0.1)
+            clock.look()
             if failure := getattr(node, "failure", None):
                 raise failure
         return 0
@@ -82,11 +97,39 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
         rclpy.try_shutdown()
 
 
+class ClockWatch:
+    """Says that a node waits for a clock that nobody publishes: none of its timers runs then, and no report is sent."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._seen: int | None = None  # ns, on the node's clock, when it last moved
+        self._since = time.monotonic()
+        self._diagnostics: Diagnostics | None = None  # once there was something to say
+
+    def look(self) -> None:
+        """Report on /diagnostics, and in the log, if the clock stands still. Call it several times a second."""
+        clock, now = self._node.get_clock(), time.monotonic()
+        seen = clock.now().nanoseconds if clock.ros_time_is_active else None
+        if seen is None or seen != self._seen:
+            self._seen, self._since = seen, now
+            if self._diagnostics:
+                self._diagnostics.report(OK, "/clock is published")
+                self._diagnostics = None
+        elif now - self._since > NO_CLOCK_TIMEOUT and not self._node.count_publishers("/clock"):
+            self._diagnostics = self._diagnostics or Diagnostics(self._node)
+            self._diagnostics.report(ERROR, NO_CLOCK)
+
+
 def handle_signals(ending: list[int]) -> None:
     """Let each signal that ends the node be appended to `ending`.
 
-    A SIGHUP that is ignored, as nohup does, stays ignored.
+    A SIGHUP that is ignored, as nohup does, stays ignored. With WAITS_FOR_BRIDGES only SIGTERM ends the node.
     """
+    if os.environ.get(WAITS_FOR_BRIDGES):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, lambda received, _: ending.append(received))
+        return
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda received, _: ending.append(received))

@@ -7,6 +7,7 @@ const CONFIRM_EVERY = 3; // states
 const SILENCE = 1500; // ms without a state after which the values on the page are old
 const RETRY = 500; // ms
 const ANSWER = 2500; // ms that Let down waits for its answer
+const READ = 5000; // ms that the arm's settings are waited for
 const [FULL, REPLACED] = [4000, 4001];
 
 let secret = sessionStorage.getItem("page") || "";
@@ -72,6 +73,16 @@ export async function request(body, timeout = 8000) {
     }
   } catch {
     return null;
+  }
+}
+
+// The arm's settings at this moment, read from its compensator: {settings}, or {error}.
+export async function settingsOf(arm) {
+  try {
+    const answer = await fetch(`/settings/${arm.split("/").map(encodeURIComponent).join("/")}`, { signal: AbortSignal.timeout(READ) });
+    return await answer.json();
+  } catch (error) {
+    return { error: String(error) };
   }
 }
 

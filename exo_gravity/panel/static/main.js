@@ -1,10 +1,11 @@
 // The page: takes the state, shows it, and sends what its user asks for. Let down comes first.
 
 import { ArmCard } from "./arm.js";
-import { ask, close as closeAsk } from "./ask.js";
-import { connect, letDown, link, request, watch } from "./link.js";
+import { ask, close as closeAsk, drop, prepare, show as showAsk } from "./ask.js";
+import { connect, letDown, link, request, settingsOf, watch } from "./link.js";
 import { Plots } from "./plots.js";
 import { Picture } from "./picture.js";
+import { say } from "./say.js";
 import { Sections } from "./sections.js";
 import { degrees, loadTexts, number, t, write } from "./texts.js";
 
@@ -18,8 +19,10 @@ let mayAlarm = false; // once the page has been connected
 
 const button = byId("let-down");
 let pressed = 0;
+let downs = 0; // how often it was asked for
 
 async function down(arm) {
+  downs += 1;
   closeAsk(false);
   const problem = await letDown(arm);
   if (problem === "") return say(t("let_down_sent"));
@@ -51,12 +54,46 @@ document.addEventListener("keyup", (event) => event.code === "Space" && event.pr
 
 // What the arms' cards ask for
 
-const say = (text) => write(byId("message"), text);
-
 async function send(body) {
   const problem = await request(body);
   say(problem === null ? t("unsent") : problem ? t("refused", problem) : "");
   return problem === "";
+}
+
+// Asks about the settings in force, not about those that the page has seen last: they are read from the arms before the
+// question is seen, and again after the answer. If they have changed meanwhile, it asks again. Let down ends it.
+//
+// compose: returns heading, text and button of the question, from the cards; null where there is nothing to ask.
+async function sure(asked, compose) {
+  const since = downs;
+  const known = compose();
+  let question = known && prepare(...known);
+  let agreed = null;
+  for (;;) {
+    const problem = await refresh(asked);
+    const texts = compose();
+    const isDown = downs !== since; // Let down was pressed meanwhile
+    if (problem && !isDown) say(t("settings_unread", problem));
+    if (problem || isDown || !texts || texts[1] === agreed) {
+      if (question) drop(question);
+      return !problem && !isDown;
+    }
+    question ??= prepare(...texts);
+    showAsk(question, ...texts);
+    if (!(await question.answered)) return false;
+    agreed = texts[1];
+    question = null;
+  }
+}
+
+// Reads the settings of these cards' arms; returns why that failed, or ''.
+async function refresh(asked) {
+  const answers = await Promise.all(asked.map((card) => settingsOf(card.name)));
+  answers.forEach(({ settings }, n) => {
+    const setup = asked[n].setup;
+    if (settings) asked[n].configure({ ...setup, settings: { ...setup.settings, ...settings } });
+  });
+  return answers.map(({ error }) => error).find(Boolean) ?? "";
 }
 
 const ASKED = 0.1; // a larger change of the support of an arm that is carried is asked about: it may be a slip
@@ -64,36 +101,44 @@ const percent = (card) => number(100 * card.support, 1);
 const actions = {
   send,
   down,
+  sure,
   async enable(card) {
-    const over = card.mode === "zero_g" && card.isOver(card.support) ? t("support_over") : "";
-    const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))} ${over}`;
-    if (await ask(t("enable_arm", card.armText()), text, t("enable"))) send({ do: "enable", arm: card.name });
+    const isSure = await sure([card], () => {
+      const over = card.mode === "zero_g" && card.isOver(card.support) ? t("support_over") : "";
+      const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))} ${over}`;
+      return [t("enable_arm", card.armText()), text, t("enable")];
+    });
+    if (isSure) send({ do: "enable", arm: card.name });
   },
   async mode(card, mode) {
     if (mode === card.mode) return;
-    const text = mode === "zero_g" ? t("zero_g_ask") : t("one_g_ask", percent(card));
-    if ((mode === "zero_g" || card.isCarried) && !(await ask(t(`mode.${mode}`), text, t(`mode.${mode}`)))) return;
-    send({ do: "set", arm: card.name, values: mode === "zero_g" ? { mode, support: 0 } : { mode } });
+    const isSure = await sure([card], () => {
+      const text = mode === "zero_g" ? t("zero_g_ask") : t("one_g_ask", percent(card));
+      return mode === "zero_g" || card.isCarried ? [t(`mode.${mode}`), text, t(`mode.${mode}`)] : null;
+    });
+    if (isSure) send({ do: "set", arm: card.name, values: mode === "zero_g" ? { mode, support: 0 } : { mode } });
   },
   async weigh(card) {
     if (await ask(t("weigh_arm", card.armText()), t("weigh_ask"), t("weigh"))) send({ do: "weigh", arm: card.name });
   },
   async carry(card, mass) {
     const kilograms = Math.round(1000 * mass) / 1000;
-    const text = t("carry_ask", number(card.payload, 2), number(kilograms, 2));
-    if (await ask(t("payload"), text, t("change"))) send({ do: "set", arm: card.name, values: { "payload.mass": kilograms } });
+    const isSure = await sure([card], () => [t("payload"), t("carry_ask", number(card.payload, 2), number(kilograms, 2)), t("change")]);
+    if (isSure) send({ do: "set", arm: card.name, values: { "payload.mass": kilograms } });
   },
   // Returns whether the support was taken.
   async support(card, support) {
-    const over = card.isOver(support) && support > card.support;
-    const far = card.isCarried && card.mode === "zero_g" && Math.abs(support - card.support) > ASKED;
-    const text = `${t("support_ask", percent(card), number(100 * support, 1))} ${over ? t("support_over") : ""}`;
-    if ((over || far) && !(await ask(t("support_title"), text, t("change")))) return false;
-    return send({ do: "set", arm: card.name, values: { support } });
+    const isSure = await sure([card], () => {
+      const over = card.isOver(support) && support > card.support;
+      const far = card.isCarried && card.mode === "zero_g" && Math.abs(support - card.support) > ASKED;
+      const text = `${t("support_ask", percent(card), number(100 * support, 1))} ${over ? t("support_over") : ""}`;
+      return over || far ? [t("support_title"), text, t("change")] : null;
+    });
+    return isSure && send({ do: "set", arm: card.name, values: { support } });
   },
 };
 
-const sections = new Sections(send, cards);
+const sections = new Sections(actions, cards);
 const plots = new Plots(byId("plots"));
 const picture = new Picture(byId("picture"), byId("views"));
 
@@ -151,8 +196,21 @@ function showBar() {
   const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => card.state === "disabled");
   byId("let-down").toggleAttribute("data-off", off);
   write(byId("let-down-hint"), t(off ? "let_down_off" : "let_down_hint"));
-  byId("light").hidden = !(link.alive && (state.recording.on || state.recording.foreign));
-  byId("simulated").hidden = !Object.values(setup.arms ?? {}).some((arm) => arm.simulated);
+  const { on, foreign, seconds } = state.recording;
+  byId("light").hidden = !(link.alive && (on || foreign));
+  write(byId("light"), on ? t("recording_light", seconds) : t("recording"));
+  showSource();
+}
+
+// Whether the arms are simulated: in one word where all are alike.
+function showSource() {
+  const all = [...cards.values()];
+  const sources = new Set(all.map((card) => card.source));
+  const place = byId("source");
+  place.hidden = !all.length;
+  place.dataset.source = sources.has("simulated") ? "simulated" : sources.has("unknown") ? "unknown" : "real";
+  const each = all.map((card) => t("source.of", card.headText(), t(`source.${card.source}`)));
+  write(place, sources.size === 1 ? t(`source.${place.dataset.source}`) : each.join(", "));
 }
 
 // The pose to which the running step of a trial leads the arms; null without one.
@@ -163,8 +221,8 @@ function targetOf(trial) {
 
 function showConnection() {
   mayAlarm ||= link.alive;
-  const words = link.alive ? t("connected") : t("connecting");
-  write(byId("connection"), setup?.dead_man ? `${words}. ${t("dead_man_on")}` : words);
+  write(byId("connection"), link.alive ? t("connected") : t(mayAlarm ? "not_connected" : "connecting"));
+  byId("connection").toggleAttribute("data-alive", link.alive);
   if (byId("alarm").dataset.down) return;
   const lost = setup?.dead_man ? t("lost_dead_man") : t("lost");
   write(byId("alarm"), link.alive || !mayAlarm ? "" : link.full ? t("full") : lost);
@@ -174,8 +232,8 @@ function showControl(operates) {
   const holder = state.control;
   const elsewhere = operates && holder.elsewhere;
   const yours = elsewhere ? t("control_elsewhere", elsewhere, link.number) : t("control_yours", link.number);
-  const text = !link.alive ? "" : !holder ? t("control_none") : operates ? yours : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
-  write(byId("control-text"), text);
+  const who = !link.alive ? "" : !holder ? t("control_none") : operates ? yours : holder.gone ? t("control_gone", holder.page, holder.address) : t("control_other", holder.page, holder.address, link.number);
+  write(byId("control-text"), setup.dead_man ? `${who} ${t("dead_man_on")}` : who);
   byId("take").hidden = (operates && !(elsewhere && setup.dead_man)) || !link.alive;
   byId("release").hidden = !operates;
 }
@@ -194,6 +252,7 @@ const useLanguage = await loadTexts(() => {
     if (card.setup) card.configure(card.setup);
   }
   plots.translate();
+  sections.translate();
   show();
 });
 let chosen = false;

@@ -3,6 +3,7 @@
 // It is drawn at most ten times a second, and only when the browser is ready for a picture: drawing must never delay a
 // press. Without WebGL a sentence replaces it.
 
+import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
 import { t } from "./texts.js";
 
@@ -52,7 +53,6 @@ export class Picture {
     this.camera = new T.PerspectiveCamera(40, 1, 0.05, 20);
     this.camera.up.set(0, 0, 1);
     this.scene = new T.Scene();
-    this.scene.background = new T.Color("#f3f5f7");
     this.scene.add(new T.HemisphereLight("#ffffff", "#8a94a0", 2.5));
     const gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0x0a4f9e, 0.09, 0.05);
     this.scene.add(gravity);
@@ -169,6 +169,7 @@ export class Picture {
       this.camera.aspect = width / height;
       this.camera.updateProjectionMatrix();
     }
+    this.scene.background = new this.three.Color(colour("--ground"));
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }

@@ -1,22 +1,30 @@
 // The last 30 seconds of each arm: angles, torques with their limits, temperatures, rate and age. uPlot draws.
+//
+// A figure without a curve says why. An arm that falls silent leaves a gap, so that no old curve looks like a new one.
 
-import { jointText, temperature } from "./arm.js";
+import { temperature } from "./arm.js";
+import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
-import { degrees, finite, t } from "./texts.js";
+import { jointText } from "./telling.js";
+import { degrees, finite, t, write } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
-const COLOURS = ["#0a4f9e", "#a61218", "#0b6b2e", "#7a4b00"];
+const HEIGHT = 160; // px
+const COLOURS = ["--curve-1", "--curve-2", "--curve-3", "--curve-4"]; // of panel.css
 const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]]; // so that colour is not all
+const MARKS = ["——", "– –", "····", "–·–"];
 const KINDS = [
   ["angle", "°", (joint) => degrees(joint.position)],
   ["torque", "Nm", (joint) => joint.effort],
   ["temperature", "°C", temperature],
 ];
+const of = (list, n) => list[n % list.length]; // an arm may have more joints
 
 export class Plots {
   constructor(place) {
     this.place = place;
-    this.arms = new Map(); // name -> {times, figures}
+    this.note = document.getElementById("plots-blank");
+    this.arms = new Map(); // name -> {figures}
     this.limits = {};
     this.width = 0;
     this.painter = new Painter(() => this.draw());
@@ -31,16 +39,20 @@ export class Plots {
     this.limits = Object.fromEntries(Object.entries(setups).map(([name, setup]) => [name, setup.max_effort ?? []]));
   }
 
+  // arms: the states of all arms.
   add(arms) {
+    const now = performance.now() / 1000;
     for (const [name, arm] of Object.entries(arms)) {
-      if (!arm.joints) continue;
-      if (!this.arms.has(name)) this.create(name, arm.joints);
-      const { figures } = this.arms.get(name);
-      const now = performance.now() / 1000;
-      const rows = KINDS.map(([, , value]) => arm.joints.map((joint) => value(joint, arm.bridge)));
-      rows.push([finite(arm.bridge?.["rate (Hz)"]), finite(arm.bridge?.["age of efforts (ms)"])]);
-      figures.forEach((figure, n) => push(figure, now, rows[n]));
+      if (arm.joints && !this.arms.has(name)) this.create(name, arm.joints);
+      for (const figure of this.arms.get(name)?.figures ?? []) {
+        push(figure, now, figure.values(arm));
+        write(figure.blank, whyBlank(figure, arm));
+      }
     }
+    const missing = Object.keys(arms).filter((name) => !this.arms.has(name));
+    this.note.hidden = this.arms.size > 0 && !missing.length;
+    const waiting = missing.map((name) => `${t(`head.${name}`)}: ${t("blank.waiting")}`).join(" ");
+    write(this.note, this.note.hidden ? "" : waiting || t("blank.no_arm"));
     this.painter.request();
   }
 
@@ -51,61 +63,73 @@ export class Plots {
 
   create(name, joints) {
     const labels = joints.map((joint) => joint.name);
-    const limits = this.limits[name] ?? [];
-    const figures = KINDS.map(([kind, unit]) => this.figure(name, kind, unit, labels, kind === "torque" ? limits : []));
-    figures.push(this.figure(name, "rate", "Hz, ms", ["rate", "age"], []));
+    const nothing = joints.map(() => null);
+    const figures = KINDS.map(([kind, unit, value]) =>
+      this.figure(name, kind, unit, labels, (arm) => arm.joints?.map((joint) => value(joint, arm.bridge)) ?? nothing),
+    );
+    const rates = (arm) => [finite(arm.bridge?.["rate (Hz)"]), finite(arm.bridge?.["age of efforts (ms)"])];
+    figures.push(this.figure(name, "rate", "Hz, ms", ["rate", "age"], rates));
     this.arms.set(name, { figures });
   }
 
-  figure(arm, kind, unit, names, limits) {
+  // values: returns the newest number of each curve from an arm's state, null where there is none.
+  figure(arm, kind, unit, names, values) {
     const element = document.createElement("figure");
     const caption = document.createElement("figcaption");
     const canvas = document.createElement("div");
-    element.append(caption, canvas);
+    const blank = Object.assign(document.createElement("p"), { className: "blank" });
+    element.append(caption, canvas, blank);
     this.place.append(element);
     this.visible.observe(element);
-    const series = names.map((_, n) => ({ stroke: COLOURS[n], dash: DASHES[n], width: 2 }));
+    const axis = { stroke: () => colour("--ink"), grid: { stroke: () => colour("--grid") }, ticks: { stroke: () => colour("--grid") } };
     const options = {
       width: Math.max(200, element.clientWidth),
-      height: 160,
+      height: HEIGHT,
       legend: { show: false },
       cursor: { show: false },
       scales: { x: { time: false } },
-      axes: [{ values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) }, { size: 50 }],
-      series: [{}, ...series],
-      hooks: { draw: [(plot) => drawLimits(plot, limits)] },
+      axes: [
+        { ...axis, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
+        { ...axis, size: 50 },
+      ],
+      series: [{}, ...names.map((_, n) => ({ stroke: () => colour(of(COLOURS, n)), dash: of(DASHES, n), width: 2 }))],
+      hooks: { draw: [(plot) => kind === "torque" && drawLimits(plot, this.limits[arm] ?? [])] },
     };
     const data = [[], ...names.map(() => [])];
-    const figure = { arm, kind, unit, names, element, caption, plot: new uPlot(options, data, canvas), data };
-    caption.textContent = title(figure);
+    const figure = { arm, kind, unit, names, values, element, caption, blank, plot: new uPlot(options, data, canvas), data };
+    write(caption, title(figure));
     return figure;
   }
 
   translate() {
-    for (const { figures } of this.arms.values()) for (const figure of figures) figure.caption.textContent = title(figure);
+    for (const { figures } of this.arms.values()) for (const figure of figures) write(figure.caption, title(figure));
   }
 
   resize() {
     if (this.place.clientWidth === this.width) return; // only the height has changed, by the plots themselves
     this.width = this.place.clientWidth;
     for (const { figures } of this.arms.values())
-      for (const { plot, element } of figures) plot.setSize({ width: Math.max(200, element.clientWidth), height: 160 });
+      for (const { plot, element } of figures) plot.setSize({ width: Math.max(200, element.clientWidth), height: HEIGHT });
   }
 }
-
-const MARKS = ["——", "– –", "····", "–·–"];
 
 function title({ arm, kind, unit, names }) {
   const words = kind === "rate" ? [`${t("rate")} (Hz)`, `${t("age")} (ms)`] : names.map((name) => jointText(arm, name));
   const head = kind === "rate" ? `${t("rate")}, ${t("age")}` : `${t(kind)} (${unit})`;
-  return `${t(`head.${arm}`)}: ${head}: ${words.map((word, n) => `${MARKS[n]} ${word}`).join(", ")}`;
+  return `${t(`head.${arm}`)}: ${head}: ${words.map((word, n) => `${of(MARKS, n)} ${word}`).join(", ")}`;
 }
 
-function push(figure, now, values) {
-  const { data } = figure;
+function push({ data }, now, values) {
   data[0].push(now);
-  values.forEach((value, n) => data[n + 1].push(value));
+  values.forEach((value, n) => data[n + 1].push(value ?? null));
   if (data[0].length > LENGTH) for (const column of data) column.shift();
+}
+
+// Why a figure has no curve; '' if it has one.
+function whyBlank({ data, kind }, arm) {
+  if (data.slice(1).some((column) => column.some((value) => value !== null))) return "";
+  if (!arm.joints) return t("blank.silent");
+  return t(`blank.${kind === "angle" ? "waiting" : kind}`);
 }
 
 // Each joint's torque limit, a thin line in its colour.
@@ -115,7 +139,7 @@ function drawLimits(plot, limits) {
     for (const value of [limit, -limit]) {
       const y = plot.valToPos(value, "y", true);
       if (!(y >= bbox.top && y <= bbox.top + bbox.height)) continue;
-      ctx.strokeStyle = COLOURS[n];
+      ctx.strokeStyle = colour(of(COLOURS, n));
       ctx.lineWidth = 1;
       ctx.beginPath();
       ctx.moveTo(bbox.left, y);

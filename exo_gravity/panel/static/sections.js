@@ -1,19 +1,21 @@
 // Wearer, session, trial, recording and parameters.
 
-import { ask } from "./ask.js";
-import { degrees, number, t, write } from "./texts.js";
+import { say } from "./say.js";
+import { degrees, has, number, t, write } from "./texts.js";
 
 const byId = (id) => document.getElementById(id);
 const LENGTHS = ["upper_arm", "forearm", "hand"];
 
 export class Sections {
-  constructor(send, cards) {
+  constructor({ send, sure }, cards) {
     this.send = send;
+    this.sure = sure;
     this.cards = cards;
     this.form = byId("wearer");
     this.edited = false;
     this.workspace = {}; // of the subject, sent with the wearer's data
     this.session = new Session(send, this);
+    this.markers = new Markers(send);
     this.form.addEventListener("input", () => (this.edited = true));
     this.form.addEventListener("submit", (event) => this.apply(event));
     byId("trial-start").addEventListener("click", () => send({ do: "trial", name: byId("trials").value }));
@@ -25,10 +27,15 @@ export class Sections {
   }
 
   configure(setup) {
+    this.markers.configure(setup.markers ?? []);
     const select = byId("trials");
     if (!select.options.length) for (const name of setup.trials ?? []) select.add(new Option(name, name));
     const settings = Object.values(setup.arms ?? {})[0]?.settings;
     if (!this.edited && settings?.["wearer.segment_length"]) this.fill(settings);
+  }
+
+  translate() {
+    this.markers.translate();
   }
 
   fill(settings) {
@@ -47,8 +54,9 @@ export class Sections {
       "wearer.segment_length": LENGTHS.map((name) => Number(fields[name].value) / 100),
       ...this.workspace,
     };
-    const acts = [...this.cards.values()].some((card) => card.isCarried && card.mode === "zero_g");
-    if (acts && !(await ask(t("wearer"), t("wearer_ask"), t("change")))) return;
+    const cards = [...this.cards.values()];
+    const acts = () => cards.some((card) => card.isCarried && card.mode === "zero_g");
+    if (!(await this.sure(cards, () => (acts() ? [t("wearer"), t("wearer_ask"), t("change")] : null)))) return;
     const lowered = [];
     for (const [arm, card] of this.cards) {
       const support = card.supportFor(...Object.values(values));
@@ -57,7 +65,7 @@ export class Sections {
       if (!(await this.send({ do: "set", arm, values: isLess ? { ...values, support } : values }))) return;
     }
     this.edited = false;
-    write(byId("message"), [t("applied"), ...lowered].join(" "));
+    say([t("applied"), ...lowered].join(" "));
   }
 
   show(state, operates) {
@@ -71,7 +79,9 @@ export class Sections {
     write(byId("recording-text"), recordingText(state.recording));
     write(byId("saved"), state.saved ? t("saved", state.saved) : "");
     this.showTrial(state.trial);
-    if (state.session) this.session.show(state, operates);
+    const isOff = [...this.cards.values()].every((card) => OFF.includes(card.state));
+    this.markers.show(state.recording, isOff);
+    if (state.session) this.session.show(state, operates, isOff);
   }
 
   showTrial(trial) {
@@ -93,11 +103,72 @@ export class Sections {
   }
 }
 
-const FREE = { "limits.lower": Array(4).fill(-3.15), "limits.upper": Array(4).fill(3.15) }; // rad: no edges
+const FREE = { "limits.lower": -3.15, "limits.upper": 3.15 }; // rad: no edges
 const OFF = ["disabled", "fault"];
 const reportAt = (name) => `/report/${name.split("/").map(encodeURIComponent).join("/")}`;
 
-// The subject, the marker and the list of past recordings.
+// Marks events in the recording: by a button for each usual one, by a digit, or by a text of one's own and the key M.
+//
+// Every page may. A text can be written only while the motors of all arms are off: otherwise the space bar lets down.
+class Markers {
+  constructor(send) {
+    this.send = send;
+    this.form = byId("markers");
+    this.presets = [];
+    this.form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.mark(this.own);
+    });
+    window.addEventListener("keydown", (event) => this.key(event), true);
+  }
+
+  get own() {
+    return this.form.elements.marker_text.value;
+  }
+
+  // presets: the texts that are recorded; those that the page knows are shown in its language.
+  configure(presets) {
+    if (presets.join() === this.presets.join()) return;
+    this.presets = presets;
+    byId("presets").replaceChildren(
+      ...presets.map((text) => {
+        const button = Object.assign(document.createElement("button"), { disabled: true });
+        button.dataset.marker = text;
+        button.addEventListener("click", () => this.mark(text));
+        return button;
+      }),
+    );
+    this.translate();
+  }
+
+  translate() {
+    [...byId("presets").children].forEach((button, n) => write(button, `${n + 1} ${markerText(button.dataset.marker)}`));
+  }
+
+  key(event) {
+    const writes = event.target.matches?.("input, select");
+    const isPlain = !(event.ctrlKey || event.metaKey || event.altKey || event.repeat);
+    if (!isPlain || writes || byId("marker").disabled) return;
+    const preset = this.presets[Number(event.key) - 1];
+    if (preset !== undefined) this.mark(preset);
+    else if (event.code === "KeyM") this.mark(this.own);
+  }
+
+  async mark(text) {
+    if (await this.send({ do: "marker", text })) say(t("marker_set", text ? markerText(text) : t("markers")));
+  }
+
+  show(recording, isOff) {
+    const records = recording.on || recording.foreign;
+    for (const button of [byId("marker"), ...byId("presets").children]) button.disabled = !records;
+    this.form.elements.marker_text.disabled = !isOff;
+    write(byId("markers-hint"), t(records ? "markers_hint" : "markers_off"));
+  }
+}
+
+const markerText = (text) => (has(`marker.${text}`) ? t(`marker.${text}`) : text);
+
+// The subject and the list of past recordings.
 //
 // Texts can be written only while the motors of all arms are off: otherwise the space bar lets down.
 class Session {
@@ -109,15 +180,7 @@ class Session {
     this.ended = ""; // the trial and the recording, likewise
     this.form.addEventListener("submit", (event) => this.use(event));
     byId("keep-wearer").addEventListener("click", () => send({ do: "keep_wearer" }));
-    byId("marker").addEventListener("click", () => this.mark());
-    window.addEventListener("keydown", (event) => this.key(event), true);
-  }
-
-  key(event) {
-    const writes = event.target.matches?.("input, select");
-    if (event.code === "Space" && event.target.matches?.('#session input[type="text"]:enabled')) event.stopPropagation();
-    const isPlain = !(event.ctrlKey || event.metaKey || event.altKey || event.repeat);
-    if (event.code === "KeyM" && isPlain && !writes && !byId("marker").disabled) this.mark();
+    window.addEventListener("keydown", takeSpace, true);
   }
 
   use(event) {
@@ -126,16 +189,10 @@ class Session {
     this.send({ do: "session", subject: subject.value, protocol: protocol.value, note: note.value });
   }
 
-  async mark() {
-    if (await this.send({ do: "marker", text: this.form.elements.marker_text.value })) write(byId("message"), t("marker_set"));
-  }
-
-  show(state, operates) {
+  show(state, operates, isOff) {
     const { recording, session, trial } = state;
-    const off = [...this.sections.cards.values()].every((card) => OFF.includes(card.state));
-    for (const control of this.form.elements) control.disabled = !operates || !off;
+    for (const control of this.form.elements) control.disabled = !operates || !isOff;
     byId("keep-wearer").disabled = !operates || !session.subject;
-    byId("marker").disabled = !(recording.on || recording.foreign);
     const present = JSON.stringify(session);
     if (present !== this.present) this.showPresent(session, this.present === "");
     this.present = present;
@@ -150,7 +207,8 @@ class Session {
     for (const name of ["subject", "protocol", "note"]) this.form.elements[name].value = session[name];
     const wearer = session.wearer;
     if (isFirst && !session.subject) return;
-    this.sections.workspace = Object.fromEntries(Object.entries(FREE).map(([name, free]) => [name, wearer[name] ?? free]));
+    const joints = [...this.sections.cards.values()][0]?.setup?.max_effort?.length ?? 0;
+    this.sections.workspace = Object.fromEntries(Object.entries(FREE).map(([name, free]) => [name, wearer[name] ?? Array(joints).fill(free)]));
     if (!wearer["wearer.segment_length"]) return;
     this.sections.fill(wearer);
     this.sections.edited = true; // until it is applied
@@ -169,6 +227,11 @@ class Session {
       }),
     );
   }
+}
+
+// A space is written in a text field that is enabled: the motors are off then.
+function takeSpace(event) {
+  if (event.code === "Space" && event.target.matches?.("#session input:enabled, #markers input:enabled")) event.stopPropagation();
 }
 
 function recordingText(recording) {

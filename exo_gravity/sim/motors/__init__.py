@@ -1,1 +1,37 @@
-"""Simulated motors, a family a file: boards that behave as their firmware, those of AK motors in `ak`."""
+"""Simulated motors, a family a file: they behave as their firmware does.
+
+Those of other distributions' families are found by the entry point group GROUP: its name is that of the family, and it
+leads to a class like `ak.SimulatedMotor`, whose arguments are a joint's motor, its firmware and how it warms.
+"""
+
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors import ak as ak_family
+from exo_gravity.core.motors import damiao as damiao_family
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.sim.motors.ak import Heat, SimulatedMotor
+from exo_gravity.sim.motors.damiao import DamiaoMotor
+from exo_gravity.sim.motors.firmware import Firmware
+
+GROUP = "exo_gravity.simulated_motors"
+OURS: Mapping[str, type[SimulatedMotor]] = {
+    ak_family.FAMILY: SimulatedMotor,
+    damiao_family.FAMILY: DamiaoMotor,
+}
+
+
+def class_of(family: str) -> type[SimulatedMotor]:
+    """Return what simulates the motors of a family. Raises ParameterError if nothing does."""
+    if family in OURS:
+        return OURS[family]
+    for entry in entry_points(group=GROUP, name=family):
+        found: type[SimulatedMotor] = entry.load()
+        return found
+    raise ParameterError("motor", family, f"of a family with an entry point of {GROUP}, to be simulated")
+
+
+def simulated(joint: JointMotor, firmware: Firmware | None = None, heat: Heat | None = None) -> SimulatedMotor:
+    """Return the simulated motor of a joint; arguments as those of `SimulatedMotor`. Raises ParameterError."""
+    return class_of(joint.spec.family)(joint, firmware, heat)

@@ -5,7 +5,7 @@ What all firmware of V1 and V2 boards does (CubeMars driver manual V1.0.15; Ben 
 - Torque flows only between ENTER and EXIT. ENTER carries out the last command at once.
 - SET_ZERO makes the present angle zero.
 
-What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/wire_formats.py):
+What a V3 board does (CubeMars driver manual V3.0.0; frames in core/motors/ak.py):
 - A command in MIT mode switches the motor on and stays in force until the next one. A current is a command too; 0 A
   switches the motor off. Other control modes are ignored here.
 - It replies to nothing. It sends its state `status_rate` times a second, on or off.
@@ -20,9 +20,9 @@ import random
 from dataclasses import dataclass, replace
 
 from exo_gravity.core.errors import FrameError
+from exo_gravity.core.motors.ak import MASTER_ID, V3Format
+from exo_gravity.core.motors.frames import BROADCAST_ID, EXTENDED, Frame, MotorCommand, MotorReply, unpack_fields
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.motors.specs import MotorCommand, MotorReply, unpack_fields
-from exo_gravity.core.motors.wire_formats import BROADCAST_ID, EXTENDED, MASTER_ID, Frame, V3Format
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.motors.firmware import (
     BOOT_LOADER,
@@ -68,14 +68,14 @@ class SimulatedMotor:
     """
 
     def __init__(self, joint: JointMotor, firmware: Firmware | None = None, heat: Heat | None = None) -> None:
-        self.firmware = firmware = firmware or usual_firmware(joint.wire_format)
+        self.firmware = firmware = firmware or self.usual_firmware(joint)
         firmware.check(joint.wire_format)
         if firmware.position_range:
             joint = replace(joint, spec=replace(joint.spec, position_range=firmware.position_range))
         self.joint = joint
         to_master = firmware.reply_to_master and joint.wire_format.replies
         #: Arbitration IDs of replies or status frames, and of the frames that the motor obeys.
-        self.reply_id = MASTER_ID if to_master else joint.wire_format.reply_id(joint.can_id)
+        self.reply_id = MASTER_ID if to_master else joint.reply_id
         self._own_ids = own_ids(joint, firmware)
         self.received_ids = tuple(self._own_ids)
         self.cable = False  #: a V3 board whose configuration cable is plugged in: it reports, and ignores commands
@@ -98,6 +98,11 @@ class SimulatedMotor:
         self._random = random.Random(joint.can_id)
         constant = firmware.torque_per_ampere.get(joint.spec.name, joint.spec.torque_per_ampere)
         self._reported = replace(joint.spec, torque_per_ampere=constant)
+
+    @staticmethod
+    def usual_firmware(joint: JointMotor) -> Firmware:
+        """Return the firmware of a motor of which only the wire format is known."""
+        return usual_firmware(joint.wire_format)
 
     @property
     def unplugged(self) -> bool:
@@ -180,7 +185,10 @@ class SimulatedMotor:
     def _exit(self) -> None:
         self.entered = False
         if self.firmware.exit_clears:
-            self._command, self._data = _NO_COMMAND, None
+            self._clear_command()
+
+    def _clear_command(self) -> None:
+        self._command, self._data = _NO_COMMAND, None
 
     def _is_special(self, data: bytes) -> bool:
         """Return whether the firmware takes the frame for a special one that the manual does not name."""
@@ -236,7 +244,7 @@ class SimulatedMotor:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
         self._age += dt
         if 0.0 < self.firmware.timeout < self._age and self.entered and self._command != _NO_COMMAND:
-            self._command, self._data = _NO_COMMAND, None
+            self._clear_command()
             self.dips += 1
         torque = self.torque(position, velocity)
         if self._heat.rise:
@@ -265,20 +273,24 @@ class SimulatedMotor:
 
     def _state(self, position: float, velocity: float) -> bytes:
         """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
-        joint, spec = self.joint, self.joint.spec
-        torque = joint.direction * self.torque(position, velocity) / (joint.torque_scale * self.strength)
-        if self.firmware.current_noise:
-            torque *= self._random.gauss(1.0, self.firmware.current_noise)
-        readings = (
-            clamp(joint.motor_position(position), spec.position_range),
-            clamp(joint.direction * velocity, spec.velocity_range),
-            clamp(torque, spec.torque_range),
-        )
+        joint, readings = self.joint, self._readings(position, velocity)
         temperature = round(max(-40.0, min(215.0, self.temperature)))
         length = self.firmware.reply_length if joint.wire_format.replies else _FULL_LENGTH
         extra = (temperature, self._error_byte) if length == _FULL_LENGTH else (None, None)
         reply = joint.wire_format.pack_reply(self._reported, MotorReply(joint.can_id, *readings, *extra))
         return reply + bytes((_BUS_VOLTAGE,)) if length == _FULL_LENGTH - 1 else reply
+
+    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
+        """Return angle, velocity and torque of the motor in rad, rad/s and Nm, within the ranges of the wire format."""
+        joint, spec = self.joint, self.joint.spec
+        torque = joint.direction * self.torque(position, velocity) / (joint.torque_scale * self.strength)
+        if self.firmware.current_noise:
+            torque *= self._random.gauss(1.0, self.firmware.current_noise)
+        return (
+            clamp(joint.motor_position(position), spec.position_range),
+            clamp(joint.direction * velocity, spec.velocity_range),
+            clamp(torque, spec.torque_range),
+        )
 
     @property
     def _error_byte(self) -> int:

@@ -17,8 +17,9 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3, WireFormat
 from exo_gravity.core.params import owned
 
 FIRST_SPECIAL = 0xFC  # last byte of ENTER, the lowest special frame of the manual
@@ -44,6 +45,7 @@ class Firmware:
     status_rate: float = MAX_STATUS_RATE  #: status frames per s of a V3 board
     reply_delay: tuple[float, float] = REPLY_DELAY  #: s from the end of a command to its reply, at least and at most
     name: str = ""  #: the value of `firmware.variant`
+    family: str = "ak"  #: of its motors
     wire_format: str = ""  #: the only one that it speaks; "" for any
     remembers_off: bool = True  #: a command while off is kept, and ENTER carries it out; otherwise it is ignored
     exit_clears: bool = False  #: EXIT clears the last command, which ENTER would resume
@@ -72,10 +74,13 @@ class Firmware:
 
     def check(self, wire_format: WireFormat) -> None:
         """Raise ParameterError if boards of `wire_format` never have this firmware."""
-        if self.wire_format not in ("", wire_format.name):
-            own = [other.name for other in FIRMWARES.values() if other.wire_format == wire_format.name]
-            expected = f"one of {', '.join(own)} for a motor with wire_format = {wire_format.name}"
+        if self.wire_format and not self._is_of(wire_format):
+            own = [other.name for other in FIRMWARES.values() if other._is_of(wire_format)]
+            expected = f"one of {', '.join(('usual', *own))} for a motor with wire_format = {wire_format.name}"
             raise ParameterError("firmware.variant", self.name, expected)
+
+    def _is_of(self, wire_format: WireFormat) -> bool:
+        return (self.family, self.wire_format) == (wire_format.family, wire_format.name)
 
 
 AK = Firmware(

@@ -206,3 +206,18 @@ def test_without_fitting_commands_or_any_valid_step_the_joint_states_are_read(re
         (named,) = (*read.problems, *read.notes)
         assert all(word in named for word in words)
         assert np.isnan(read.recordings[0].command).all() == (number < 2)
+
+
+def test_one_of_several_samples_is_kept_of_each_arm_each_with_the_command_that_was_in_force(
+    content, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("exo_gravity.lab.bag.storage.ROWS", 50)  # many batches: each goes on counting
+    gripper = [
+        (STATES, made.JOINT_STATE, at + 1000, made.joint_state(at, ["gripper"], [0.1]))
+        for topic, _, at, _ in content
+        if topic == STATES
+    ]
+    bag = made.write_bag(tmp_path / "bag", [*content, *gripper])
+    (whole,), (thinned,) = (read_bag(bag, every).recordings for every in (1, 7))
+    for field in ("time", "position", "velocity", "effort", "command"):
+        np.testing.assert_array_equal(getattr(thinned, field), getattr(whole, field)[::7])

@@ -9,12 +9,16 @@ import can
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.specs import ENTER, SET_ZERO, unpack_command
-from exo_gravity.core.motors.wire_formats import MIT, MIT_V3
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.damiao import DAMIAO_MIT, LAST_ID, REFRESH, REGISTERS
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import DAMPED, ENTER, SET_ZERO, unpack_command
+from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.lab.calibration.bus_scan import DAMPED, BusScan
-from exo_gravity.sim import Firmware
+from exo_gravity.lab.calibration.bus_scan import BusScan
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
+from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.virtual_time import Wire
 
 from ...hardware.wires import Responder
@@ -57,13 +61,42 @@ def test_the_scan_sends_only_commands_of_damping_without_torque(wire: Wire) -> N
     listener = Responder(wire)
     with scan_of(wire) as bus:
         bus.scan()
-    assert {message.arbitration_id for message in listener.received} == set(range(1, 127))
-    assert {bytes(message.data) for message in listener.received} == {DAMPED}
+    asked = [message for message in listener.received if message.arbitration_id == REGISTERS]
+    commands = [message for message in listener.received if message.arbitration_id != REGISTERS]
+    assert {message.arbitration_id for message in commands} == set(range(1, 127))
+    assert {bytes(message.data) for message in commands} == {DAMPED}
+    assert {(message.data[0], message.data[2]) for message in asked} == {(i, REFRESH) for i in range(1, LAST_ID + 1)}
     assert DAMPED not in (ENTER, SET_ZERO)
     for spec in SPECS:
         command = unpack_command(spec, DAMPED)
         assert (command.kp, command.kd) == (0.0, 5.0)
         assert abs(command.torque) < 0.005
+
+
+@pytest.mark.parametrize("is_fd", [False, True], ids=["classic", "fd"])
+def test_the_motors_of_all_families_are_found_and_none_is_commanded(wire: Wire, is_fd: bool) -> None:
+    joints = [
+        *(JointMotor(MOTORS["DM-J4310"], can_id, wire_format=DAMIAO_MIT, timeout=0.2) for can_id in (1, 3)),
+        JointMotor(MOTORS["DM-J8009"], 8, wire_format=DAMIAO_MIT, timeout=0.2, master_id=0x2A),
+        JointMotor(MOTORS["AK80-64"], 2),
+    ]
+    device = SimulatedDevice(SimulatedArm(), [simulated(joint) for joint in joints])
+    device.is_fd = (is_fd,) * len(joints)
+    device.encoder_error = (0.5, -0.2, 1.0, 0.0)
+    wire.play(device)
+    with BusScan((*ADDRESS[:2], {"fd": is_fd}), wire.clock, wire.open) as bus:
+        answers, problems = bus.scan(range(1, 20))
+        polled = bus.poll((1, 2, 3, 8))
+    assert problems == ()
+    found = {answer.can_id: (answer.family, answer.wire_format, answer.reply_id) for answer in answers}
+    assert found == {
+        1: ("damiao", "mit", 0x11),
+        2: ("ak", "mit", 2),
+        3: ("damiao", "mit", 0x13),
+        8: ("damiao", "mit", 0x2A),
+    }
+    assert [polled[can_id].position for can_id in (1, 3, 8)] == pytest.approx([0.5, -0.2, 1.0], abs=0.02)
+    assert not device.powered
 
 
 def test_no_motor_is_switched_on_and_one_without_power_is_missing(wire: Wire) -> None:

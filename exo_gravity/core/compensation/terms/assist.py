@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.compensation.terms.catalogue import TermParameters, clamp
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.params import owned
@@ -57,7 +57,7 @@ class AssistInput:
         self.assist = assist or Assist()
         self.reason = NOTHING_YET
         self._names = list(names)
-        self._target = NO_TORQUE  # the newest efforts
+        self._target: Torque = (0.0,) * len(self._names)  # the newest efforts
         self._begin = math.inf  # s, since when they are followed
         self._period = ASSIST.slowest
         self._stamp = self._arrival = -math.inf
@@ -119,7 +119,7 @@ class AssistInput:
         return NO_REASON
 
     def torque(self, now: float) -> Torque:
-        """Return the torque (4,) in Nm at `now`; call it in every cycle."""
+        """Return the torque (n,) in Nm at `now`; call it in every cycle."""
         self._last = now
         self._begin = min(self._begin, now) if self._is_sound(now) else math.inf
         ramp = max(0.0, min(1.0, (now - self._begin) / ASSIST.ramp))

@@ -27,9 +27,9 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, for_joints
 from exo_gravity.core.params import check_owned, owned, params_of
 
 DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held
@@ -44,7 +44,7 @@ MAX_INERTIA_SHARE = 0.8  # leaves a fifth for masses that are not known exactly
 
 @dataclass(frozen=True)
 class SpringTuning:
-    """What the springs of `spring`, `coupling` and `limits` give at most."""
+    """What the springs of `spring`, `coupling` and `limits` give at most; another arm's joints all get the least."""
 
     effort: Sequence[float] = (1.0, 2.0, 1.0, 1.0)  #: Nm that a spring may give: a hand overcomes it
     coupling_effort: float = 1.0  #: Nm on the joint that follows
@@ -83,15 +83,15 @@ class TermState(NamedTuple):
     """The arm as the terms see it."""
 
     dt: float  #: s since the last state, 0 for the first
-    position: Sequence[float]  #: (4,) rad
-    velocity: Sequence[float]  #: (4,) rad/s
-    acceleration: Sequence[float]  #: (4,) rad/s^2, low-passed
+    position: Sequence[float]  #: (n,) rad
+    velocity: Sequence[float]  #: (n,) rad/s
+    acceleration: Sequence[float]  #: (n,) rad/s^2, low-passed
     elapsed: float  #: s since the spring's settings
 
 
 @dataclass(frozen=True)
 class TermParameters:
-    """The parameters of one term, checked; the first one switches it on. `torque` returns the (4,) Nm that it adds."""
+    """The parameters of one term, checked; the first one switches it on. `torque` returns the (n,) Nm that it adds."""
 
     #: whether the parameters ask for any torque; by default they do not
     on: bool = field(init=False, repr=False, compare=False)
@@ -99,20 +99,20 @@ class TermParameters:
     def __post_init__(self) -> None:
         check_owned(self)
         first = params_of(type(self))[0]
-        off = tuple(first.default) if isinstance(first.default, list) else first.default
-        object.__setattr__(self, "on", getattr(self, first.name) != off)
+        value = getattr(self, first.name)
+        off = tuple(first.for_joints(len(value)).default) if isinstance(value, tuple) else first.default
+        object.__setattr__(self, "on", value != off)
 
 
 @dataclass(frozen=True)
 class Damping(TermParameters):
     """Virtual viscosity, as a therapist sets it for resistance; it takes energy, except for what comes late."""
 
-    viscosity: Sequence[float] = owned((0.0,) * 4, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
+    viscosity: Sequence[float] = owned((0.0,) * JOINT_COUNT, "virtual viscous friction; 0: off", (0.0, 5.0), "Nm s/rad")
 
     def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm, against the motion."""
-        b, v = self.viscosity, state.velocity
-        return -b[0] * v[0], -b[1] * v[1], -b[2] * v[2], -b[3] * v[3]
+        """Return the torque (n,) in Nm, against the motion."""
+        return tuple([-b * v for b, v in zip(self.viscosity, state.velocity, strict=True)])
 
 
 @dataclass(frozen=True)
@@ -123,25 +123,28 @@ class Spring(TermParameters):
     limited torque times the way along the path. Raises ParameterError.
     """
 
-    stiffness: Sequence[float] = owned((0.0,) * 4, "virtual spring towards the pose; 0: off", (0.0, 50.0), "Nm/rad")
+    stiffness: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "virtual spring towards the pose; 0: off", (0.0, 50.0), "Nm/rad"
+    )
     pose: Sequence[float] = owned(
         (0.0, 0.3, 0.3, 0.5),
-        "pose that it pulls towards, or a path: rows of s and 4 angles",
+        "pose that it pulls towards, or a path: rows of s and an angle of each joint",
         unit="rad",
         any_length=True,
     )
-    max_effort: Sequence[float] = SPRING.effort  #: largest torque, (4,) Nm
-    times: tuple[float, ...] = field(init=False, repr=False, compare=False)  #: (n,) s of the path's rows, from 0 on
-    ways: np.ndarray = field(init=False, repr=False, compare=False)  #: (4, n) rad, each joint's angles
+    max_effort: Sequence[float] = SPRING.effort  #: largest torque, (n,) Nm
+    times: tuple[float, ...] = field(init=False, repr=False, compare=False)  #: (m,) s of the path's rows, from 0 on
+    ways: np.ndarray = field(init=False, repr=False, compare=False)  #: (n, m) rad, each joint's angles
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        numbers = tuple(self.pose)
-        path = (0.0, *numbers) if len(numbers) == JOINT_COUNT else numbers
-        rows = np.reshape(path, (-1, 1 + JOINT_COUNT)) if len(path) % (1 + JOINT_COUNT) == 0 else np.empty((0, 1))
+        numbers, count = tuple(self.pose), len(self.stiffness)
+        object.__setattr__(self, "max_effort", for_joints(self.max_effort, count))
+        path = (0.0, *numbers) if len(numbers) == count else numbers
+        rows = np.reshape(path, (-1, 1 + count)) if len(path) % (1 + count) == 0 else np.empty((0, 1))
         times, poses = rows[:, 0], rows[:, 1:]
         if not (len(rows) and np.all(np.abs(poses) <= FREE)):
-            raise ParameterError("spring.pose", list(numbers), f"4 angles within {FREE:g} rad, or a path of rows")
+            raise ParameterError("spring.pose", list(numbers), f"{count} angles within {FREE:g} rad, or a path of rows")
         if times[0] != 0.0 or not (np.all(np.diff(times) > 0.0) and times[-1] < math.inf):
             raise ParameterError("times of the path in spring.pose", times[:3].tolist(), "rising from 0 s")
         speed = max((np.linalg.norm(np.diff(poses, axis=0), axis=1) / np.diff(times)).tolist(), default=0.0)
@@ -151,9 +154,9 @@ class Spring(TermParameters):
             object.__setattr__(self, name, value)
 
     def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm."""
+        """Return the torque (n,) in Nm."""
         pose = self.pose
-        if len(pose) != JOINT_COUNT:
+        if len(pose) != len(self.stiffness):
             pose = [float(np.interp(state.elapsed, self.times, way)) for way in self.ways]
         columns = zip(self.stiffness, pose, state.position, state.velocity, self.max_effort, strict=True)
         return tuple([clamp(k * (to - q), most) - LATE * k * v for k, to, q, v, most in columns])
@@ -168,7 +171,7 @@ class Coupling(TermParameters):
     """
 
     stiffness: Sequence[float] = owned(
-        (0.0,) * 4,
+        (0.0,) * JOINT_COUNT,
         "torque per angle of each joint on the joint with the largest entry, which follows: "
         "[0, -1, 2, 0] pulls flexion to half of abduction; zeros: off",
         (-50.0, 50.0),
@@ -187,17 +190,15 @@ class Coupling(TermParameters):
         return max(map(abs, self.stiffness))
 
     def stable(self, least_inertia: Sequence[float]) -> float:
-        """Return the largest stiffness on the follower, Nm/rad, that is stable on these inertias (4,) kg m^2."""
+        """Return the largest stiffness on the follower, Nm/rad, that is stable on these inertias (n,) kg m^2."""
         pairs = zip(self.stiffness, least_inertia, strict=True)
         return 1.0 / sum((k / self.largest) ** 2 / inertia for k, inertia in pairs) / (4.0 * DELAY**2)
 
     def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm on the follower and on the joints that it follows."""
+        """Return the torque (n,) in Nm on the follower and on the joints that it follows."""
         k, q, v, largest = self.stiffness, state.position, state.velocity, self.largest
-        stretch = k[0] * q[0] + k[1] * q[1] + k[2] * q[2] + k[3] * q[3]
-        damping = LATE * (k[0] * v[0] + k[1] * v[1] + k[2] * v[2] + k[3] * v[3])
-        pull = (clamp(-stretch, self.max_effort) - damping) / largest
-        return k[0] * pull, k[1] * pull, k[2] * pull, k[3] * pull
+        pull = (clamp(-_dot(k, q), self.max_effort) - LATE * _dot(k, v)) / largest
+        return tuple([each * pull for each in k])
 
 
 @dataclass(frozen=True)
@@ -213,17 +214,19 @@ class SoftLimits(TermParameters):
     upper: Sequence[float] = owned(
         (FREE,) * JOINT_COUNT, f"upper edge of each joint's workspace; {FREE:g}: none", (-FREE, FREE), "rad"
     )
-    stiffness: Sequence[float] = SPRING.edge_stiffness  #: of the springs beyond the edges, (4,) Nm/rad
-    max_effort: Sequence[float] = SPRING.effort  #: largest torque of the springs, (4,) Nm
+    stiffness: Sequence[float] = SPRING.edge_stiffness  #: of the springs beyond the edges, (n,) Nm/rad
+    max_effort: Sequence[float] = SPRING.effort  #: largest torque of the springs, (n,) Nm
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not all(low < high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ParameterError("limits.lower", list(self.lower), f"below limits.upper = {list(self.upper)}")
         object.__setattr__(self, "on", max(self.lower) > -FREE or min(self.upper) < FREE)
+        for name in ("stiffness", "max_effort"):
+            object.__setattr__(self, name, for_joints(getattr(self, name), len(self.lower)))
 
     def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm: none inside, back towards the workspace outside."""
+        """Return the torque (n,) in Nm: none inside, back towards the workspace outside."""
         torque = []
         edges = self.lower, self.upper
         columns = zip(self.stiffness, *edges, state.position, state.velocity, self.max_effort, strict=True)
@@ -254,7 +257,7 @@ class Friction(TermParameters):
     )
 
     def torque(self, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm, along the motion."""
+        """Return the torque (n,) in Nm, along the motion."""
         torque = []
         for v, coulomb, viscous in zip(state.velocity, self.coulomb, self.viscous, strict=True):
             whole = self.share * (coulomb + viscous * min(abs(v), FRICTION.fastest))
@@ -279,9 +282,9 @@ class EnergyTank:
         self._time = 0.0
 
     def pass_on(self, torque: Torque, velocity: Sequence[float], dt: float, income: float) -> Torque:
-        """Return `torque` (4,) in Nm, reduced when the tank is nearly empty and the torque would give energy.
+        """Return `torque` (n,) in Nm, reduced when the tank is nearly empty and the torque would give energy.
 
-        velocity: (4,) rad/s. income: W that flows into the tank, from the joints' friction.
+        velocity: (n,) rad/s. income: W that flows into the tank, from the joints' friction.
         """
         power = _dot(torque, velocity)
         if power > 0.0 and self.level < INERTIA.fading * INERTIA.tank:
@@ -302,10 +305,10 @@ class Inertia(TermParameters):
 
     share: float = owned(0.0, "share of the arm's inertia that the motors take over; 0: off", (0.0, MAX_INERTIA_SHARE))
 
-    def torque(self, links: LinkInertia, friction: Sequence[float], tank: EnergyTank, state: TermState) -> Torque:
-        """Return the torque (4,) in Nm: a share of what accelerates `links` as they are accelerated now.
+    def torque(self, links: Links, friction: Sequence[float], tank: EnergyTank, state: TermState) -> Torque:
+        """Return the torque (n,) in Nm: a share of what accelerates `links` as they are accelerated now.
 
-        friction: (4,) Nm of Coulomb friction that is left to fill the `tank`.
+        friction: (n,) Nm of Coulomb friction that is left to fill the `tank`.
         """
         velocity = state.velocity
         fastest = max(map(abs, velocity))
@@ -329,7 +332,7 @@ class AccelerationFilter:
         self._twice: list[float] = []  # and behind two
 
     def update(self, velocity: Sequence[float], dt: float) -> Sequence[float]:
-        """Return the acceleration (4,) in rad/s^2 for the `velocity` (4,) in rad/s, `dt` s after the last call.
+        """Return the acceleration (n,) in rad/s^2 for the `velocity` (n,) in rad/s, `dt` s after the last call.
 
         dt: 0 starts anew, with the acceleration 0. Its gain is below 1 at any frequency and any dt.
         """

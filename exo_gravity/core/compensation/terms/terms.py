@@ -11,9 +11,8 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
-from exo_gravity.core.arm.kinematics import least_inertia, links_of
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.compensation.guidance import PAUSE
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
 from exo_gravity.core.compensation.terms.catalogue import (
@@ -31,6 +30,7 @@ from exo_gravity.core.compensation.terms.catalogue import (
     clamp,
 )
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import for_joints
 from exo_gravity.core.params import Param, params_of
 
 
@@ -38,7 +38,8 @@ from exo_gravity.core.params import Param, params_of
 class SumLimits:
     """What bounds all terms together."""
 
-    effort: Sequence[float] = (2.0, 4.0, 2.0, 2.0)  #: Nm: well below the motors' rated torque, which gravity needs
+    #: Nm: well below the motors' rated torque, which gravity needs; another arm's joints all get the least
+    effort: Sequence[float] = (2.0, 4.0, 2.0, 2.0)
     edge_share: float = 0.8  #: of the stiffness that the arm can bear, for `limits` where that is less
 
 
@@ -57,14 +58,14 @@ class TermSettings:
     limits: SoftLimits = field(default_factory=SoftLimits)
     assist: Assist = field(default_factory=Assist)
 
-    def on_arm(self, robot: ArmModel) -> "TermSettings":
+    def on_arm(self, robot: Arm) -> "TermSettings":
         """Return these settings with limits as stiff as `robot` can bear.
 
         Raises ParameterError unless every spring and damper is stable on `robot`, without a wearer in it.
         """
         if not any(getattr(self, name).on for name in ("damping", "spring", "coupling", "limits", "inertia")):
             return self
-        least = least_inertia(links_of(robot))
+        least = robot.links.least
         # A spring that acts DELAY late gives the energy of a damping of -stiffness * DELAY. Virtual damping acts as
         # late, so inertia / (2 DELAY) is the most that damps: twice what the spring needs.
         dampers = [inertia / (2.0 * DELAY) for inertia in least]
@@ -104,26 +105,28 @@ def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
 class TermsInForce(NamedTuple):
     """The terms of some settings."""
 
-    terms: Sequence[Callable[[TermState], Torque]]  #: each returns (4,) Nm that the motors add
+    terms: Sequence[Callable[[TermState], Torque]]  #: each returns (n,) Nm that the motors add
     since: float  #: s, when the spring's settings came into force
 
 
 class Terms:
     """What one compensator adds to gravity compensation.
 
-    names: of the joints (4,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input,
+    names: of the joints (n,). arm: what moves, with known masses, for `inertia`. `assist` is the outer loop's input,
     `tank` the energy of `inertia`. in_force: the present terms.
     """
 
-    def __init__(self, names: Sequence[str], settings: TermSettings, arm: ArmModel) -> None:
+    def __init__(self, names: Sequence[str], settings: TermSettings, arm: Arm) -> None:
         self.settings = settings
+        self._none = (0.0,) * len(names)
+        self._most = for_joints(SUM.effort, len(names))  # Nm
         self.assist = AssistInput(names, settings.assist)
         self._refusal = ""  # why the sum is not used
-        self._assisted = NO_TORQUE
+        self._assisted: Torque = self._none
         self.tank = EnergyTank()
         self._acceleration = AccelerationFilter()
         self._time = -math.inf
-        self._state = TermState(0.0, NO_TORQUE, NO_TORQUE, NO_TORQUE, 0.0)
+        self._state = TermState(0.0, self._none, self._none, self._none, 0.0)
         self._has_inertia = False
         self.in_force = TermsInForce(self._built(settings, arm), -math.inf)
 
@@ -139,50 +142,50 @@ class Terms:
         refused = assist.reason if assist.assist.on and assist.state == "refused" else ""
         return self._refusal or refused
 
-    def apply(self, settings: TermSettings, arm: ArmModel) -> None:
+    def apply(self, settings: TermSettings, arm: Arm) -> None:
         """Use new settings and a new arm at once: it is for the caller to guide the change (`guidance`)."""
         since = self.in_force.since if settings.spring == self.settings.spring else self._time
         self.settings, self.assist.assist = settings, settings.assist
         self.in_force = TermsInForce(self._built(settings, arm), since)
 
     def torque(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
-        """Return the torque (4,) in Nm on top of gravity compensation at `now` (s, monotonic).
+        """Return the torque (n,) in Nm on top of gravity compensation at `now` (s, monotonic).
 
-        theta, velocity: (4,) rad and rad/s.
+        theta, velocity: (n,) rad and rad/s.
         """
         dt, self._time = now - self._time, now
         if not 0.0 <= dt <= PAUSE:
             dt = 0.0  # the acceleration is measured anew
-        acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else NO_TORQUE
+        acceleration = self._acceleration.update(velocity, dt) if self._has_inertia else self._none
         self._state = TermState(dt, theta, velocity, acceleration, now - self.in_force.since)
         total = _sum(self.in_force.terms, self._state)
         self._refusal = "" if math.isfinite(sum(total)) else "torque of the terms is not finite"
         if self._refusal:
-            total, self._acceleration = NO_TORQUE, AccelerationFilter()  # it may have kept what is not finite
-        self._assisted = NO_TORQUE if self.assist.idle else self.assist.torque(now)
+            total, self._acceleration = self._none, AccelerationFilter()  # it may have kept what is not finite
+        self._assisted = self._none if self.assist.idle else self.assist.torque(now)
         return self._whole(total)
 
     def torque_of(self, other: TermsInForce) -> Torque:
-        """Return the torque (4,) in Nm that other terms would give in the state of the last `torque`."""
+        """Return the torque (n,) in Nm that other terms would give in the state of the last `torque`."""
         state = self._state._replace(dt=0.0, elapsed=self._time - other.since)
         total = _sum(other.terms, state)
         if not math.isfinite(sum(total)):
-            total = NO_TORQUE
+            total = self._none
         return self._whole(total)
 
     def _whole(self, total: Torque) -> Torque:
-        """Return the `total` (4,) of the terms in Nm, clamped, with the outer loop's efforts."""
-        return tuple(map(operator.add, self._assisted, map(clamp, total, SUM.effort)))
+        """Return the `total` (n,) of the terms in Nm, clamped, with the outer loop's efforts."""
+        return tuple(map(operator.add, self._assisted, map(clamp, total, self._most)))
 
-    def _built(self, s: TermSettings, arm: ArmModel) -> Sequence[Callable[[TermState], Torque]]:
+    def _built(self, s: TermSettings, arm: Arm) -> Sequence[Callable[[TermState], Torque]]:
         """Return the terms that are on."""
         terms = [term.torque for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
         if s.inertia.on:
             self._has_inertia = True
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]
-            terms.append(partial(s.inertia.torque, links_of(arm), left, self.tank))
+            terms.append(partial(s.inertia.torque, arm.links, left, self.tank))
         return terms
 
 
 def _sum(terms: Sequence[Callable[[TermState], Torque]], state: TermState) -> Torque:
-    return tuple(map(sum, zip(NO_TORQUE, *(torque(state) for torque in terms), strict=True)))
+    return tuple(map(sum, zip((0.0,) * len(state.velocity), *(torque(state) for torque in terms), strict=True)))

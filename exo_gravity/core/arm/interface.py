@@ -1,0 +1,125 @@
+"""What everything that carries an arm of n joints asks of it: gravity, inertia, and what it holds.
+
+`ArmModel` (core/arm/arm.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm
+that a URDF describes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.numbers import Vector
+
+
+class Links(Protocol):
+    """The inertia of an arm's links, of what they hold, and of the rotors where these are known."""
+
+    def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
+        ...
+
+    def momentum(
+        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
+    ) -> tuple[Torque, Torque]:
+        """Return the generalized momentum p = M v, (n,) kg m^2/s, and C^T v, (n,) Nm, with M' = C + C^T.
+
+        turning: angular velocity of the base in its own axes, (3,) rad/s.
+        """
+        ...
+
+    def matrix(self, theta: Sequence[float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
+        ...
+
+    @property
+    def least(self) -> tuple[float, ...]:
+        """The least inertia (n,) in kg m^2 that each joint feels in any pose, the other joints being free."""
+        ...
+
+
+class Arm(Protocol):
+    """An arm of n joints with what it holds. Immutable; equal arms have equal hashes."""
+
+    @property
+    def gain(self) -> np.ndarray:
+        """(n,) By which the torque of each joint is scaled, the paper's c_n."""
+        ...
+
+    @property
+    def gravity(self) -> float:
+        """m/s^2."""
+        ...
+
+    @property
+    def scale(self) -> tuple[float, ...]:
+        """(n,) m/s^2, gain times gravity."""
+        ...
+
+    @property
+    def payload(self) -> tuple[float, float, float, float]:
+        """The load in the hand: kg, and its centre of gravity in m in the frame of the hand."""
+        ...
+
+    @property
+    def total_mass(self) -> float:
+        """Kg of all that the joints carry."""
+        ...
+
+    @property
+    def given_mass(self) -> float:
+        """Kg of it that parameters give, where a wrong unit is likely."""
+        ...
+
+    @property
+    def has_hand(self) -> bool:
+        """Whether it is known where a load is held."""
+        ...
+
+    @property
+    def links(self) -> Links:
+        """The inertia."""
+        ...
+
+    @property
+    def facts(self) -> Mapping[str, Sequence[float] | None]:
+        """What is known of the arm itself, by name and unit, for /diagnostics; None for what is not known."""
+        ...
+
+    def worn_links(self, mass: Vector, cog: Vector) -> Links:
+        """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
+        ...
+
+    def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
+        ...
+
+    def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm that turns the `side` arm at `theta` (n,) rad along with its base.
+
+        angular_acceleration: of the trunk, (3,) rad/s^2 in its own axes.
+        """
+        ...
+
+    def massless(self, gravity: float) -> Arm:
+        """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
+        ...
+
+    def with_payload(self, mass: float, cog: Vector = ZERO) -> Arm:
+        """Return this arm with a load of `mass` kg in its hand, instead of any other. Raises ParameterError.
+
+        cog: (3,) m, its centre of gravity in the frame of the hand.
+        """
+        ...
+
+    def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> Arm:
+        """Return this arm plus a share `support` (0..1) of the wearer's arm. Raises ParameterError.
+
+        mass, cog: of the wearer's segment on each link, (n,) kg, and (n,) m from the link's joint along the link.
+        """
+        ...

@@ -1,0 +1,47 @@
+"""The parameters of a file, checked as the nodes check them at their start."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table, settings_of, urdf_table
+from exo_gravity.core.errors import named
+from exo_gravity.core.params import Param
+from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.trunk_estimator import TrunkEstimator
+from exo_gravity.lab.inputs.arms import node_values, read_arm
+from exo_gravity.lab.inputs.parameter_file import Nodes
+
+
+def check_nodes(nodes: Nodes) -> None:
+    """Check the parameters of each node of an arm and of the IMU as the node does at its start. Raises ParameterError.
+
+    The URDF of `law: urdf` is left to the node, which may receive it from a topic.
+    """
+    for node, given in nodes.items():
+        namespace, _, name = node.rpartition("/")
+        if name == "can_bridge":
+            node_values(nodes, node, CAN_BRIDGE)
+        elif name == "imu":
+            values = node_values(nodes, node, IMU)
+            settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")
+            with named(f"{node} "):
+                TrunkEstimator(*(values[setting] for setting in settings))
+        elif name == "compensator" and given.get("law") == URDF_LAW:
+            table = urdf_table(given)
+            node_values({node: _of_urdf(given, table)}, node, table)
+        elif name == "compensator" and f"{namespace}/can_bridge" in nodes:
+            read_arm(nodes, namespace).settings()
+        elif name == "compensator":
+            values = node_values(nodes, node, compensator_table(given))
+            with named(f"{node} "):
+                settings_of(values, lambda path: Path(path).read_text(encoding="utf-8"))
+
+
+def _of_urdf(given: Mapping[str, Any], table: Sequence[Param]) -> dict[str, Any]:
+    """Return the parameters without those of the exoskeleton's own arm, which the node ignores."""
+    used = {param.name for param in table}
+    unused = {param.name for param in COMPENSATOR} - used
+    return {name: value for name, value in given.items() if name not in unused}

@@ -1,0 +1,89 @@
+"""The same work on many items: in a process for each core, or on the workers of a Dask cluster.
+
+Outcomes come in the order in which they are finished, one for each item. The function must be importable, and a pure
+one: an item whose process dies is worked on again.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import get_context
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+SPAWNED = get_context("spawn")  # a progress bar has a thread, which a forked process would lack
+CONNECT = "10s"  # for which a scheduler may not answer
+ENDED = "the process that worked on it was ended, perhaps for want of memory"
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[Item, Result]):
+    """What became of an item."""
+
+    item: Item
+    result: Result | None  #: None if it failed
+    problem: str = ""  #: why it failed, or ''
+
+
+def in_processes(
+    work: Callable[[Item], Result], items: Sequence[Item], workers: int | None = None
+) -> Iterator[Outcome[Item, Result]]:
+    """Yield the outcome of each item, worked on in `workers` processes (default: one for each core).
+
+    A process that dies takes the pool with it. Those items that it may have been working on then run one by one, and
+    one that ends its process again is the one that fails; a new pool goes on with the others.
+    """
+    count = workers or os.cpu_count() or 1
+    left = dict.fromkeys(items)
+    while left:
+        for outcome in _in_pool(work, [*left], count):
+            del left[outcome.item]
+            yield outcome
+        for item in [*left][:count]:  # a pool works on them in their order
+            with ProcessPoolExecutor(1, SPAWNED) as alone:
+                outcome = _outcome(item, alone.submit(work, item).result, BrokenProcessPool)
+            del left[item]
+            yield outcome
+
+
+def _in_pool(work: Callable[[Item], Result], items: Sequence[Item], workers: int) -> Iterator[Outcome[Item, Result]]:
+    """Yield the outcome of each item until a process dies."""
+    pool = ProcessPoolExecutor(min(workers, len(items)), SPAWNED)
+    try:
+        futures = {pool.submit(work, item): item for item in items}
+        for future in as_completed(futures):
+            if isinstance(future.exception(), BrokenProcessPool):
+                return
+            yield _outcome(futures[future], future.result, BrokenProcessPool)
+    except BrokenProcessPool:  # already while items were submitted
+        return
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def on_cluster(address: str, work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Outcome[Item, Result]]:
+    """Yield the outcome of each item, worked on by the workers of the Dask scheduler at `address`.
+
+    What a worker that dies was working on goes to another one; an item that ends several workers fails. Raises OSError
+    if no scheduler answers, ModuleNotFoundError without dask[distributed].
+    """
+    import distributed
+
+    with distributed.Client(address, timeout=CONNECT) as client:
+        futures = {client.submit(work, item, pure=False): item for item in items}
+        for future in distributed.as_completed(futures):
+            yield _outcome(futures[future], future.result, distributed.KilledWorker)
+
+
+def _outcome(item: Item, result: Callable[[], Result], ended: type[Exception]) -> Outcome[Item, Result]:
+    """Return the outcome of an item. ended: what `result` raises if the item's process was ended."""
+    try:
+        return Outcome(item, result())
+    except ended:
+        return Outcome(item, None, ENDED)
+    except Exception as error:  # of any kind: the others go on
+        return Outcome(item, None, f"{type(error).__name__}: {error}")

@@ -1,0 +1,285 @@
+"""Arms of any number of joints, from a URDF, on the whole path of a torque: compensator, safety machine, bus, motors.
+
+MuJoCo's model of the same URDF says what gravity needs, and the simulated device what the motors did.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import pytest
+
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.controller import DirectController
+from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import MIT
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import unpack_command
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.drive import Drive, FaultCode, Send, State
+from exo_gravity.core.safety.limits import DAMPING, Limits
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
+from exo_gravity.hardware.ownership.owned_bus import let_down
+from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.sim.arm import SimulatedArm
+from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.motors import simulated
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.urdf import UrdfConfig
+from exo_gravity.sim.virtual_arm import VirtualArm, resting
+from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from ..support.chains import random_chain
+from ..support.urdf_oracle import MujocoArm
+from .rig import SAFE_SPEED, ArmOnWires
+
+COUNTS = (1, 2, 3, 5, 6, 7, 9)
+SPEC = MOTORS["AK80-9"]
+CODE = 2.0 * SPEC.torque_range / 4095  # Nm
+RATE = 250.0  # Hz
+LIFT = 0.35  # rad, by which the wearer moves each joint
+HOLD = 3.0  # s after that
+FREE = 2.5  # rad from zero, so that the stops are far
+UPRIGHT, TILTED = TrunkState(), TrunkState(0.4, -0.3)
+
+
+def settings_of(text: str, names: Sequence[str], **given: object) -> Settings:
+    given = {"joint_names": list(names), "use_imu": False, **given}
+    return urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
+
+
+def hanging_chain(count: int, trunk: TrunkState) -> tuple[UrdfConfig, list[float]]:
+    """Return an arm at random with `count` joints that hangs off its stops on `trunk`, and its angles there."""
+    for seed in itertools.count(count):
+        text, names = random_chain(count, seed)
+        mechanics = {"coulomb_friction": (0.1,) * count, "rotor_inertia": (0.005,) * count}
+        config = UrdfConfig(text=text, joint_names=names, hand="hand", **mechanics)
+        angles = hanging(config, trunk)
+        if max(map(abs, angles)) < FREE:
+            return config, angles
+    raise AssertionError
+
+
+def hanging(config: UrdfConfig, trunk: TrunkState) -> list[float]:
+    """Return the angles at which the arm comes to rest when it falls under damping."""
+    model, _ = config.models()
+    model.dof_frictionloss[:], model.dof_damping[:] = 0.0, 0.2
+    model.opt.gravity = config.felt("left", trunk)[0]
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, 20_000)
+    return list(data.qpos.tolist()) if np.abs(data.qvel).max() < 1e-4 else [math.inf] * model.njnt
+
+
+class CarriedChain(VirtualArm):
+    """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it.
+
+    notes: what its bridge has noted. fastest: rad/s, the largest true speed of a joint so far.
+    """
+
+    def __init__(self, count: int, home: Sequence[float] | None = None, trunk: TrunkState = UPRIGHT) -> None:
+        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        self.fastest = 0.0
+        config, self.home = hanging_chain(count, trunk)
+        text, self.names = config.text, config.joint_names
+        self.oracle = MujocoArm(text, self.names)
+        joints = [JointMotor(SPEC, 1 + n, wire_format=MIT) for n in range(count)]
+        device = SimulatedDevice(SimulatedArm(config), [simulated(joint) for joint in joints])
+        device.arm.reset(self.home)
+        device.pitch, device.roll = trunk.pitch, trunk.roll
+        span = [(max(-3.1, angle - 1.0), min(3.1, angle + 1.0)) for angle in self.home]
+        low, high = zip(*span, strict=True)
+        limits = Limits(
+            tuple(self.names),
+            low,
+            high,
+            max_effort=(SPEC.peak_torque,) * count,
+            home=tuple(self.home if home is None else home),
+        )
+        settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
+        self.controller = DirectController(Compensator(settings, self.names), limits)
+        super().__init__(device, self.controller, joints, limits, RATE, look=self._look, note=self.notes.note)
+        if trunk is not UPRIGHT:
+            self.add_imu(resting(trunk.pitch, trunk.roll), self.controller.compensator, 0.01)
+        self.notes.clock = self.clock
+        self.on_wire = ArmOnWires(("wire", "any arm", {}), joints, limits, 1.0 / RATE, {"any arm": self.wire})
+
+    def carry(self) -> None:
+        """Start the arm."""
+        self.enable()
+        assert self.run_until(lambda: self.safety.state is State.ACTIVE or self.safety.fault, 90.0)
+        assert self.safety.state is State.ACTIVE, self.safety.fault
+
+    def raise_it(self) -> None:
+        """Let the wearer raise the arm, and let go."""
+        goal = [angle - math.copysign(LIFT, angle) for angle in self.home]  # away from the stops
+        self.device.start(VirtualWearer(TrialScript.parse({"name": "raise", "steps": [{"move": goal, "over": 2.0}]})))
+        self.run(2.0 + HOLD)
+        self.check_controller()
+        assert self.safety.state is State.ACTIVE, self.safety.fault
+
+    def _look(self) -> None:
+        self.fastest = max(self.fastest, *map(abs, self.device.arm.velocities))
+
+    def needed(self) -> np.ndarray:
+        """What gravity needs where the device is, (n,) Nm."""
+        gravity = 9.80665 * gravity_in_trunk(self.device.pitch, self.device.roll)
+        return self.oracle.torque(self.device.arm.positions, gravity)
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_the_efforts_are_gravitys_torque_and_their_frames_within_half_a_code(count: int) -> None:
+    text, names = random_chain(count, seed=count)
+    settings = settings_of(text, names, max_effort=[1000.0] * count, max_effort_rate=1000.0)
+    oracle, random = MujocoArm(text, names), np.random.default_rng(1)
+    motor = JointMotor(SPEC, 1)
+    for n in range(50):
+        theta = random.uniform(-3.0, 3.0, count)
+        compensator = Compensator(settings, names)
+        effort = np.array(compensator.step(float(n), theta.tolist(), [0.0] * count).effort)
+        expected = oracle.torque(theta, (0.0, 0.0, -9.80665))
+        assert np.abs(effort - expected).max() < 1e-10
+        for torque in np.clip(effort, -SPEC.torque_range, SPEC.torque_range):
+            sent = unpack_command(SPEC, motor.command(float(torque), 0.0)).torque
+            assert abs(sent - torque) <= 0.5 * CODE + 1e-12
+
+
+@pytest.mark.parametrize(("count", "trunk"), [*((count, UPRIGHT) for count in COUNTS), (3, TILTED)])
+def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int, trunk: TrunkState) -> None:
+    arm = CarriedChain(count, trunk=trunk)
+    arm.carry()
+    arm.raise_it()
+    assert np.abs(arm.device.arm.velocities).max() < 0.02
+    torque = [motor.torque(0.0, 0.0) for motor in arm.device.motors]
+    assert np.abs(torque - arm.needed()).max() < 0.5 * CODE + 0.02  # the arm is where a code of its angle says
+    arm.safety.disable(arm.now)
+    assert arm.run_until(lambda: arm.loop.is_off, 60.0)
+    assert not arm.device.powered
+
+
+def test_an_arm_that_a_dead_bridge_left_is_let_down_from_its_notes() -> None:
+    arm = CarriedChain(3)
+    arm.carry()
+    arm.raise_it()
+    arm.fastest = 0.0
+    assert let_down(arm.on_wire, ArmNotes([arm.notes] * 3), print, lambda: False)
+    assert not arm.device.powered
+    arm.clock.sleep(0.5)
+    arm.catch_up()
+    assert arm.fastest < SAFE_SPEED
+
+
+def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:
+    notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+    assert not ArmNotes([notes] * 2).drive.powered
+    notes.note(Drive((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
+    assert ArmNotes([notes] * 3).drive == notes.drive
+    assert ArmNotes([notes] * 2).drive == Drive((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
+
+
+def test_an_arm_that_does_not_hang_where_home_says_is_not_started() -> None:
+    arm = CarriedChain(3)
+    wrong = CarriedChain(3, home=[angle + 0.4 for angle in arm.home])
+    wrong.enable()
+    wrong.run(15.0)
+    assert wrong.safety.fault and wrong.safety.fault.code is FaultCode.IMPLAUSIBLE_ZERO
+    assert not wrong.device.powered
+
+
+@pytest.mark.parametrize("held", [{}, {"payload.mass": 1.5, "payload.cog": [0.02, -0.03, 0.05]}])
+@pytest.mark.parametrize("pitch", [0.0, 0.6])
+def test_a_wearer_and_a_load_are_carried_on_any_links_under_any_tilt(held: dict[str, object], pitch: float) -> None:
+    count = 5
+    text, names = random_chain(count, seed=11)
+    arm = UrdfArm(text, names, "hand")
+    mass, cog = [0.0, 1.1, 0.0, 0.7, 0.3], [0.0, 0.5 * arm.length[1], 0.0, 0.9 * arm.length[3], 0.2 * arm.length[4]]
+    worn = {"wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 0.6}
+    settings = settings_of(text, names, max_effort=[1000.0] * count, **worn, **held)
+    config = UrdfConfig(
+        text=text, joint_names=names, hand="hand", wearer_mass=[0.6 * m for m in mass], wearer_cog=cog, gravity=9.80665
+    )
+    load = (held["payload.mass"], *held["payload.cog"]) if held else (0.0,) * 4
+    model, _ = config.models(load)
+    random, tilt = np.random.default_rng(5), Tilt.of("left", pitch, -0.5 * pitch)
+    model.opt.gravity = 9.80665 * np.array(tilt.gravity_in_trunk)
+    data = mujoco.MjData(model)
+    for _ in range(20):
+        data.qpos[:] = random.uniform(-3.0, 3.0, count)
+        mujoco.mj_forward(model, data)
+        torque, reason = settings.torque(data.qpos.tolist(), tilt)
+        assert reason == "" and np.abs(torque - data.qfrc_bias).max() < 1e-9
+    bare = settings.robot
+    assert settings.mass == pytest.approx(bare.total_mass + 0.6 * sum(mass) + load[0])
+
+
+def test_inertia_momentum_and_a_base_that_turns_faster_agree_with_mujocos() -> None:
+    count = 6
+    text, names = random_chain(count, seed=3)
+    arm = UrdfArm(text, names, "hand").with_payload(0.8, (0.05, 0.0, 0.02))
+    config = UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(0.0,) * count)
+    model, turning = config.models((0.8, 0.05, 0.0, 0.02))
+    model.opt.gravity = turning.opt.gravity = np.zeros(3)
+    model.dof_damping[:] = model.dof_frictionloss[:] = 0.0
+    data, random = mujoco.MjData(model), np.random.default_rng(4)
+    whole = np.zeros((count, count))
+    for _ in range(20):
+        theta, velocity, acceleration = (random.uniform(-1.5, 1.5, count) for _ in range(3))
+        data.qpos[:], data.qvel[:] = theta, velocity
+        mujoco.mj_forward(model, data)
+        for row, one in zip(whole, np.eye(count), strict=True):
+            mujoco.mj_mulM(model, data, row, one)
+        np.testing.assert_allclose(
+            arm.links.matrix(theta), whole, rtol=0.0, atol=1e-6
+        )  # a point of mass has some inertia
+        expected = whole @ acceleration + data.qfrc_bias
+        np.testing.assert_allclose(arm.links.torque(theta, velocity, acceleration), expected, rtol=0.0, atol=1e-5)
+        momentum, _ = arm.links.momentum(theta, velocity)
+        np.testing.assert_allclose(momentum, whole @ velocity, rtol=0.0, atol=1e-5)
+        assert np.all(1.0 / np.diag(np.linalg.inv(whole)) > 0.9 * np.array(arm.links.least))
+        spin_up = random.normal(size=3)
+        on_ball = mujoco.MjData(turning)
+        on_ball.qpos[0], on_ball.qpos[4:], on_ball.qacc[:3] = 1.0, theta, spin_up
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(turning, on_ball)
+        bias = np.empty(3 + count)
+        mujoco.mj_rne(turning, on_ball, 1, bias)
+        np.testing.assert_allclose(arm.turning_torque("left", theta, spin_up), bias[3:], rtol=0.0, atol=1e-5)
+
+
+def test_the_exact_momentum_balance_holds() -> None:
+    """With p = M v: p' = tau + C^T v - g along any motion, which is what the observer relies on."""
+    text, names = random_chain(4, seed=8)
+    links = UrdfArm(text, names).links
+    at = [lambda t, n=n: 0.4 * math.sin(t + n) for n in range(4)]
+    rate = [lambda t, n=n: 0.4 * math.cos(t + n) for n in range(4)]
+    t, step = 0.7, 1e-5
+    theta, velocity = [q(t) for q in at], [v(t) for v in rate]
+    acceleration = [-q for q in theta]
+    before, after = (links.momentum([q(s) for q in at], [v(s) for v in rate])[0] for s in (t - step, t + step))
+    change = (np.array(after) - before) / (2.0 * step)
+    torque = links.torque(theta, velocity, acceleration)
+    np.testing.assert_allclose(change, np.add(torque, links.momentum(theta, velocity)[1]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "problem"),
+    [
+        ({"payload.mass": 1.0}, r"payload\.mass = 1\.0: must be 0 without urdf\.hand"),
+        ({"wearer.mass": [0.5, 0.5]}, r"wearer\.mass = .*: must be 0 on link 2, which has no length"),
+        ({"wearer.body_mass": 70.0}, r"wearer\.links = \[3, 4\]: must be 2 different links from 1 to 2"),
+        ({"gain": [1.0]}, r"gain = \[1\.0\]: must be 2 numbers"),
+    ],
+)
+def test_what_an_arm_without_a_hand_cannot_hold_is_refused(given: dict[str, object], problem: str) -> None:
+    text, names = random_chain(2, seed=2)
+    values = {"joint_names": names, "use_imu": False, **given}
+    with pytest.raises(ParameterError, match=problem):
+        urdf_settings_of(values_of(urdf_table(values), values), UrdfArm(text, names))
