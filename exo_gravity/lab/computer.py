@@ -272,7 +272,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
             rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
             for bus in buses.values():
                 check_bridge(rate, motors_of(values), limits, bus.status_rate)
-            serials = serials_of(values["can.serial"], values["can.channel"])
+            serials = serials_of(values["can.serial"], values["can.channel"], len(values["can_id"]))
             address = values["can.interface"], values["can.channel"], can_options(nodes[node])
             arm = ArmOnBus(address, motors_of(values), limits, 1.0 / rate, serials=serials)
         yield from (of_opening(node, part) for part in arm.parts)
