@@ -23,6 +23,7 @@ PACKAGE = ROOT / "exo_gravity"
 PASSING = WAITED_OUT - {FaultCode.OUTSIDE_LIMITS}  # faults that a start waits out; that one has a word of its own
 # The words of each node's key.
 VOCABULARY: dict[tuple[str, str], Iterable[str]] = {
+    ("", "clock"): vocabulary.ClockState,
     ("can_bridge", "state"): (*State, vocabulary.INACTIVE),
     ("can_bridge", "source"): vocabulary.Source,
     ("can_bridge", "motors"): vocabulary.Motors,

@@ -103,7 +103,7 @@ class Observed(Barrier):
     def brake(self, dt: float, joints: Sequence[JointSample], effort: Sequence[float]) -> Sequence[float]:
         """Return the damping (n,) Nm s/rad."""
         brakes = super().brake(dt, joints, effort)
-        position, velocity, torque, _, _, times = zip(*joints, strict=True)
+        position, velocity, torque, _, _, times, *_ = zip(*joints, strict=True)
         estimate = self._observer.update(min(times), (position, velocity, torque), Tilt.of("right", 0.0, 0.0))
         columns = zip(brakes, estimate.torque, velocity, strict=True)
         return [kd * share(along(unexplained, speed), 1.0) for kd, unexplained, speed in columns]

@@ -264,6 +264,13 @@ class ImuState(Word):
     NO_DEVICE = "no_device"
 
 
+class ClockState(Word):
+    """Whether a node with `use_sim_time` gets a clock."""
+
+    PUBLISHED = "published"
+    MISSING = "missing"
+
+
 class NodeState(Word):
     """What a node beside the path does."""
 

@@ -199,8 +199,8 @@ class UrdfJoints:
             for k, position in enumerate(self._at.tolist()):
                 moved = positions.copy()
                 moved[count + k] = position
-                effects[k] = max(effects[k], np.abs(self._torque(moved, gravity) - torque).max())
-        return peak, effects / max(peak.max(), TINY)
+                effects[k] = max(effects[k], float(np.max(np.abs(self._torque(moved, gravity) - torque))))
+        return peak, effects / max(float(np.max(peak)), TINY)
 
     def _leader(self, name: str) -> Mimic:
         """Return how a joint follows the one that moves by itself; raises ParameterError if they go in a circle."""

@@ -30,7 +30,7 @@ from exo_gravity.lab.adapters import of_opening
 from exo_gravity.lab.findings import Finding, Level, judged
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.node_checks import check_nodes
-from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, check_names, stages
 from exo_gravity.lab.packages import MissingPackageError, check_packages
 
 LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
@@ -272,7 +272,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
             rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
             for bus in buses.values():
                 check_bridge(rate, motors_of(values), limits, bus.status_rate)
-            serials = serials_of(values["can.serial"], values["can.channel"], len(values["can_id"]))
+            serials = serials_of(values["can.serial"], values["can.channel"], len(values["joint_names"]))
             address = values["can.interface"], values["can.channel"], can_options(nodes[node])
             arm = ArmOnBus(address, motors_of(values), limits, 1.0 / rate, serials=serials)
         yield from (of_opening(node, part) for part in arm.parts)
@@ -290,6 +290,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
 def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     """Return every finding; seconds: for which wake-ups are measured. Raises ParameterError."""
     check_buses(nodes)
+    check_names(nodes)
     check_nodes(nodes)
     bridges = {node: node_values(nodes, node, CAN_BRIDGE) for node in stages(nodes)[0]}
     buses = list(of_buses(nodes, bridges, root))

@@ -29,7 +29,7 @@ from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
-from exo_gravity.lab.inputs.parameter_file import Nodes, check_buses, load, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, check_buses, check_names, load, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.packages import check_packages
 
@@ -143,6 +143,7 @@ def planned(
     """
     nodes = {**{node: {} for node in more}, **load(params)}
     check_buses(nodes)
+    check_names(nodes)
     nodes |= {node: {} for node in wearers(nodes)}
     names = chosen(nodes, only)
     for node in names:

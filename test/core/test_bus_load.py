@@ -129,9 +129,9 @@ def test_typical_bits_of_can_fd_are_the_mean_of_a_carried_arm():
     for index in range(1000):
         can_id = index % 8 + 1
         torque, position, velocity = rng.uniform((-9, -1.65, -1), (9, 3.14, 1)).tolist()
-        reply = MotorReply(can_id, position, velocity, torque, int(rng.integers(20, 60)), 0, True)
+        reply = MotorReply(can_id, position, velocity, torque, int(rng.integers(20, 60)), 0)
         commands.append(fd_bits(can_id, pack_command(spec, 0.0, 0.0, 0.0, 0.0, torque)))
-        replies.append(fd_bits(DAMIAO_MIT.reply_id(can_id), DAMIAO_MIT.pack_reply(spec, reply)))
+        replies.append(fd_bits(DAMIAO_MIT.reply_id(can_id), DAMIAO_MIT.pack_reply(spec, reply, True)))
     assert np.mean(commands, axis=0) == pytest.approx((FD_BITS.typical, FD_COMMAND_BITS.typical), abs=1.0)
     assert np.mean(replies, axis=0) == pytest.approx((FD_BITS.typical, FD_REPLY_BITS.typical), abs=1.0)
     assert np.all(np.max([*commands, *replies], axis=0) <= (FD_BITS.most, FD_COMMAND_BITS.most))

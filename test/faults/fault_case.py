@@ -25,14 +25,19 @@ ALL_JOINTS = (0, 1, 2, 3)
 class FaultCase:
     """One fault. inject(rig) causes it, and may return the time (wall clock, s) at which it began.
 
-    clear(rig) ends the fault where the rig is used again. afterwards(rig) checks, once the arm is down, what happens
-    next: it raises AssertionError. stage: the bridge's state in which the fault occurs, or "started". limit: s until the arm must be
-    let down, None where it may stay carried, because the fault is refused or ignored. outcomes: the allowed results,
-    fault codes or states; () for any. unreached: joints (0..3) whose motors no frame can reach. unpowered: joints that
-    fall, because a motor has no power, so that nothing can brake them. steps_from: s after the fault from which on
-    torque steps count, where the fault itself is a step. speed_limit, driven_limit: rad/s of any joint. work_limit: J
-    of any motor. damping_limit: of any motor's damping by itself, as a multiple of
-    its rated torque. check: of the arm's true motion. ends_rig: whether the rig is spent although its nodes run on.
+    clear(rig) ends the fault where the rig is used again.
+    afterwards(rig) checks, once the arm is down, what happens next: it raises AssertionError.
+    stage: the bridge's state in which the fault occurs, or "started".
+    limit: s until the arm must be let down, None where it may stay carried, because the fault is refused or ignored.
+    outcomes: the allowed results, fault codes or states; () for any.
+    unreached: joints (0..) whose motors no frame can reach.
+    unpowered: joints that fall, because a motor has no power, so that nothing can brake them.
+    steps_from: s after the fault from which on torque steps count, where the fault itself is a step.
+    speed_limit, driven_limit: rad/s of any joint.
+    work_limit: J of any motor.
+    damping_limit: of any motor's damping by itself, as a multiple of its rated torque.
+    check: of the arm's true motion.
+    ends_rig: whether the rig is spent although its nodes run on.
     """
 
     name: str

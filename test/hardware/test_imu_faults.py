@@ -127,8 +127,9 @@ def test_a_gyroscope_that_turns_to_degrees_in_slow_motion_is_withheld_before_the
     outcome = follow(motion)
     withheld = start + np.flatnonzero(np.isnan(outcome.errors[start:]))
     named = [k for k, text in enumerate(outcome.refusals) if "check the gyroscope's unit" in text]
-    assert withheld[0] < start + 17 and named[0] < start + 60
-    assert np.nanmax(outcome.errors) < 6.0 and not np.isfinite(outcome.errors[start + 17 :]).any()
+    # The trunk may just not turn when it begins.
+    assert withheld[0] < start + 25 and named[0] < start + 60
+    assert np.nanmax(outcome.errors) < 6.0 and np.isnan(outcome.errors[withheld[0] :]).all()
 
 
 @pytest.mark.parametrize("turn", [30.0, 90.0, 180.0])
@@ -142,6 +143,21 @@ def test_3_percent_of_the_samples_lost_cost_nothing():
     motion = lost(0.03)(MOTION, 0)
     outcome = follow(motion)
     assert np.nanmax(outcome.errors) < 1.0 and np.isfinite(outcome.errors[motion.times > 1.1]).all()
+
+
+def test_a_knock_between_lost_samples_is_no_wrong_gyroscope():
+    def bow(times):  # by 1.2 rad in 1.5 s
+        s = np.clip((times - STILL_TIME) / 1.5, 0.0, 1.0)
+        return np.outer(s**3 * (10.0 - 15.0 * s + 6.0 * s * s), (0.0, 1.2, 0.0))
+
+    motion = sampled(bow, np.arange(800) / 100.0, 0.01, 100.0)
+    for knock in range(370, 430, 5):
+        force, kept = motion.accelerometer.copy(), np.ones(len(motion.times), bool)
+        force[knock] *= -0.9
+        kept[[knock - 1, knock + 1]] = False  # one judgement has this sample alone
+        parts = {name: getattr(motion, name)[kept] for name in ("times", "gyroscope", "gravity")}
+        outcome = follow(replace(motion, accelerometer=force[kept], **parts))
+        assert not any(outcome.refusals) and np.nanmax(outcome.errors) < 2.5
 
 
 def saturated(duration):

@@ -125,7 +125,7 @@ def test_what_a_start_waits_for_and_why_it_ended_have_words_and_figures(sent):
         pytest.approx(-2.0, abs=0.11),
     )
     assert values["refusal"] == "none" and values["elbow temperature (degC)"] == "unknown"
-    safety.step(30.0, loop.samples, NO_EFFORTS)
+    safety.step(100.0, loop.samples, NO_EFFORTS)  # longer than any start waits
     values = keys_of(sent(lambda _: loop, 1)[-1])
     assert (values["state"], values["waiting for"], values["refusal"]) == ("disabled", "none", "joint_limits")
     loop.samples = [hanging] * 4

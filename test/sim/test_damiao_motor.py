@@ -25,7 +25,7 @@ class Bench:
 
     def __init__(self, timeout: float = 0.2) -> None:
         joint = JointMotor(MOTORS["DM-J4310"], 3, wire_format=DAMIAO_MIT, timeout=timeout)
-        self.motor = DamiaoMotor(joint)
+        self.joint, self.motor = joint, DamiaoMotor(joint)
         self.angle, self.time = 0.3, 0.0
 
     def send(self, data: bytes, frame_id: int = 3) -> bytes:
@@ -37,7 +37,7 @@ class Bench:
         return self.send(data, frame_id)[0] >> 4
 
     def push(self, torque: float, frame_id: int = 3) -> int:
-        return self.state(self.motor.joint.command(torque, 0.0), frame_id)
+        return self.state(self.joint.command(torque, 0.0), frame_id)
 
     def wait(self, duration: float) -> float:
         torque = 0.0

@@ -43,20 +43,19 @@ def imu_entry(
     return "/imu/data_raw", IMU, stamp, bytes(STORE.serialize_cdr(message, IMU))
 
 
-def bag_of(folder: Path, samples: ImuRecord, unknown: float = 0.0) -> Path:
-    orientation = [None] * len(samples.time) if samples.orientation is None else samples.orientation
-    rows = zip(*samples[:3], orientation, strict=True)
+def bag_of(folder: Path, samples: ImuRecord, orientation: np.ndarray | None = None, unknown: float = 0.0) -> Path:
+    reported = [None] * len(samples.time) if orientation is None else orientation
+    rows = zip(*samples, reported, strict=True)
     return write_bag(folder, (imu_entry(*row, unknown) for row in rows))
 
 
-def reporting(samples: ImuRecord, kind: str) -> ImuRecord:
-    """Return the samples with an orientation: what VQF makes of them, one filled in, zeros, or one of other axes."""
-    rate, force = (np.ascontiguousarray(values) for values in samples[1:3])
+def reported(samples: ImuRecord, kind: str) -> np.ndarray:
+    """Return an orientation: what VQF makes of the samples, one filled in, zeros, or one of other axes."""
+    rate, force = (np.ascontiguousarray(values) for values in samples[1:])
     filtered = np.roll(VQF(0.01).updateBatch(rate, force)["quat6D"], -1, axis=1)
     turned = (Rotation.from_quat(filtered) * Rotation.from_euler("x", 3.8, degrees=True)).as_quat()
     upright = np.tile(filtered[100], (len(rate), 1))
-    known = {"true": filtered, "filled in": upright, "zeros": np.zeros_like(filtered), "of other axes": turned}
-    return samples._replace(orientation=known[kind])
+    return {"true": filtered, "filled in": upright, "zeros": 0.0 * filtered, "of other axes": turned}[kind]
 
 
 def calibrate(tmp_path: Path, *arguments: str) -> int:
@@ -95,14 +94,16 @@ def test_the_mounting_goes_into_the_new_file_and_onto_the_page(
 def test_the_orientation_that_imu_will_use_is_judged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, unknown: float, problem: str
 ) -> None:
-    bag = bag_of(tmp_path / "bag", reporting(record(MOUNTED), kind), unknown)
+    samples = record(MOUNTED)
+    bag = bag_of(tmp_path / "bag", samples, reported(samples, kind), unknown)
     assert calibrate(tmp_path, "--bag", str(bag)) == (1 if problem else 0)
     assert re.search(problem, capsys.readouterr().err)
 
 
 def test_an_imu_that_reports_its_orientation_and_no_rate_is_calibrated(tmp_path: Path) -> None:
-    samples = reporting(record(MOUNTED), "true")
-    bag = bag_of(tmp_path / "bag", samples._replace(angular_velocity=np.zeros_like(samples.angular_velocity)))
+    samples = record(MOUNTED)
+    still = samples._replace(angular_velocity=np.zeros_like(samples.angular_velocity))
+    bag = bag_of(tmp_path / "bag", still, reported(samples, "true"))
     assert calibrate(tmp_path, "--bag", str(bag)) == 0
     found = rotation_matrix(load(tmp_path / "new.yaml")["/imu"]["rotation_trunk_from_imu"])
     error = found @ rotation_matrix(MOUNTED).T
@@ -113,7 +114,7 @@ def test_samples_that_imu_would_find_too_slow_are_not_calibrated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     samples = record(MOUNTED)
-    slow = ImuRecord(*(values[::10] for values in samples[:3]))
+    slow = ImuRecord(*(values[::10] for values in samples))
     assert calibrate(tmp_path, "--bag", str(bag_of(tmp_path / "bag", slow))) == 1
     assert "samples a second must be 20 or more; they come at 10 Hz" in capsys.readouterr().err
 

@@ -90,6 +90,12 @@ def test_two_bridges_on_the_same_bus_are_refused(refused):
     assert "must be different from the bus of /left/can_bridge: one arm per bus" in error
 
 
+def test_two_orders_of_an_arms_joints_are_refused(refused):
+    names = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["joint_names"]
+    error = refused({"/right/can_bridge": {"joint_names": [*names[:2], names[3], names[2]]}})
+    assert error.startswith("launcher: /right/can_bridge joint_names") and "those of /right/compensator" in error
+
+
 def test_an_option_of_the_bus_without_an_entry_for_each_motor_is_named(refused):
     bus = yaml.safe_load(SIM.read_text())["/right/can_bridge"]["ros__parameters"]["can"]
     bus["options"]["bitrate"] = [500_000, 1_000_000]

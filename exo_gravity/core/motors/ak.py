@@ -60,7 +60,7 @@ FAMILY = "ak"
 MASTER_ID = 0  # the arbitration ID of replies from some firmware versions of V1 and V2 boards
 REPLY_LENGTHS = (6, 7, 8)  # bytes
 TEMPERATURE_OFFSET = 40  # of the byte, degC
-OPEN_DRIVE_BITS = 0x7F  # of an ID that the open drive compares
+OPEN_DRIVE_BITS = 0x7F  # of an ID that the open drive compares: 7
 OPEN_DRIVE_LENGTH = 7  # bytes of its reply, which no other board is known to send
 # What the error byte means in the manuals' table. One vendor's MIT firmware sends a bit mask instead: the whole byte is
 # 2 above 81 degC and 6 above 120 degC, where it shuts off.
@@ -249,10 +249,11 @@ class MitFormat(WireFormat):
 
     reply_lengths: tuple[int, ...] = REPLY_LENGTHS
     alias_length: int = OPEN_DRIVE_LENGTH
+    id_bits: int = 7
 
-    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the data of a reply. Raises ParameterError."""
-        return pack_reply(spec, *reply[:6])
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool = False) -> bytes:
+        """Return the data of a reply, which is the same on or off. Raises ParameterError."""
+        return pack_reply(spec, *reply)
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply. Raises FrameError."""
@@ -310,8 +311,8 @@ class V3Format(WireFormat):
         values = unpack_fields(spec, int.from_bytes(data, "big"), *order)
         return MotorCommand(**dict(zip(order, values, strict=True)))
 
-    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the data of a status frame. Raises ParameterError."""
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool = False) -> bytes:
+        """Return the data of a status frame, which is the same on or off. Raises ParameterError."""
         numbers = []
         for name, value, step in zip(MotorReply._fields[1:4], reply[1:4], _steps(spec), strict=True):
             limit = 0x7FFF * step

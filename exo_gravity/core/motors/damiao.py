@@ -215,9 +215,9 @@ class DamiaoFormat(WireFormat):
             raise ParameterError("master_id", master_id, expected)
         return reply_id
 
-    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool) -> bytes:
         """Return the data of a reply, whose temperature is that of both parts. Raises ParameterError."""
-        state = reply.error or (ON if reply.on else OFF)
+        state = reply.error or (ON if on else OFF)
         warmth = byte_of("temperature", reply.temperature or 0)
         return bytes((state << 4 | reply.motor_id,)) + state_of(spec, reply) + bytes((warmth, warmth))
 
@@ -228,7 +228,11 @@ class DamiaoFormat(WireFormat):
         state = data[0] >> 4
         position, velocity, torque = unpack_fields(spec, int.from_bytes(data[1:6], "big"), *MotorReply._fields[1:4])
         error = 0 if state in (OFF, ON) else state
-        return MotorReply(data[0] & 0xF, position, velocity, torque, max(data[6], data[7]), error, state == ON)
+        return MotorReply(data[0] & 0xF, position, velocity, torque, max(data[6], data[7]), error)
+
+    def says_on(self, data: bytes | bytearray) -> bool | None:
+        """Return whether the motor is on: in every other state it is off."""
+        return data[0] >> 4 == ON
 
     def error_text(self, error: int) -> str:
         """Return what a state above 1 means."""
@@ -292,6 +296,7 @@ DAMIAO_MIT = DamiaoFormat(
     "mit",
     FAMILY,
     last_id=LAST_ID,
+    id_bits=8,
     on=((0, CLEAR_ERROR), (0, ENTER)),
     stops=frozenset((EXIT, CLEAR_ERROR)),
     needs_timeout=True,

@@ -136,7 +136,6 @@ class MotorReply(NamedTuple):
     torque: float  #: Nm
     temperature: int | None  #: degC, None from firmware that replies with 6 or 7 bytes
     error: int | None  #: the board's code of an error, 0 for none; None from firmware that replies with 6 or 7 bytes
-    on: bool | None = None  #: whether the motor is on, None from boards that do not say
 
 
 class Setting(NamedTuple):
@@ -220,6 +219,7 @@ class WireFormat(ABC):
     replies: bool = True
     first_id: int = 0  #: of commands
     last_id: int = 126  #: the largest ID of a motor
+    id_bits: int = 11  #: of an 11-bit ID that some of these boards compare with their own
     #: frames that switch a motor on, before its first command; none if the command itself does
     on: tuple[Frame, ...] = ((0, ENTER),)
     off: tuple[Frame, ...] = ((0, EXIT),)  #: frames that switch a motor off
@@ -250,12 +250,19 @@ class WireFormat(ABC):
     unpack_command = staticmethod(unpack_command)
 
     @abstractmethod
-    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
-        """Return the data of a reply or status frame. Raises ParameterError on NaN or a value that does not fit."""
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool) -> bytes:
+        """Return the data of a reply or status frame of a motor that is on or off.
+
+        Raises ParameterError on NaN or a value that does not fit.
+        """
 
     @abstractmethod
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
         """Return the content of a reply or status frame of the motor `motor_id`. Raises FrameError."""
+
+    def says_on(self, data: bytes | bytearray) -> bool | None:
+        """Return whether a reply that `unpack_reply` can read says that the motor is on; None if it does not say."""
+        return None
 
     @abstractmethod
     def error_text(self, error: int) -> str:

@@ -3,6 +3,7 @@
 A `JointMotor` translates a joint's effort and damping to the frames of its wire format, and frames to `JointSample`s.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -145,14 +146,14 @@ class JointMotor:
     def sample(self, data: bytes | bytearray, time: float) -> JointSample:
         """Return what a reply or status frame that arrived at `time` s says of the joint. Raises FrameError."""
         board = self.wire_format
-        _, position, velocity, torque, temperature, error, on = board.unpack_reply(self.spec, self.can_id, data)
+        _, position, velocity, torque, temperature, error = board.unpack_reply(self.spec, self.can_id, data)
         sign = self.direction
         effort = sign * torque * self.torque_scale
         trouble = board.error_text(error) if error else ""
         if error in board.let_go:
             error = 0
         angle, speed = sign * (position - self.zero), sign * velocity
-        return JointSample(angle, speed, effort, temperature, error, time, on, trouble)
+        return JointSample(angle, speed, effort, temperature, error, time, board.says_on(data), trouble)
 
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
@@ -202,10 +203,12 @@ def motors_of(values: Mapping[str, Any]) -> tuple[JointMotor, ...]:
     if len(set(ids)) != len(ids):
         raise ParameterError("can_id", ids, f"{len(ids)} different IDs")
     motors = tuple(_motor_of({name: values[name][joint] for name in _OF_A_MOTOR}) for joint in range(len(ids)))
-    for motor in motors:
-        if motor.reply_id != motor.command_id and motor.reply_id < EXTENDED and motor.reply_id & 0xFF in ids:
-            expected = f"without the last two hexadecimal digits of a can_id, {ids}: that motor would obey the replies"
-            raise ParameterError("master_id", motor.master_id, expected)
+    replying = [motor for motor in motors if motor.command_id != motor.reply_id < EXTENDED]
+    for motor, other in itertools.product(replying, motors):
+        bits = other.wire_format.id_bits
+        if motor.reply_id & (1 << bits) - 1 == other.can_id:
+            expected = f"without the lowest {bits} bits of motor {other.can_id}, which would obey the replies"
+            raise ParameterError("master_id", motor.reply_id, expected)
     return motors
 
 

@@ -79,6 +79,7 @@ class TurnLimits:
     clear: float = 0.04  #: the smallest turn that is compared: 2.3 degrees,
     clear_of_motion: float = 6.0  #: and this many times the deviation from 1 g,
     deviation_time: float = 0.15  #: s, over which that is averaged
+    knock: float = 0.3  #: by which the acceleration changes between two judgements where it is no gravity
     unlike: float = 0.55  #: share of the gyroscope's turn by which the two differ where axes or signs are wrong,
     alike: float = 0.3  #: and where they are right
     lever: float = 0.42 / STANDARD_GRAVITY  #: s^2: from the axis of a turn to the IMU, 0.42 m, which a swing explains
@@ -86,6 +87,7 @@ class TurnLimits:
     shown: float = 2.0  #: and at most this many times the change of the acceleration, which a swing shows, too
     steady_time: float = 0.3  #: s over which the acceleration is averaged, from which its change is taken
     shown_time: float = 0.5  #: s for which such a change counts
+    start_time: float = 2.0  #: s from the start on in which no swing is taken for an explanation
     velocity: float = 0.009  #: s 1 g, that a movement may add beyond this; at most 0.0082 in 30 of 32 random days
     notice: float = 0.0003  #: s 1 g, from which on the whole difference counts as uncertainty
     memory: float = 2.0  #: s, after which differences are forgotten
@@ -106,7 +108,7 @@ class Turns:
     _deviation = 0.0  # of the acceleration's length from 1 g, a running mean, as a share
     _up: Floats3 | None = None  # running mean of gravity's direction by the estimate; None before the first
     _apart = ZERO  # the same less the accelerometer's
-    _steady = ZERO  # running mean of the acceleration in the IMU's axes
+    _last = _steady = ZERO  # the acceleration in the IMU's axes before, and its running mean
     _shown = 0.0  # the acceleration's largest change from it of late
     _unlike = 0.0  # s 1 g, by which the turns have differed
     _agreed = _rest = _age = 0.0  # s
@@ -133,7 +135,7 @@ class Turns:
         share = dt / limits.time
         apart = plus(up, acceleration, -1.0 / math.hypot(*acceleration))
         if self._up is None:
-            self._up, self._apart, self._steady = up, apart, acceleration
+            self._up, self._apart, self._last, self._steady = up, apart, acceleration, acceleration
         turned, unlike = plus(up, self._up, -1.0), plus(apart, self._apart, -1.0)
         self._up, self._apart = plus(self._up, turned, share), plus(self._apart, unlike, share)
         change = plus(acceleration, self._steady, -1.0)
@@ -143,7 +145,8 @@ class Turns:
         self.contradiction = 0.0
         size, difference = math.hypot(*turned), math.hypot(*unlike)
         self._rest = self._rest + dt if size <= limits.clear and self._deviation < limits.at_rest else 0.0
-        if size > max(limits.clear, limits.clear_of_motion * self._deviation):
+        is_knock, self._last = math.dist(acceleration, self._last) > limits.knock, acceleration
+        if size > max(limits.clear, limits.clear_of_motion * self._deviation) and not is_knock:
             self._compare(dt, turned, size, difference, swing, unmeasured)
 
     def _compare(
@@ -151,7 +154,9 @@ class Turns:
     ) -> None:
         """Compare a clear turn, `size` of `turned`, with the accelerometer's, which differs by `difference`."""
         limits = self.limits
-        explained = min(limits.most, limits.lever * swing, limits.shown * self._shown)
+        explained = 0.0  # before and just after the first tilt nothing is lost by a refusal
+        if self._age > limits.start_time:
+            explained = min(limits.most, limits.lever * swing, limits.shown * self._shown)
         excess = difference - limits.unlike * size - explained - unmeasured
         if difference < limits.alike * size:
             self._agreed += dt

@@ -45,6 +45,7 @@ HEAD = np.dtype(  # of a message's record; the serialised message follows
 LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most
+CACHED_ROWS = 4_000  # of a database, at once: more leave the processor's cache before they are put together
 BLOCK = 2**20  # bytes that are decompressed at once
 REPAIRED = "_repaired"  # with which the names of complete copies end
 
@@ -194,8 +195,7 @@ class Storage:
             try:
                 cursor = database.execute(query, list(chosen))
                 while True:
-                    for row in islice(cursor, ROWS):  # not fetchmany, which loses the rows before the damage
-                        found.append(row)
+                    found.extend(islice(cursor, CACHED_ROWS))  # fetchmany would lose the rows before the damage
                     if not found:
                         return
                     yield from self._whole(found, chosen)

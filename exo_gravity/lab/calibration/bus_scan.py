@@ -185,7 +185,7 @@ class BusScan(contextlib.ExitStack):
         """Return the newest answer of each of these motors; a silent one is missing. Raises BusError."""
         reporting = set(can_ids) & set(self._v3)
         found: dict[int, MotorAnswer] = {}
-        for can_id in set(can_ids) - reporting:
+        for can_id in set(can_ids).intersection(self._boards) - reporting:
             for _, answer in self._ask(self._boards[can_id], can_id):
                 if answer:
                     found[answer.can_id] = answer
@@ -214,28 +214,32 @@ class BusScan(contextlib.ExitStack):
     ) -> Iterator[tuple[can.Message, str, MotorAnswer | None]]:
         """Yield the data frames that arrive within `duration` s, what each is, and the answer in it.
 
-        asked: whose answers are expected, besides the frames of boards that report by themselves.
+        asked: whose answers are expected, besides those of motors that have answered before, and of boards that report
+            by themselves.
         """
-        own = [(asked, dict.fromkeys(range(1, asked.last_id + 1), 0))] if asked else []
-        boards = [*own, *((board, IDS) for board in self._reporting)]
         end = self._now() + duration
         while (remaining := end - self._now()) > 0.0:
             message = self._port.receive(remaining)
             if message is None or message.is_error_frame or message.is_remote_frame:
                 continue
-            kind, answer = OTHER, None
-            for board, ids in boards:
-                frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-                kind, can_id = board.classify(frame_id, message.data, ids)
-                if kind == REPLY:
-                    answer = _answer(board, can_id, (message.arbitration_id, bytes(message.data)))
-                    self._boards[can_id] = board
-                    if board in self._reporting:
-                        self._v3[can_id] = answer
-                    break
-                if kind == COMMAND:
-                    break
-            yield message, kind, answer
+            yield message, *self._sort(message, asked)
+
+    def _sort(self, message: can.Message, asked: WireFormat | None) -> tuple[str, MotorAnswer | None]:
+        """Return what a frame is, and the answer in it; `asked` as for `_frames`."""
+        frame = message.arbitration_id, bytes(message.data)
+        kinds = set()
+        for board in dict.fromkeys((*([asked] if asked else ()), *self._reporting, *self._asked)):
+            ids = IDS if board in self._reporting else dict.fromkeys(range(1, board.last_id + 1), 0)
+            frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+            kind, can_id = board.classify(frame_id, message.data, ids)
+            if kind == REPLY and (board in (asked, *self._reporting) or self._boards.get(can_id) is board):
+                answer = _answer(board, can_id, frame)
+                self._boards[can_id] = board
+                if board in self._reporting:
+                    self._v3[can_id] = answer
+                return kind, answer
+            kinds.add(kind)
+        return (COMMAND if COMMAND in kinds else OTHER), None
 
 
 def _answer(board: WireFormat, can_id: int, frame: Frame) -> MotorAnswer:

@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,7 +58,8 @@ SENSOR = 5e-3  # rad: 5 mg, the bias of a calibrated accelerometer
 ONE_G = (0.9, 1.1)  # of the accelerometer at rest
 RESTS = 6
 DISTINCT = math.radians(30.0)  # between two rests on different sides
-NO_VECTOR, NO_QUATERNION = (math.nan,) * 3, (math.nan,) * 4
+NO_VECTOR = (math.nan,) * 3
+LEAST_STEP = 1e-4  # s between two samples
 SETTLED = 1.5  # s of rest at the start of a record after which `imu` has a tilt
 SAME_TILT = math.radians(3.0)  # between accelerometer and `imu` at rest: what `imu` promises
 LARGEST_ERROR = math.radians(0.5)  # of the two directions in which gravity can be off
@@ -69,22 +71,14 @@ NO_HEADING = (
 
 
 class ImuRecord(NamedTuple):
-    """Samples in the IMU's axes; NaN where the driver does not measure a quantity."""
+    """Samples in the IMU's axes; NaN where the driver does not measure a quantity.
+
+    Without a gyroscope, as of a BNO085, the angular velocity is that of the reported orientation.
+    """
 
     time: np.ndarray  #: (n,) s
     angular_velocity: np.ndarray  #: (n, 3) rad/s
     acceleration: np.ndarray  #: (n, 3) m/s^2
-    orientation: np.ndarray | None = None  #: (n, 4), x, y, z, w, world from IMU; None if there is none
-
-    def with_turns(self) -> "ImuRecord":
-        """Return the record with the turns of the orientation where the IMU has no gyroscope, as a BNO085."""
-        if self.orientation is None or (np.isfinite(self.angular_velocity).all() and self.angular_velocity.any()):
-            return self
-        world_from_imu = Rotation.from_quat(self.orientation)
-        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec() / np.maximum(np.diff(self.time), 1e-6)[
-            :, None
-        ]
-        return self._replace(angular_velocity=np.vstack((turns, turns[-1:])))
 
 
 class Phase(NamedTuple):
@@ -111,10 +105,10 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
     """
     values = node_values(load(options.params), NODE, IMU)
     topic = values["input_topic"]
-    record = read_imu(options.bag or _record(options, say), topic)
-    turning = record.with_turns()
-    found = mounting(turning)
-    check_as_imu(record, still_phases(turning), found, values)
+    samples = read_samples(options.bag or _record(options, say), topic)
+    record = record_of(samples)
+    found = mounting(record)
+    check_as_imu(samples, still_phases(record), found, values)
     quaternion = found.quaternion.round(6).tolist()
     error = " ".join(f"{angle:.1f}" for angle in np.degrees(found.error))
     accuracy = f"±{error} degrees about the trunk's x, y and z, most of which is posture"
@@ -130,23 +124,36 @@ def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: S
 
 def read_imu(bag: Path, topic: str) -> ImuRecord:
     """Return the samples of `topic` in a recording, in order of their stamps. Raises DataError."""
-    rows = []
+    return record_of(read_samples(bag, topic))
+
+
+def read_samples(bag: Path, topic: str) -> list[ImuSample]:
+    """Return the samples of `topic` in a recording as `imu` takes them, in order of their stamps. Raises DataError."""
+    samples: list[ImuSample] = []
     for found in samples_of(bag, topic, IMU_TYPE):
-        seconds = found["header.stamp.sec"] + found["header.stamp.nanosec"] * 1e-9
-        columns = [seconds]
-        for name, axes, reported, nothing in (
-            ("angular_velocity", "xyz", reported_vector, NO_VECTOR),
-            ("linear_acceleration", "xyz", reported_vector, NO_VECTOR),
-            ("orientation", "xyzw", reported_orientation, NO_QUATERNION),
+        columns = [(found["header.stamp.sec"] + found["header.stamp.nanosec"] * 1e-9).tolist()]
+        for name, axes, reported in (
+            ("angular_velocity", "xyz", reported_vector),
+            ("linear_acceleration", "xyz", reported_vector),
+            ("orientation", "xyzw", reported_orientation),
         ):
-            given = np.column_stack([found[f"{name}.{axis}"] for axis in axes]).tolist()
-            covariances = found[f"{name}_covariance"][:, 0].tolist()
-            columns.append([reported(*each) or nothing for each in zip(given, covariances, strict=True)])
-        rows.append(np.column_stack(columns))
-    values = np.concatenate(rows)
-    values = values[np.lexsort(values.T[::-1])]
-    time, orientation = values[:, 0] - values[0, 0], values[:, 7:]
-    return ImuRecord(time, values[:, 1:4], values[:, 4:7], orientation if np.isfinite(orientation).any() else None)
+            values = np.column_stack([found[f"{name}.{axis}"] for axis in axes]).tolist()
+            columns.append(list(map(reported, values, found[f"{name}_covariance"][:, 0].tolist())))
+        samples += [ImuSample(*row) for row in zip(*columns, strict=True)]
+    return sorted(samples, key=attrgetter("time"))
+
+
+def record_of(samples: Sequence[ImuSample]) -> ImuRecord:
+    """Return the samples as arrays; the times begin with 0."""
+    times, rates, forces, quaternions = zip(*samples, strict=True)
+    time = np.array(times) - times[0]
+    rate, force = (np.array([values or NO_VECTOR for values in column]) for column in (rates, forces))
+    if all(quaternions) and not (np.isfinite(rate).all() and rate.any()):
+        world_from_imu = Rotation.from_quat(quaternions)
+        turns = (world_from_imu[:-1].inv() * world_from_imu[1:]).as_rotvec()
+        rate[:-1] = turns / np.maximum(np.diff(time), LEAST_STEP)[:, None]
+        rate[-1] = rate[-2]
+    return ImuRecord(time, rate, force)
 
 
 def _record(options: argparse.Namespace, say: Say) -> Path:
@@ -173,7 +180,7 @@ def still_phases(record: ImuRecord) -> list[Phase]:
 
     Raises DataError if the samples are too few or not finite, or if the accelerometer does not show one g at rest.
     """
-    time, rate, force, _ = record
+    time, rate, force = record
     for name, measured in (("angular_velocity", rate), ("linear_acceleration", force)):
         if len(time) < 10 or not np.all(np.isfinite(measured)):
             raise DataError(f"{len(time)} IMU samples, must be 10 or more, all with a finite {name}")
@@ -232,39 +239,36 @@ def mounting(record: ImuRecord) -> Mounting:
     return Mounting(rotation.as_quat(canonical=True), np.array((level, level, heading)), bow, len(bows))
 
 
-def check_as_imu(record: ImuRecord, phases: Sequence[Phase], found: Mounting, values: Mapping[str, Any]) -> None:
-    """Raise DataError unless `imu` gives the tilt that each still phase of `record` shows.
+def check_as_imu(
+    samples: Sequence[ImuSample], phases: Sequence[Phase], found: Mounting, values: Mapping[str, Any]
+) -> None:
+    """Raise DataError unless `imu` gives the tilt that each still phase of the samples shows.
 
     found: the mounting. values: of `imu`'s parameters.
     """
     settings = (values[name] for name in ("rate", "gyroscope_range", "accelerometer_range"))
     estimator = TrunkEstimator(found.quaternion.tolist(), *settings)
-    measured = (record.angular_velocity, record.acceleration, record.orientation)
-    columns = [[None] * len(record.time) if values is None else values.tolist() for values in measured]
-    if not np.isfinite(record.angular_velocity).any():
-        columns[0] = [None] * len(record.time)
     ends = {phase.samples.stop - 1: phase for phase in phases}
     problem = ""
-    for k, row in enumerate(zip(record.time.tolist(), *columns, strict=True)):
+    for k, sample in enumerate(samples):
         answer = None
         try:
-            answer = estimator.update(ImuSample(*row))
+            answer = estimator.update(sample)
             problem = "" if answer else problem
         except ParameterError as error:
             problem = problem or f"{error.name} must be {error.expected}"  # the first since the last tilt
-        if k not in ends or record.time[k] < SETTLED:
+        since = sample.time - samples[0].time
+        if k not in ends or since < SETTLED:
             continue
+        when = f"{since:.0f} s after the first sample"
         if answer is None:
-            reason = problem or estimator.settling
-            raise DataError(
-                f"`imu` would give no tilt of these samples {record.time[k]:.0f} s after the first: {reason}"
-            )
+            raise DataError(f"`imu` would give no tilt {when}: {problem or estimator.settling}")
         apart = angle_between(-answer.gravity, estimator.rotation @ ends[k].up)
         if apart > SAME_TILT:
-            source = "the reported orientation" if record.orientation is not None else "the fused orientation"
+            source = "fused" if sample.orientation is None else "reported"
             raise DataError(
-                f"{source}, which `imu` would use, is {math.degrees(apart):.0f} degrees from the accelerometer at rest "
-                f"{record.time[k]:.0f} s after the first sample: check the axes of the IMU's driver"
+                f"the {source} orientation, which `imu` would use, is {math.degrees(apart):.0f} degrees from the "
+                f"accelerometer at rest {when}: check the axes of the IMU's driver"
             )
 
 

@@ -78,3 +78,15 @@ def check_buses(nodes: Nodes) -> None:
             other = owner.setdefault(bus, node)
             if other != node:
                 raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
+
+
+def check_names(nodes: Nodes) -> None:
+    """Raise ParameterError if bridge and compensator of an arm name its joints in different orders.
+
+    Efforts are looked up by name: the motors of two exchanged names would each get the torque of the other.
+    """
+    for node in stages(nodes)[0]:
+        compensator = f"{node.rpartition('/')[0]}/compensator"
+        own, others = (nodes.get(name, {}).get("joint_names") for name in (node, compensator))
+        if own and others and list(own) != list(others):
+            raise ParameterError(f"{node} joint_names", list(own), f"those of {compensator}, {list(others)}")

@@ -34,6 +34,8 @@ HEXADECIMAL = re.compile(r"[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F
 C_NOT_FINITE = re.compile(r"[+-]?(?:inf|infinity|nan(?:\(\w*\))?)", re.IGNORECASE)
 LARGEST_INTEGER = 2**63 - 1
 
+STRING = "tag:yaml.org,2002:str"  # !!str, the one tag that rcl minds
+
 Nodes = dict[str, dict[str, Any]]  # node name -> dotted parameter name -> value
 
 
@@ -153,7 +155,7 @@ class _Reader:
         return self._scalar(name)
 
     def _scalar(self, name: str) -> bool | int | float | str:
-        text, is_quoted = self._next.value, self._next.style in ("'", '"')
+        text, is_quoted = self._next.value, self._next.style in ("'", '"') or self._next.tag == STRING
         if not text and not is_quoted:
             raise ParameterError(name, None, f"given a value, or left out (line {self._line})")
         self._advance()
@@ -209,7 +211,7 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, style='"'))
+_Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(STRING, text, style='"'))
 _Dumper.add_representer(
     list, lambda dumper, items: dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=True)
 )

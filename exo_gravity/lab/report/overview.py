@@ -1,6 +1,7 @@
 """What many trials show together: a table, the trend of each subject over their sessions, and a page with both.
 
-A session is a day. Trials of one subject, arm (real or simulated), mode and support are compared with each other, and with no others.
+A session is a day. Trials of one subject, arm, mode and support, all real or all simulated, are compared with each
+other, and with no others.
 """
 
 import math

@@ -198,7 +198,8 @@ function showBar() {
   write(byId("let-down-hint"), t(off ? "let_down_off" : "let_down_hint"));
   const { on, foreign, seconds } = state.recording;
   byId("light").hidden = !(link.alive && (on || foreign));
-  write(byId("light"), on ? t("recording_light", seconds) : t("recording"));
+  const clock = `${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}`;
+  write(byId("light"), on ? t("recording_light", clock) : t("recording"));
   showSource();
 }
 

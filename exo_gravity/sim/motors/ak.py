@@ -277,7 +277,7 @@ class SimulatedMotor:
         temperature = round(max(-40.0, min(215.0, self.temperature)))
         length = self.firmware.reply_length if joint.wire_format.replies else _FULL_LENGTH
         extra = (temperature, self._error_byte) if length == _FULL_LENGTH else (None, None)
-        reply = joint.wire_format.pack_reply(self._reported, MotorReply(joint.can_id, *readings, *extra))
+        reply = joint.wire_format.pack_reply(self._reported, MotorReply(joint.can_id, *readings, *extra), self.entered)
         return reply + bytes((_BUS_VOLTAGE,)) if length == _FULL_LENGTH - 1 else reply
 
     def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:

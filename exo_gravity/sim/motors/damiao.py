@@ -176,5 +176,5 @@ class DamiaoMotor(SimulatedMotor):
         joint = self.joint
         temperature = round(max(0.0, min(255.0, self.temperature)))
         readings = self._readings(position, velocity)
-        reply = MotorReply(joint.can_id, *readings, temperature, self.error or self.latched, self.entered)
-        return joint.wire_format.pack_reply(joint.spec, reply)
+        reply = MotorReply(joint.can_id, *readings, temperature, self.error or self.latched)
+        return joint.wire_format.pack_reply(joint.spec, reply, self.entered)

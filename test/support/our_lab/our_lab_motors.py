@@ -1,6 +1,6 @@
 """A laboratory's own motor, in its own distribution: what CONTRIBUTING's "Add a motor family" says, and no more.
 
-Its board speaks MIT mode with the torque first, replies on IDs of its own, and says of each reply whether it is on.
+Its board speaks MIT mode with the torque first, and replies with IDs of its own.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class OurFormat(WireFormat):
         values = unpack_fields(spec, int.from_bytes(data, "big"), *ORDER)
         return MotorCommand(**dict(zip(ORDER, values, strict=True)))
 
-    def pack_reply(self, spec: MotorSpec, reply: MotorReply) -> bytes:
+    def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool) -> bytes:
         return state_of(spec, reply) + bytes((reply.temperature or 0, reply.error or 0, reply.motor_id))
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
