@@ -17,8 +17,8 @@ from exo_gravity.core.arm.arm_data import (
     moments_along,
 )
 from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, moments_of
-from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
 from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
 from exo_gravity.core.numbers import Vector
 
 __all__ = [
