@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core import gravity_torque
+from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
@@ -22,7 +23,7 @@ LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
 
 def measure_laws(quick: bool) -> Iterator[Row]:
     """Yield the rows of the law."""
-    arm = settings_of(values_of(COMPENSATOR, {})).arm
+    arm = papers(settings_of(values_of(COMPENSATOR, {})).arm)
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, 4))
     pin, model = pinocchio_model(arm)
     model.gravity.linear = np.array((0.0, 0.0, arm.gravity))

@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from exo_gravity.core import paper_static_torque
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel, papers
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
@@ -335,9 +335,9 @@ def sound() -> Iterator[tuple[str, Compensator, Sequence[float], Sequence[float]
         spring=Spring((2.0, 4.0, 2.0, 1.0)),
         assist=Assist((2.0, 4.0, 2.0, 2.0)),
     )
-    moment, everything = full.arm.first_moment, Lively(replace(full, terms=added, inertial=True), ())
+    moment, everything = papers(full.arm).first_moment, Lively(replace(full, terms=added, inertial=True), ())
     addition = tuple(map(operator.add, SUM.effort, added.assist.max_effort))
-    yield "One-G", Compensator(settings_of()), settings_of().arm.first_moment, NO_TORQUE
+    yield "One-G", Compensator(settings_of()), papers(settings_of().arm).first_moment, NO_TORQUE
     yield "Zero-G, 75 kg", Compensator(full), moment, NO_TORQUE
     yield "with changes of load", Lively(full, (half, settings_of())), moment, NO_TORQUE
     yield "with all terms, assistance, `inertial`", everything, moment, addition
@@ -377,7 +377,7 @@ def caught(
     wearer = Passive(script, pose, release)
     sound = settings_of()
     compensator = Changed(wrong if isinstance(wrong, Settings) and not pose else sound, wrong)
-    moment = sound.arm.first_moment if watched else (0.0,) * 4
+    moment = papers(sound.arm).first_moment if watched else (0.0,) * 4
     trial = OfflineTrial(arm_of(sound, False, moment, (addition,) * 4), script, 1.0, compensator, wearer)
     tripped = math.inf
 

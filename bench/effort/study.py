@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm import ArmModel, papers
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
 from exo_gravity.core.arm.wearer import Wearer
@@ -36,6 +36,7 @@ from exo_gravity.core.compensation.terms.catalogue import (
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.params import SIMULATOR, device_of
 
 from .exertion import MIDDLE, REACH, TASKS, Exertion, measure
@@ -60,7 +61,7 @@ def settings_by_name(base: Settings, coulomb: Sequence[float], viscous: Sequence
     base: of the arm and its wearer. coulomb Nm, viscous Nm s/rad: the friction that the terms know, (4,) each.
     """
     known = Friction(coulomb=coulomb, viscous=viscous)
-    least = least_inertia(links_of(base.robot_by_mass or base.loaded))
+    least = least_inertia(links_of(papers(base.robot_by_mass or base.loaded)))
     soft = [min(20.0, SOFT * inertia / (4.0 * DELAY**2)) for inertia in least]  # Nm/rad
     terms = {
         "friction": TermSettings(friction=replace(known, share=0.4)),
@@ -95,7 +96,7 @@ class Study:
         nodes = load(params or packaged_config("sim.yaml"))
         arm = read_arm(nodes, "/right")
         base = arm.settings()
-        worn = Wearer(BODY_MASS).on_links(base.loaded.length)
+        worn = Wearer(BODY_MASS).on_links(papers(base.loaded).length)
         base = replace(base, wearer_mass=worn.mass.tolist(), wearer_cog=worn.cog.tolist())
         base = replace(base, use_imu=False, max_effort=[motor.peak_effort for motor in arm.motors])
         simulator = dict(node_values(nodes, "/right/simulator", SIMULATOR))
@@ -116,7 +117,8 @@ class Study:
         grid = np.array(list(product((0.0,), *(np.linspace(low, high, count) for low, high, count in bounds))))
         config, wearer = device_of(self.simulator).arm.config, self.settings[ONE_G]
         assert wearer is not None
-        own = ArmModel(wearer.loaded.length, wearer.wearer_cog, wearer.wearer_mass)
+        assert isinstance(config, ArmConfig)
+        own = ArmModel(papers(wearer.loaded).length, wearer.wearer_cog, wearer.wearer_mass)
         most = np.abs(gravity_torque(own, grid)).max(axis=0)
         true = config.links.with_wearer(config.wearer_mass, config.wearer_cog)
         for name, settings in self.settings.items():
@@ -128,7 +130,7 @@ class Study:
                 left = gravity_torque(true, poses)
                 if settings:
                     limit = np.array(settings.max_effort)
-                    left -= np.clip(gravity_torque(settings.arm, poses), -limit, limit)
+                    left -= np.clip(gravity_torque(papers(settings.arm), poses), -limit, limit)
                 needed = np.maximum(needed, np.abs(left) + config.coulomb_friction)
             for strength in STRENGTHS:
                 reached = np.all(needed <= np.maximum(LEAST, strength * most), axis=1)

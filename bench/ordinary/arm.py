@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
@@ -128,8 +129,8 @@ class OrdinaryArm:
         self.result = Result()
         arm = read_arm(load(packaged_config("sim.yaml")), "/right")
         settings = replace(arm.settings(), tilt_timeout=TILT_TIMEOUT)
-        robot = settings.robot_by_mass
-        assert robot
+        assert settings.robot_by_mass
+        robot = papers(settings.robot_by_mass)
         board = MIT_V3 if is_v3 else MIT
         motors = [replace(motor, spec=board.ranged(motor.spec), wire_format=board) for motor in arm.motors]
         coulomb, stribeck = equipment.friction

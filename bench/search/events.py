@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.wearer import Wearer
 
 from .stage import Stage
@@ -61,7 +62,7 @@ def max_effort(stage: Stage, share: float) -> None:
 
 def body_mass(stage: Stage, mass: float) -> None:
     """Set the mass of the wearer's body, in kg, as the operator would."""
-    load = Wearer(mass).on_links(stage.settings.loaded.length)
+    load = Wearer(mass).on_links(papers(stage.settings.loaded).length)
     stage.change(wearer_mass=load.mass.tolist(), wearer_cog=load.cog.tolist())
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import can
 
+from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
@@ -121,7 +122,7 @@ class Stage:
         settings = replace(configured.settings(), tilt_timeout=TILT_TIMEOUT, payload_mass=case.payload)
         robot = settings.robot_by_mass
         assert robot
-        self.load = Wearer(BODY_MASS).on_links(robot.length)
+        self.load = Wearer(BODY_MASS).on_links(papers(robot).length)
         worn = {"wearer_mass": self.load.mass.tolist(), "wearer_cog": self.load.cog.tolist()}
         mode = "zero_g" if case.worn else "one_g"
         self.settings: Settings = replace(settings, mode=mode, support=1.0, **worn)

@@ -15,6 +15,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
+from exo_gravity.core.numbers import Vector
 from exo_gravity.sim import ArmConfig, SimulatedArm, VirtualWearer
 from exo_gravity.sim import arm as arms
 
@@ -31,6 +32,8 @@ class StrappedArm(SimulatedArm):
 
     gap: m, the largest between the robot and the wearer's arm at a cuff so far.
     """
+
+    config: ArmConfig
 
     def __init__(self, config: ArmConfig, rhythm: np.ndarray = RHYTHM) -> None:
         self._worn = replace(
@@ -52,7 +55,7 @@ class StrappedArm(SimulatedArm):
 
         wearer.torque = torque  # type: ignore[method-assign]
 
-    def reset(self, theta: Sequence[float]) -> None:
+    def reset(self, theta: Vector) -> None:
         """Put both arms at rest at `theta`, (4,) rad."""
         super().reset(theta)
         self.data.qpos[7:] = theta

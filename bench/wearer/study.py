@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm import STANDARD_GRAVITY, papers
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
@@ -218,7 +218,7 @@ def only(curve: WearerCurve, keep: np.ndarray) -> WearerCurve:
 def baselines(settings: Settings, time: np.ndarray, joints: Any, tilt_at: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the first-order observer's torque (n, 4), and gravity minus the motors'."""
     position, velocity, effort = joints
-    arm = settings.loaded.with_wearer(settings.wearer_mass, settings.wearer_cog)
+    arm = papers(settings.loaded).with_wearer(settings.wearer_mass, settings.wearer_cog)
     tilts = [tilt_at(now) for now in time.tolist()]
     magnitude = np.array([tilt.magnitude for tilt in tilts])[:, None]
     static = magnitude * gravity_torque(arm, position, np.array([tilt.direction for tilt in tilts])) - effort

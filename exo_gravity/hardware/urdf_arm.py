@@ -268,8 +268,8 @@ class UrdfArm:
             if len(following) == 1:
                 ways.append(places[joint].actInv(places[following[0]].translation))
                 continue
-            hand = self._hand and model.frames[model.getBodyId(self._hand)]
-            is_held = hand and hand.parentJoint == joint
+            hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
+            is_held = hand is not None and hand.parentJoint == joint
             ways.append(hand.placement.translation.copy() if is_held else np.zeros(3))
         return ways
 

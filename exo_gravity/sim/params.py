@@ -116,7 +116,7 @@ def simulator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     if URDF_FILE.name not in given:
         return tuple(table_for(SIMULATOR, given))
     table = [param for param in SIMULATOR if param.name not in PAPER]
-    of_urdf = {"default": [0.0] * JOINT_COUNT, "description": "joint stops; zeros: the URDF's limits"}
+    of_urdf: dict[str, Any] = {"default": [0.0] * JOINT_COUNT, "description": "joint stops; zeros: the URDF's limits"}
     shared = [replace(param, **of_urdf) if param.name in STOPS else param for param in table]
     return tuple(table_for((*shared, *URDF), given))
 

@@ -18,7 +18,6 @@ from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import OFF
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
@@ -26,7 +25,7 @@ from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.motors import simulated
 
-from ..support.simulated_device import SPECS, command, frame, make_device
+from ..support.simulated_device import OFF, SPECS, command, frame, make_device
 
 GROUP = "239.74.163.2"
 channels = itertools.count()

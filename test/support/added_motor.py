@@ -16,6 +16,7 @@ from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
+from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.sim.virtual_arm import VirtualArm
 
@@ -30,11 +31,14 @@ def carried(given: dict[str, Any]) -> dict[str, Any]:
     check_bridge(values["rate"], motors, limits)
     device = device_of(values_of(SIMULATOR, given))
 
+    config = device.arm.config
+    assert isinstance(config, ArmConfig)
+
     class Holding:
         """Asks for what holds the device where it is."""
 
         def efforts(self, latest: float) -> Efforts:
-            held = gravity_torque(device.arm.config.links, device.arm.positions)
+            held = gravity_torque(config.links, device.arm.positions)
             return Efforts(tuple(held), arm.now, damped=False, held=False)
 
         def take(self, now: float, samples: Any) -> None:

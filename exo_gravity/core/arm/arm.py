@@ -17,6 +17,7 @@ from exo_gravity.core.arm.arm_data import (
     moments_along,
 )
 from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, moments_of
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
 from exo_gravity.core.numbers import Vector
 
@@ -33,6 +34,7 @@ __all__ = [
     "ArmModel",
     "ModelError",
     "moments_along",
+    "papers",
 ]
 
 
@@ -70,3 +72,10 @@ class ArmModel(ArmData):
     def massless(self, gravity: float) -> "ArmModel":
         """Return an arm with these links, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
         return type(self).from_moments(self.length, NO_TORQUE, gravity=gravity)
+
+
+def papers(arm: Arm) -> ArmModel:
+    """Return `arm`, for what is only known of the paper's. Raises TypeError for another."""
+    if not isinstance(arm, ArmModel):
+        raise TypeError(f"this takes the paper's arm, got {type(arm).__name__}")
+    return arm

@@ -295,7 +295,7 @@ def _settings_of(
     values: Mapping[str, Any], side: str, robot: Arm, wearer: tuple[Sequence[float], Sequence[float]], **own: Any
 ) -> Settings:
     mass, cog = wearer
-    errors = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
+    errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
     sized = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
     return Settings(
         side=side,

@@ -150,13 +150,13 @@ class Limits:
         object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
         if any(self.largest_moment) and len(names) != JOINT_COUNT:
             raise ParameterError("largest_moment", list(self.largest_moment), "zeros for another arm than the paper's")
+        if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
+            expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
+            raise ParameterError("position_max", list(self.position_max), expected)
         columns = zip(names, self.position_min, self.home, self.position_max, self.home_tolerance, strict=True)
         for name, low, home, high, tolerance in columns:
             if not low - tolerance <= home <= high + tolerance:
                 raise ParameterError(f"home of {name}", home, f"within its limits, {low:g} to {high:g} rad")
-        if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
-            expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
-            raise ParameterError("position_max", list(self.position_max), expected)
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
         """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""

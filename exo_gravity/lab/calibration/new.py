@@ -86,7 +86,8 @@ def write_new(new: NewArm, output: Path) -> list[str]:
         raise ParameterError("motors and ids", [*new.motors, *new.ids], expected)
     arm = UrdfArm(text, names, new.hand)
     ranges = [known[name] for name in names]
-    poses = np.random.default_rng(0).uniform(*np.transpose(ranges), (POSES, len(names)))
+    low, high = np.transpose(ranges)
+    poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
     upright = Tilt.of("left")
     needed = np.max(np.abs([arm.torque(pose, upright) for pose in poses.tolist()]), axis=0)
     rated = [MOTORS[motor].rated_torque for motor in new.motors]

@@ -10,7 +10,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm import ArmModel, papers
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
@@ -62,7 +62,7 @@ def request_of(s: Settings) -> Request:
     """Return what the motors must be able to hold with these settings."""
     support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
     tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return s.loaded, (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
+    return papers(s.loaded), (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
 
 
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
