@@ -251,7 +251,7 @@ class TrunkEstimator:
         dt = time - self._time
         if not math.isfinite(time) or -TUNING.longest_gap <= dt <= 0.0:  # far in the past: another clock, like a gap
             raise ParameterError("stamp", time, "a finite number, later than the last stamp")
-        self._equal.check(time, values, quaternion)
+        self._equal.check(time, values, quaternion if dt <= TUNING.longest_gap else None)
         self._time = time
         try:
             self._seldom.check(dt)
