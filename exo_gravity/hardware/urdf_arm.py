@@ -269,8 +269,10 @@ class UrdfArm:
                 ways.append(places[joint].actInv(places[following[0]].translation))
                 continue
             hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
-            is_held = hand is not None and hand.parentJoint == joint
-            ways.append(hand.placement.translation.copy() if is_held else np.zeros(3))
+            if hand is not None and hand.parentJoint == joint:
+                ways.append(hand.placement.translation.copy())
+            else:
+                ways.append(np.zeros(3))
         return ways
 
 

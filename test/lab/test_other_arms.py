@@ -43,7 +43,7 @@ def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
 
     recording = trial.run(look)
     assert not trial.trouble and not trial.events
-    released = next(step.start for step in recording.script if step.action == "hold")
+    released = next(step.start for step in recording.steps if step.action == "hold")
     during = (recording.time > released + 0.5) & (recording.time < released + 2.9)
     positions, commands = recording.position[during], recording.command[during]
     assert np.ptp(positions, axis=0).max() < HELD

@@ -296,7 +296,7 @@ def _settings_of(
 ) -> Settings:
     mass, cog = wearer
     errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
-    sized = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
+    sized: list[Any] = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
     return Settings(
         side=side,
         robot=robot,
