@@ -222,7 +222,9 @@ def test_with_its_configuration_cable_a_v3_board_reports_and_ignores_commands():
 
 
 def test_a_firmware_of_other_boards_is_refused_by_name():
-    with pytest.raises(ParameterError, match=r"firmware\.variant = 'vendor': must be one of usual, v3, v3_2, v3_query for"):
+    with pytest.raises(
+        ParameterError, match=r"firmware\.variant = 'vendor': must be one of usual, v3, v3_2, v3_query for"
+    ):
         SimulatedMotor(V3_JOINT, FIRMWARES["vendor"])
 
 
