@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from hashlib import blake2b
 from importlib.metadata import distributions
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from rich.console import Console
 
@@ -63,11 +63,12 @@ def play(
             if outcome.problem:
                 failed.append(f"{outcome.item}: {outcome.problem}")
                 continue
-            _keep(kept[outcome.item], outcome.result)
-            results[outcome.item] = outcome.result
+            result = cast(Result, outcome.result)
+            _keep(kept[outcome.item], result)
+            results[outcome.item] = result
             rest = (time.monotonic() - begin) / number * (len(left) - number)
             head = f"{len(results)} of {len(items)}, {rest / 60.0:.0f} minutes left"
-            console.print(f"{head}: {told(outcome.result)}", markup=False, soft_wrap=True)
+            console.print(f"{head}: {told(result)}", markup=False, soft_wrap=True)
     except KeyboardInterrupt:
         console.print("stopped: the next run goes on here")
         sys.exit(130)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -56,13 +56,13 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
 
 
 def _speeds(
-    name: str, size: float, ours: Callable[[], object], peers: dict[str, Callable[[], object]], repeats: int
+    name: str, size: float, ours: Callable[[], object], peers: Mapping[str, Callable[[], object]], repeats: int
 ) -> Iterator[Row]:
     """Yield a row for each peer: MB of messages in a second, of which there are `size` MB."""
     first, *others = seconds_in_turns((ours, *peers.values()), repeats)
     for peer, seconds in zip(peers, others, strict=True):
-        speeds = [[size / taken for taken in column] for column in (first, seconds)]
-        yield Row.of_values(f"{name}: {peer}", *speeds, "MB/s", more_is_better=True)
+        fast, other = ([size / taken for taken in column] for column in (first, seconds))
+        yield Row.of_values(f"{name}: {peer}", fast, other, "MB/s", more_is_better=True)
 
 
 def _size(bag: Path) -> float:

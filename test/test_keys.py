@@ -49,7 +49,7 @@ VOCABULARY: dict[tuple[str, str], Iterable[str]] = {
     ("imu", "state"): vocabulary.ImuState,
     ("simulator", "warnings"): vocabulary.SimulatorWarning,
 }
-PARAMETERS = {"position_min", "position_max"}
+PARAMETERS = {"position_min", "position_max", "use_sim_time"}
 BESIDE = ("simulator", "robot_model", "panel", "calibrator")  # nodes whose states are of one enumeration
 
 

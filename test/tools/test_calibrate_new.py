@@ -12,6 +12,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.inputs.ros_yaml import dumped
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools.calibrate import main
@@ -30,7 +31,7 @@ def test_the_written_file_carries_the_arm_on_the_simulated_device(tmp_path, caps
     shipped = yaml.safe_load(packaged_config("three_joints.yaml").read_text())["/right/simulator"]["ros__parameters"]
     bus = content["/right/can_bridge"]["ros__parameters"]["can"]
     simulator = {**shipped, "can": {**bus}, "direction": [1, 1, 1], "zero": [0.0, 0.0, 0.0]}
-    output.write_text(yaml.safe_dump({**content, "/right/simulator": {"ros__parameters": simulator}}))
+    output.write_text(dumped({**content, "/right/simulator": {"ros__parameters": simulator}}))
     script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.6, 0.5, 0.8], "over": 3.0}, {"hold": 3.0}]})
     (trial,) = simulated_trials(output, script)
     recording = trial.run()

@@ -127,10 +127,10 @@ def test_a_packaged_file_keeps_every_line_and_still_describes_its_arms(tmp_path:
 SHARED = "/a/x:\n  ros__parameters: &both\n    zero: [0.0]\n/b/x:\n  ros__parameters: *both\n"
 
 
-@pytest.mark.parametrize(("old", "node"), [(SHARED, "/b/x"), (OLD, "/left/can_bridge")])
-def test_a_value_that_other_entries_share_and_a_node_that_the_file_lacks_are_refused(tmp_path, old, node) -> None:
-    with pytest.raises(ParameterError, match=node):
-        written(tmp_path, Change(node, "zero", [1.0]), old=old)
+@pytest.mark.parametrize(("old", "named"), [(SHARED, "&both"), (OLD, "/left/can_bridge")])
+def test_a_value_that_other_entries_share_and_a_node_that_the_file_lacks_are_refused(tmp_path, old, named) -> None:
+    with pytest.raises(ParameterError, match=named):
+        written(tmp_path, Change("/b/x" if old == SHARED else "/left/can_bridge", "zero", [1.0]), old=old)
     assert not (tmp_path / "new.yaml").exists()
 
 

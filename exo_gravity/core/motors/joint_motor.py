@@ -225,8 +225,9 @@ def source_of_bus(interface: str, channel: str) -> Source:
     """Return whether the motors on a bus are real: the values of `can.interface` and `can.channel`."""
     if interface in SIMULATED_BUSES:
         return Source.SIMULATED
-    is_virtual = any(name.strip().startswith(VIRTUAL_CAN) for name in channel.split(","))
-    return Source.UNKNOWN if is_virtual else Source.REAL
+    names = [name.strip() for name in channel.split(",")]
+    is_unknown = any(not name or name.startswith(VIRTUAL_CAN) for name in names)
+    return Source.UNKNOWN if is_unknown else Source.REAL
 
 
 def buses_of(channel: str, options: Mapping[str, Any], count: int) -> dict[str, tuple[list[int], dict[str, Any]]]:

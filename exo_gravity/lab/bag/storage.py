@@ -39,9 +39,8 @@ MAGIC = b"\x89MCAP0\r\n"
 ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
-HEAD = np.dtype(  # of a message's record; the serialised message follows
-    {"names": ["size", "channel", "time"], "formats": ["<u8", "<u2", "<u8"], "offsets": [1, 9, 15], "itemsize": 31}
-)
+_FIELDS: Any = {"names": ["size", "channel", "time"], "formats": ["<u8", "<u2", "<u8"], "offsets": [1, 9, 15]}
+HEAD = np.dtype({**_FIELDS, "itemsize": 31})  # of a message's record; the serialised message follows
 LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most

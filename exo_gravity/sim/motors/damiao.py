@@ -15,6 +15,7 @@ source is public (umeow0716/damiao_firmware); no motor was met:
 
 import struct
 from dataclasses import replace
+from typing import Any
 
 from exo_gravity.core.motors.damiao import (
     CLEAR_ERROR,
@@ -152,7 +153,8 @@ class DamiaoMotor(SimulatedMotor):
         """Set a register until the next power cycle; only those whose value changes what the motor does."""
         fields = {PMAX: "position_range", VMAX: "velocity_range", TMAX: "torque_range"}
         if number in fields:
-            self.joint = replace(self.joint, spec=replace(self.joint.spec, **{fields[number]: value}))
+            changed: dict[str, Any] = {fields[number]: value}
+            self.joint = replace(self.joint, spec=replace(self.joint.spec, **changed))
         elif number == TIMEOUT:
             self.firmware = replace(self.firmware, timeout=value * TICK)
         elif number == CTRL_MODE:

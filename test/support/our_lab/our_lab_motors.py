@@ -65,8 +65,10 @@ class OurFormat(WireFormat):
         return state_of(spec, reply) + bytes((reply.temperature or 0, reply.error or 0, reply.motor_id))
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
-        readings = unpack_fields(spec, int.from_bytes(data[:5], "big"), "position", "velocity", "torque")
-        return MotorReply(motor_id, *readings, data[5], data[6])
+        position, velocity, torque = unpack_fields(
+            spec, int.from_bytes(data[:5], "big"), "position", "velocity", "torque"
+        )
+        return MotorReply(motor_id, position, velocity, torque, data[5], data[6])
 
     def error_text(self, error: int) -> str:
         return f"see page {error} of our manual"
