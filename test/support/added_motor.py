@@ -33,12 +33,13 @@ def carried(given: dict[str, Any]) -> dict[str, Any]:
 
     config = device.arm.config
     assert isinstance(config, ArmConfig)
+    links = config.links
 
     class Holding:
         """Asks for what holds the device where it is."""
 
         def efforts(self, latest: float) -> Efforts:
-            held = gravity_torque(config.links, device.arm.positions)
+            held = gravity_torque(links, device.arm.positions)
             return Efforts(tuple(held), arm.now, damped=False, held=False)
 
         def take(self, now: float, samples: Any) -> None:
