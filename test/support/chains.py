@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+import pinocchio as pin
 
 LEAST = math.radians(20.0)  # between the axes of neighbouring joints
 
 
-def random_chain(count: int, seed: int) -> tuple[str, list[str]]:
-    """Return the URDF of an arm with `count` turning joints, and their names; the last link is `hand`."""
+def random_chain(count: int, seed: int, zero: Sequence[float] = ()) -> tuple[str, list[str]]:
+    """Return the URDF of an arm with `count` turning joints, and their names; the last link is `hand`.
+
+    zero: rad, where the angles of the same arm without `zero` are 0 here; () where they are 0 there.
+    """
     random = np.random.default_rng(seed)
     names = [f"joint_{n}" for n in range(count)]
     parts, parent, last = ['<link name="base"/>'], "base", np.zeros(3)
-    for name in names:
+    for name, angle in zip(names, zero or [0.0] * count, strict=True):
         while True:
             axis = random.normal(size=3)
             axis /= np.linalg.norm(axis)
@@ -22,10 +27,11 @@ def random_chain(count: int, seed: int) -> tuple[str, list[str]]:
                 break
         last, child = axis, f"link_of_{name}"
         middle = f"{child}_mount"
+        place, rpy = random.uniform(-0.2, 0.2, 3), random.uniform(-3, 3, 3)
         parts += [
             joint(f"{name}_mount", "fixed", parent, middle, random.uniform(-0.05, 0.05, 3), random.uniform(-3, 3, 3)),
             f'<link name="{middle}">{inertial(random, 0.1)}</link>',
-            joint(name, "revolute", middle, child, random.uniform(-0.2, 0.2, 3), random.uniform(-3, 3, 3), axis),
+            joint(name, "revolute", middle, child, place, turned(rpy, axis, angle), axis),
             f'<link name="{child}">{inertial(random, 0.6)}</link>',
         ]
         parent = child
@@ -42,6 +48,12 @@ def joint(
     return (
         f'<joint name="{name}" type="{kind}">{origin}<parent link="{parent}"/><child link="{child}"/>{turning}</joint>'
     )
+
+
+def turned(rpy: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
+    """Return the rpy of a joint's origin after it is turned about its axis."""
+    matrix = pin.rpy.rpyToMatrix(rpy) @ pin.AngleAxis(angle, axis).toRotationMatrix()
+    return pin.rpy.matrixToRpy(matrix)
 
 
 def inertial(random: np.random.Generator, most: float) -> str:
