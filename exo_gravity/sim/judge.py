@@ -39,11 +39,14 @@ MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated de
 class Driven:
     """What motors did to an arm on which no hand was, each by the motor that did most.
 
-    A stretch is motion beyond SLOW in the direction of the motor's whole torque, that of its damping included, but for
-    COAST; a WEAK torque drives nothing. speed: rad/s that `joint` (1..n) gained within a stretch, at `time` as in the
-    records; what it had before is not the motor's, and a stretch of LITTLE energy has none. energy: J in one stretch,
-    and power: W in it. damping: torque by damping alone as a multiple of the motor's rated torque, also while a hand is
-    on the arm.
+    In a stretch a joint moves faster than SLOW in the direction of its motor's whole torque, that of damping included;
+    gaps of up to COAST belong to it. A WEAK torque drives nothing.
+
+    speed: rad/s gained within a stretch; 0 in one of LITTLE energy.
+    energy: J in one stretch.
+    power: W in a stretch.
+    damping: torque of damping alone as a multiple of the motor's rated torque, also while a hand is on the arm.
+    joint, time: which joint (1..n) gained that speed, and when, as in the records.
     """
 
     speed: float = 0.0

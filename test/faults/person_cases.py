@@ -31,7 +31,7 @@ from .rig import Rig
 from .rigs import SignCheckRig, WearerRig, variant
 
 GAP = 4.0  # s for which the bridge stands still
-BLIND = 30.0  # s, longer than motors that do not reply are waited for
+BLIND = 30.0  # s, longer than a let-down waits for motors that do not reply
 LAP = [0.1, 0.5, 0.5, 1.3]  # rad
 ELBOW_TURN = 2.0 * math.pi / 6.0  # rad, of the output for one turn of the rotor
 OBSERVED = 4.0  # s

@@ -104,7 +104,7 @@ class JointDescent:
         self._blind += dt
         if self._blind > DESCENT.blind_hold:
             self._approach(0.0, max(DESCENT.min_fade_rate, abs(self._carried)) / DESCENT.blind_fade_time, dt)
-        self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * dt)
+        self._raise_damping(dt)
         self._is_rising = True
 
     def step(self, dt: float, velocity: float) -> None:
@@ -136,13 +136,16 @@ class JointDescent:
         """Bring the torque nearer to `effort` (Nm), by at most `rate` (Nm/s)."""
         self.effort = limited(effort, self.effort, min(MAX_EFFORT_RATE, rate) * dt)
 
+    def _raise_damping(self, dt: float, share: float = 1.0) -> None:
+        """Raise the damping by this share of the full rate."""
+        self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * share * dt)
+
     def _step_damping(self, dt: float, excess: float) -> None:
         if self._is_rising:
-            self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * dt)
+            self._raise_damping(dt)
             self._is_rising = self.damping < DAMPING
         elif excess:
-            rise = DESCENT.damping_rate * min(1.0, excess / self._speed)
-            self.damping = min(DAMPING, self.damping + rise * dt)
+            self._raise_damping(dt, min(1.0, excess / self._speed))
         elif self.effort == 0.0:
             self.damping *= math.exp(-dt / DESCENT.damping_fade)
             if self.damping < DESCENT.min_damping:

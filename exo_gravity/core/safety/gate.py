@@ -59,8 +59,8 @@ class HangingArm:
     #: Nm asked for on a joint: gravity of a few degrees, the whole arm of a wearer of 75 kg included. Hanging, friction
     #: alone holds it. A trunk's IMU that is mounted otherwise than it is set asks for more
     torque: float = 1.5
-    #: of `max_effort`, where that is more: a worn arm of 75 kg lies against a trunk that leans by 0.12 rad, and 2.1 Nm
-    #: are asked for at its abduction
+    #: of `max_effort`, which counts where it is more. The arm of a wearer of 75 kg that rests against a trunk leaning
+    #: by 0.12 rad needs 2.1 Nm in abduction
     share: float = 1.0 / 3.0
     moved: float = 0.06  #: rad that a joint may turn after it was confirmed: a wearer breathes, and hangs on
     valid: float = 10.0  #: s for which the confirmation holds

@@ -1,4 +1,4 @@
-"""What the safety machine watches besides the motors' readings: whether the arm is at rest, and how old efforts are."""
+"""What the safety machine monitors besides the motors' readings: whether the arm is at rest, and the efforts' age."""
 
 import math
 from collections.abc import Sequence

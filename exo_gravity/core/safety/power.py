@@ -33,8 +33,8 @@ class PowerTuning:
     torque: float = 0.2  #: Nm, smoothed, from which on it is on; less cannot throw an arm when it is switched off
     smoothing: float = 0.05  #: s, time constant
     read_time: float = 0.2  #: s without torque that show a motor off; an arm that sinks under damping shows it sooner
-    #: s of silence after which an operator may have cut its power: nobody releases an emergency stop sooner. A supply
-    #: that dips is back by then.
+    #: s of silence after which an operator may have cut its power: nobody releases an emergency stop sooner, and a
+    #: brownout is over by then
     cut: float = 0.2
     off_share: float = 0.25  #: of the torque asked for, less of which a motor gives that does not deliver: it is off
     told_off: int = 2  #: replies in a row that say that a motor is off; one may be wrong, or older than its ENTER

@@ -34,8 +34,8 @@ class TiltLimits:
     """What a message of the tilt may say, and how long it is used."""
 
     speed: float = 5.0  #: rad/s, faster than a trunk can tilt
-    #: rad, by which a tilt may lie off a direction that follows the tilts at `speed`: noise stays within it, a tilt
-    #: that creeps with many small jumps leaves it as one that jumps
+    #: rad, by which a tilt may deviate from a reference direction that follows the tilts no faster than `speed`. Noise
+    #: stays within it; neither a jump nor many small ones in a row do
     jump: float = 0.1
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
     #: gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages,
@@ -71,7 +71,7 @@ class TiltInput:
         self._in_time = -math.inf  # s, when the newest one that came in time was measured
         self._arrival = -math.inf
         self._lead = 0.0  # s, of the stamps
-        self._followed = self._tilt.direction  # (3,), follows the tilts no faster than a trunk
+        self._reference = self._tilt.direction  # (3,), follows the tilts no faster than a trunk tilts
         self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
         self._refusal = ""  # why the newest one was refused; contains no measured value
 
@@ -150,13 +150,13 @@ class TiltInput:
         lead = max(lead, -age)
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
-        way, reach = angle_between(tilt.direction, self._followed), TILT.speed * max(0.0, measured - self._time)
+        way, reach = angle_between(tilt.direction, self._reference), TILT.speed * max(0.0, measured - self._time)
         if way > TILT.jump + reach:
             expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last ones"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
         share = 1.0 if way <= reach else reach / way
-        x, y, z = (old + share * (new - old) for new, old in zip(tilt.direction, self._followed, strict=True))
-        self._followed = x, y, z
+        x, y, z = (old + share * (new - old) for new, old in zip(tilt.direction, self._reference, strict=True))
+        self._reference = x, y, z
         self._tilt, self._angular_velocity = tilt, angular_velocity
         self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
         if now - measured <= self.timeout:

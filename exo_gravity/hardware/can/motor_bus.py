@@ -55,7 +55,7 @@ CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint,
-HOLD_STEP = 0.01  # s for which it does so at once, at most: after a stall of the loop the torque must not step
+HOLD_STEP = 0.01  # s of this motion at most for each reply: after a stall of the loop the torque must not step
 FOREIGN_COMMAND = "foreign command"
 AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
 
