@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rules of this repository that no linter knows: prints what breaks them, and exits with 1 if anything does.
 
 Documents: links, paths and quoted messages exist; tables, safety case and site are complete. Code: a docstring in every

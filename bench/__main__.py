@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench [--quick] [--only PARTS] [--output build/bench.json]: print one table and write it as JSON.
 
 PARTS are some of law,loop,work,recordings,starts. It takes 20 minutes on two quiet cores. A disturbed run is repeated

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A peer for the loop: the same law on the same bus in one process, without ROS, safety machine or messages.
 
     python -m bench.bare_python PARAMS NAMESPACE RATE

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A peer for the loop: the same messages between two bare rclpy nodes, on the same bus, with the same pacing.
 
     python -m bench.bare_rclpy bridge|compensator PARAMS NAMESPACE RATE

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.cohort [--recordings 200]: what `report` of a folder takes, and what becomes of bad recordings.
 
 Generates trials of 20 subjects, a day each, of which one is no recording and one is cut short; reports them twice, and

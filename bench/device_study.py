@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the studies of random devices share: their options, and the table of what was shown against its limits."""
 
 from __future__ import annotations

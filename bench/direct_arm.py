@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One arm of a parameter file without its nodes: its motors, its bus and its law, for an upright trunk."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.imu_report [FOLDER] [--write FILE]: the trunk's inclination error here, by VQF and by imufusion.
 
 Writes one table as Markdown: for each trial the error in degrees, RMS (largest), over the samples in motion. FOLDER

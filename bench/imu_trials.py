@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The trunk estimator and its peers on recorded trials with an optical reference (BROAD; see test/data/broad)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python on the same arm and poses."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An independent listener on a udp_multicast bus: it records every frame with the kernel's time stamp.
 
     python -m bench.listener CHANNEL PORT FILE

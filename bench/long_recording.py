@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.long_recording [--minutes 60]: time and memory of reading a long recording of two arms at 500 Hz.
 
 Prints a table in Markdown: all samples, one of 10, and the whole report. Exit code 1 if any takes more than 1.5 GB.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One run of a loop from bus to bus, timed by an independent listener.
 
 The kinds of loop: the package's nodes, the same nodes with SCHED_FIFO threads, can_bridge and compensator of an arm in

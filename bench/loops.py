@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows of the loop: every rate, against the same law without ROS and on bare rclpy."""
 
 from __future__ import annotations

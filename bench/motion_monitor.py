@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`make study NAME=motion-monitor`: what the monitor of unexplained torque sees, and its cost, as in docs/safety.md.
 
 Offline, with the simulated arm, its CAN frames, the safety machine with its own limits and the compensator, judged by

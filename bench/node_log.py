@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The log of all nodes as it grows, for a program that waits for one of its lines."""
 
 from __future__ import annotations

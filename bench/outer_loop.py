@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An outer loop for the benchmark: assist efforts at 500 Hz with every term on, then neither, in turns.
 
     python -m bench.outer_loop NAMESPACE TURNS SECONDS

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Plays the parts of a study on all cores, says what is left, and keeps what is finished.
 
 A study that was stopped goes on where it was, unless the code or an installed package has changed since.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The path of a torque, counted: from the CAN frame that holds an encoder reading to the frame that holds the torque.
 
     python -m bench.path [--hops]

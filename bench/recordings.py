@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows of recordings: reading against rosbags and mcap's own reader, a report, many at once against one by one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows of the benchmark, each with our figure and that of a peer or a limit; their table and file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.terms_loop [--turns 6] [--seconds 5]: what assist efforts and all terms cost the loop at 500 Hz.
 
 One run of the package's nodes. The terms and an outer loop at 500 Hz are on and off in turns, so that other load on the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The timing of a loop from the frames on its bus: latency from reply to torque, cycle spacing, missed cycles.
 
 The content of a command shows which replies it answers. The arm moves to and fro, so that its angles change by a few

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows of the tools: training the ANFIS, an offline trial against real time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The documentation as a site: `make docs` builds it with Sphinx, and every warning is an error.
 
 The pages are the Markdown files that a git host shows too. The whole repository is Sphinx's source folder, so that

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/frames.png: the arm's frames and joint axes by Table 1 of the paper, hanging and in one pose.
 
 `python docs/frames.py` renews it. Needs the extra `report`.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/states.svg: the states of an arm, from the machine's table of transitions.
 
 `python docs/states.py` renews it. A transition without a route, a route without a transition, and an arrow that passes

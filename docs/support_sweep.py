@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/support_sweep.png: `support` increases from 0 to 1 under a wearer's passive arm on the simulated device.
 
 A hand moves the arm to a pose and holds it there. Once a second `support` increases by 0.05, as with `ros2 param set`.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Writes the tables of the documents from the declarations in the code.
 
 `python docs/tables.py` renews them. With `--check` it changes nothing, names each table that differs, and exits with 1.

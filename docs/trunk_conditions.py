@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Prints what the benefit of `inertial` depends on: the figures of docs/imu.md that are not in its first two tables.
 
 `python docs/trunk_conditions.py` takes about ten minutes and does not need ROS.

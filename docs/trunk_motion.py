@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/trunk_motion.png and writes the table of docs/imu.md: an arm on the back of a wearer who moves.
 
 The simulated arm is brought to a pose and let go; then the trunk bows, leans, walks or sits down hard. Everything that

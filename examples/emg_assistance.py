@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An outer loop: assists the right elbow in proportion to the wearer's muscle signals. Needs ROS.
 
 Subscribes to /emg (std_msgs/Float32MultiArray, biceps and triceps in V, sample after sample, 1,000 a second) and

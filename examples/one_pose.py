@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque that holds an arm against gravity in one pose: upright and bowed, without and with the wearer's arm.
 
 A plot follows; with a file's name (.png, .pdf, .svg) it is written there instead. The core alone needs no matplotlib.

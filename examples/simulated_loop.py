@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Gravity compensation of a simulated arm, without ROS: read the motors, compute the torque, command it.
 
 A plot shows how the torque rises and the arm stays; with a file's name (.png, .pdf, .svg) it is written there instead.

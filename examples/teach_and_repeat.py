@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Teach and repeat on a simulated arm, without ROS: a hand leads the weightless arm, then a soft spring leads it back.
 
 The law carries the arm; the term `spring` pulls it along the recorded path with little torque, so that a person in it

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Feed-forward gravity compensation for a worn upper-body exoskeleton (ROS 2)."""
 
 import os

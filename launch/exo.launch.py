@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Starts the nodes of a parameter file: `ros2 launch exo_gravity exo.launch.py params:=FILE`.
 
 Each node is a `Node` action of its own: PushRosNamespace, SetRemap and the like of a file that includes this one reach

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Opens RViz for running arms: `ros2 launch exo_gravity view.launch.py params:=FILE`.
 
 Starts robot_model, robot_state_publisher and RViz, and no arm. `rviz:=false` leaves RViz out, for other viewers.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The walls: which part of the package may import which.
 
 The path of a torque is what a torque depends on: core, hardware, and the nodes can_bridge, compensator and imu. It

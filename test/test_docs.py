@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The documents' programs print what they show, and the documents' commands exist.
 
 `.ci/house.py`, which `make lint` runs, checks links, paths and tables.

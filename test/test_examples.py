@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The programs in examples/ run, and the physics of what they print is right."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ament's linters: `colcon test` and `make lint` run them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`colcon test` leaves out the test files whose packages are missing, and no others."""
 
 from collections import Counter

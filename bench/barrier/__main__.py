@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`make study NAME=barrier`: each rule on arms that would be thrown and on wearers who reach, as Markdown.
 
 python -m bench.barrier [--rule NAME ...] [--case START ...] [--rate 250]

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Arms in virtual time that their motors would throw, and wearers who reach: what happens to each, by the truth.
 
 The truth is the simulated device's: joint speeds from MuJoCo, torques that its motors apply. Masses are those of the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rules by which a joint that its own feed-forward drives may be braked; they are compared on the same cases.
 
 Each is a `Barrier` with another `brake`. There are four kinds: by the joint's speed, by the power of the feed-forward,

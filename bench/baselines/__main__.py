@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.baselines [--only growth,learned]: laws without a model, compared with the exact law.
 
 Tables go to the terminal, CSV files and a figure to a folder. It takes six minutes.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Controllers in place of the compensator, and what they cost the wearer: exertion, and sag after letting go.
 
 A PID has no input for the wearer's intention: it holds the pose in which it was switched on, and the wearer moves the

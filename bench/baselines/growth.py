@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The curse of dimensionality, measured: the cost of an ANFIS for joint 3 with 2 to 6 inputs.
 
 Inputs are added in the order of `INPUTS`: shoulder flexion and elbow, then abduction, rotation, and the trunk's pitch

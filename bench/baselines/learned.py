@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Learned laws: their error, memory, time a pose, seconds to train, and what they cost the wearer.
 
 The inputs are the four angles and the trunk's pitch and sideways tilt. Each baseline gets exact torques, without the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The tables and the figure of the study."""
 
 from __future__ import annotations

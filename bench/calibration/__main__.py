@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.calibration [--devices 20] [--first 0] [--output build/calibration]: the study of `calibrate`.
 
 Random simulated devices go through the whole procedure, offline, about a minute each, one on each core. It prints a

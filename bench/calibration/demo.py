@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The demo of `make study NAME=calibrate-demo`: a simulated arm with a wrong file, calibrated, and a picture of both.
 
 The device is that of config/sim.yaml with centres of gravity off its links' axes and motors that give more or less than

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A device drawn at random, as a parameter file: what the file of a new arm says, and what the simulator is."""
 
 from __future__ import annotations

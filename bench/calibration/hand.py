@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The person of `calibrate motors` and `calibrate imu`: moves the arm by hand on a virtual bus, stands and bows."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A random arm for tests of the identification: what a slow tour through its best poses would measure."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A tour of `calibrate` without nodes: the tour carries the simulated device in virtual time.
 
 `run_tour` takes the place of `lab.calibration.live.run_tour`, and reads the same parameters.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The limits of the study, and the table of its results."""
 
 from __future__ import annotations

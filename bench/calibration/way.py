@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One device, all the way that a user goes: motors, imu, gravity, scale, and the arm let go before and after.
 
 Each step is the command line of `calibrate`. What differs from a real arm: the person is `hand.Hand`, the nodes are

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.effort [--quick]: a wearer's exertion on the simulated arm, under every setting of the compensator.
 
 A virtual wearer moves the arm through 13 poses, a reach task and a sine sweep of each joint. Tables go to the terminal,

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer's exertion: a virtual wearer moves the simulated arm along paths, and the wearer's torque is measured.
 
 The hand is that of the virtual wearer, and stronger; the wearer's passive arm is in the exoskeleton. Without help they

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.effort.holds: whether the arm creeps or swings in 13 holds with the terms `friction` and `inertia`.
 
 The packaged simulator and five perturbed ones, as they are after a calibration. The wearer has 45 kg: a heavier arm

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The results of the study: tables, CSV files, a figure, and a comparison with what others have measured."""
 
 from __future__ import annotations

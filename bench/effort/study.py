@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What is compared: the settings of the compensator, the simulated arm with a wearer in it, and a weak wearer's reach.
 
 The wearer's passive arm is `WEARER_EXCESS` heavier than configured. Motors may give their peak torque: the arm of a

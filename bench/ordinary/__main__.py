@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.ordinary [--minutes 60] [--only TEXT]: ordinary motors, sensors and computers raise no alarm.
 
 Plays an arm in virtual time: many starts, a wearer who reaches, walks and rests, no fault. Prints a table, and writes

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One arm with ordinary motors, sensors and computers, in virtual time: is it carried, and how well.
 
 What carries it is what the nodes use: `VirtualArm`, Compensator and TrunkEstimator. The simulated device gives the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows: each driver of an IMU once, with ordinary motors, wire formats, rates and computers by turns."""
 
 from __future__ import annotations

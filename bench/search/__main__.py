@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.search [--minutes 60] [--seed S]: search for unlisted events that throw an arm.
 
 Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A case: an arm, and what happens to it, drawn from a seed. It is data, so that a seed replays it.
 
 Each kind of event belongs to a group: operator, hardware, computer, wearer, IMU. A case draws two kinds, mostly of

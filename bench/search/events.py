@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What each kind of event does to a `Stage`."""
 
 from __future__ import annotations

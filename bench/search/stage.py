@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arm of a case in virtual time, and everything that can be done to it: VirtualArm with a device that fails."""
 
 from __future__ import annotations

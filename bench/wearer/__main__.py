@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.wearer [--devices 20] [--first 0] [--output build/wearer]: the study of `wearer_efforts`.
 
 Random calibrated devices with a virtual wearer go through one trial each, weigh loads in the hand, and adapt to one who

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Random devices with a wearer in them, and what the package's own calibration finds of each.
 
 `identify` and `wearer_from` work on what slow tours measure: torques of the true arm with friction of both signs, noise

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A virtual wearer with muscles, who reaches and holds, rests in the device, lifts a share of their arm, and tires.
 
 Their torque is the sum of an impedance about the path that they mean to follow, which muscles and reflexes give at

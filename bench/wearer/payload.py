@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Loads in the hand of random calibrated devices with a relaxed wearer, weighed.
 
 A hand brings the arm to a pose, and lets go of it soon after a weighing has begun: of the empty hand, then of each of

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm of the wearer that moves relative to the robot's: straps that give, and a shoulder that moves.
 
 The wearer's arm is modelled separately from the robot's, with the same joints, and the muscles act on it. Springs and

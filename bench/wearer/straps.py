@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What straps that give and a shoulder that moves do to the estimate, whose model has neither."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One device and its wearer through one trial, and how far what is estimated is from what the muscles did.
 
 The trial has three parts: they lift what the device does not, then rest in full support, then tire from 60 to 20 %

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer who holds a pose and tires, with a support that adapts and with a fixed one.
 
 They mean to hold the pose all the time. Their muscles give at most a share of their arm's weight, which falls from 60

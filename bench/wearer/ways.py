@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Three ways to find the weight of a wearer's arm, on the same devices and poses.
 
 F. Just et al., J. NeuroEng. Rehabil. 17:13, 2020, compare them on ARMin. What they need is what this package has:

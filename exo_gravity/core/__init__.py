@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument)."""
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The errors that the package raises.
 
 Each message names the item, its value and what would be valid.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Numbers in joint order, their checks, and the rate of a counter."""
 
 import math

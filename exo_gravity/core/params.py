@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameters: a table for each node, and the check of given values against it.
 
 A name that is not in the table is an error, because a misspelt safety limit must not silently keep its default. A

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
 
 Each word stands here once; the states and the fault codes of an arm are in core/safety/drive.py. A `Reason` is a

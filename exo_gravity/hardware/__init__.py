@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Devices: the CAN bus of the motors, the IMU. Drivers raise, nodes decide."""
 
 from typing import TYPE_CHECKING, Any

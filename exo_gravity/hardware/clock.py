@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What is asked of the computer: the time, and to be run in time. sim/virtual_time.py has a clock of virtual time."""
 
 import contextlib

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The control loop of one arm: get the efforts, decide, command all motors, collect replies; at a fixed rate.
 
 What turns samples into efforts is a `Controller`: over ROS, in this process, or the tour of a calibration. Each cycle

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Which computers ROS 2 communicates with: this one alone, unless a person chose otherwise."""
 
 import os

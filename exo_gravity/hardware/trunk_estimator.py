@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Samples of an inertial measurement unit (IMU) on the trunk -> gravity in the trunk's axes, and how sure that is.
 
 An orientation that the IMU reports is used as it is, while gyroscope and accelerometer confirm it. Without one, VQF

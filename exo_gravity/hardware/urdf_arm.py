@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Any serial arm, from its URDF, by Pinocchio (extra `urdf`).
 
 A URDF gives each link's mass, centre of gravity and inertia, and each joint's place and axis. With the joint velocities

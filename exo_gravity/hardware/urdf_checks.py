@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a URDF leaves out or only fills in, and what moves in it besides the joints of the arm.
 
 Many published descriptions were made for pictures and for planning: they have links without mass, equal masses on all

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The bench acceptance: what the first real motors and the first unworn arm must show, step by step, as data.
 
 The steps run over the control loop and the motor bus that carry a worn arm, without a watchdog: a person stands at the

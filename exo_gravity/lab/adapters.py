@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether the CAN interfaces of a parameter file open: python-can's backend, the adapter's driver, the bus itself."""
 
 from importlib import import_module, metadata

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An ANFIS of joints 2 to 4 of an upright arm: the samples it is trained on, and a hybrid learning that converges.
 
 Samples are torques in Nm at gain 1, not scaled. A measured torque lacks what stiction carries: approach each pose from

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What an arm requires of its motors to carry its wearer's arm: a table, a verdict, and a map for each joint.
 
 Over all poses within the joint limits and over the trunk's tilt. Holding an arm up is continuous work, so rated torque

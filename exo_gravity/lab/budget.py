@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque budget: the gravity torque on each motor over the whole workspace, compared with the motor's limits.
 
 The workspace is every pose within the joint limits at every trunk tilt up to a bound. Gravity's torque is linear in the

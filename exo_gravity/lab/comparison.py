@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The paper's comparison: every law against every reference, the checks of the result, its tables, CSV and figures.
 
 The paper's laws take the angle between joint 1's axis and gravity as theta_1, as in the compensator.

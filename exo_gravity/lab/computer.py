@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether this computer is fit to carry the arms of a parameter file: findings, each with the command that fixes it.
 
 What only delays threads (the kernel, the governor, ...) is judged by its effect: where the measured wake-ups are in

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What `doctor` found: one row each, with how bad it is and the command that fixes it."""
 
 from enum import IntEnum

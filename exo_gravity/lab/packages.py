@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What is said of a Python package that is not installed: by which extra of this package it comes."""
 
 import sys

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The same work on many items: in a process for each core, or on the workers of a Dask cluster.
 
 Outcomes come in the order in which they are finished, one for each item. The function must be importable, and a pure

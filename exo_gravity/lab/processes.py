@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The processes of a parameter file: starts one per top-level key, watches them, and stops them.
 
     /right/can_bridge  ->  the executable `can_bridge`, as node `can_bridge` in the namespace /right

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether the numbers of an arm are simulated or real, for all that shows them: page, report, CSV files, recordings.
 
 An arm is simulated if its device says so: a simulator plays it, or its bus leads to no motor. It is real if its

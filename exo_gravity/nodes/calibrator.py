@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrator: moves the arm through the poses of a calibration, in the compensator's place.
 
 It answers joint states with efforts as `compensator` does. While the bridge starts, it answers with the expected weight

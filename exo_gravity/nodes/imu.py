@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """imu: samples of an IMU in, from a driver's topic or a device, the trunk's pitch and roll out, one for each sample.
 
 While samples are missing, impossible, frozen, not yet settled or from two publishers, it publishes nothing: the tilt

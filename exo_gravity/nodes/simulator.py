@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """simulator: a simulated arm behind a CAN bus, a trunk IMU, and a virtual wearer who performs a trial.
 
 CAN frames and an IMU topic are its only connection to the other nodes. It also publishes `wearer_step`, the step that

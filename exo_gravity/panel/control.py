@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Who operates the arms, and what a page may ask for.
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A

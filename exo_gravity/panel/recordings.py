@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings, trials, saved parameters and the subjects: folders below `output`, SUBJECT/DATE/TRIAL.
 
 A recording is made by the package's `recorder`, a trial by its command `trial --attach`: processes, which this module

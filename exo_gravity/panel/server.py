@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The web server: the page and its files, its actions, and the live connection that carries the state to every page.
 
 It runs uvicorn on a separate thread. A page that is slow or asleep gets the newest state only, so that nothing queues

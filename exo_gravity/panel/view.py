@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of `panel`, those of other nodes that its page may change, and what the page shows of the arms."""
 
 import math

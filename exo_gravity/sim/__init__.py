@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated device: a MuJoCo arm, motors that exchange real CAN frames, a trunk IMU and a virtual wearer.
 
 It knows nothing of the compensator: CAN frames and IMU samples are the only connection. `SimulatedDevice.run` plays it

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """CAN controllers on a wire in virtual time: arbitration, collisions of two frames with one ID, error counters.
 
 By the Bosch CAN Specification 2.0, part A, sections 6 to 8. A frame takes the time of its bits, stuff bits included.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The mechanics of the simulated device: a MuJoCo arm on a moving base, with its own masses, friction and joint stops.
 
 It is the paper's arm (`ArmConfig`), or one from a URDF (`UrdfConfig`, sim/urdf.py).

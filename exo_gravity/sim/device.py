@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated device: the arm, its motors and the wearer. CAN frames are its only connection to a controller.
 
 `run` plays it in real time on python-can buses. `advance` and `exchange` play it without a bus, as fast as possible.

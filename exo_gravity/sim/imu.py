@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trunk IMU: the motion of the trunk -> gyroscope and accelerometer in the IMU's axes, with sensor errors.
 
 The trunk's orientation in the world is Ry(pitch) Rx(roll) (`core.arm.tilt`; heading is irrelevant). The accelerometer

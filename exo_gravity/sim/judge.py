@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Judges what an arm did, by the simulated arm's true motion, not by the frames on its bus.
 
 `measure` judges one fault, for the fault matrix. `Driven` is what motors did to an arm at any time, for the search too.

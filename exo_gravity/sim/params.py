@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of `simulator`, and the device that they describe."""
 
 import math

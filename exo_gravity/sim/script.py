@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The script of a trial: a list of timed steps for the wearer, as `docs/trials.md` lists them.
 
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How the trunk of a wearer moves: bowing, leaning, walking and sitting down hard.
 
 Each motion gives the trunk's tilt and the acceleration of the shoulder at any time. Trunk axes and the signs of pitch

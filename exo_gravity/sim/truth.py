@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The true motion of the simulated arm at every physics step: in a file, for a judge in another process, or in memory.
 
 The file is a sequence of records, of which `record_of` is the only description. They leave the process every

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated arm from a URDF: MuJoCo reads the links; the joints' mechanics and what the arm holds are added.
 
 The model is MuJoCo's own reading of the URDF and not Pinocchio's, on which the compensator's law is built, so that it

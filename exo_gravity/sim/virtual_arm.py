@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated arm that is carried in virtual time by what carries a real one: control loop, motor bus, safety machine.
 
 Offline trials, studies and tests use it. The controller is the caller's: a compensator without messages, the tour of a

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A CAN bus in virtual time, with a simulated device on it: the same frames as in real time, without threads or waits.
 
 Time passes only while a thread waits for a frame or sleeps. Everything that is due meanwhile (replies, status

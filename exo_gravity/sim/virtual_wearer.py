@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The virtual wearer: performs a trial script on the simulated arm, as a person would who reads it from a screen.
 
 Move: a hand leads the joints along minimum-jerk paths (Flash and Hogan 1985) to the pose, holds them there for the last

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """budget --params FILE --body-mass KG: the torque that a wearer's arm requires of each motor, against what it can give.
 
 For every arm of a parameter file: the robot alone and with the wearer's arm, over all poses within the joint limits

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate COMMAND --params FILE --output NEW.yaml: finds what differs between an arm and its parameter file.
 
 `calibrate new` writes the first file of an arm from its URDF, its motors and their IDs.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the command lines share: argument types, and messages about packages that are not installed.
 
 A tool imports packages that only some tools need inside `extras`, after it has parsed its arguments: `--help` works

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """doctor --params FILE: whether this computer is fit to carry the arms of a parameter file.
 
 It reads the file as its nodes do, opens each CAN interface that the file names unless a bridge holds it, reads the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """launcher: starts one process per top-level key of the parameter file, and stops them all when one ends.
 
 With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.

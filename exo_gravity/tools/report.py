@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
 Several recordings, or a folder of them, become one table and page, a row for each trial, and cohort.csv, a row for each

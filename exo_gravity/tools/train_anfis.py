@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """train_anfis: trains an ANFIS for joints 2 to 4 of an upright arm, and saves it in one readable file.
 
 By default it learns `gravload` torques at the paper's 1,053 positions; with --bag, the torques measured in the holds of

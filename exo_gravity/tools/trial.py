@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """trial NAME: runs a trial from start to report, on the simulated device or on a real arm.
 
 It starts the nodes of a parameter file and a recorder, follows the script, stops the nodes, and reports the recording.

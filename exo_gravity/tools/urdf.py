@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """urdf --params FILE: writes the robot description (URDF) of the arms of a parameter file, for RViz and other programs.
 
 The root link is `trunk` (REP-103); the joints have the names and the order of `joint_names`. `law: exact` with gains of

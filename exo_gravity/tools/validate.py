@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """validate: reproduces the paper's comparison: every law against the Robotics Toolbox's gravload and Pinocchio.
 
 It compares over 1,053 positions of the workspace, then over 100,000 random ones at each of five limits of the trunk's

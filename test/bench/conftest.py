@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The tests of the studies are long: `make test-all` runs them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Controllers in place of the compensator, and laws without a model: what they cost, and what is measured of them."""
 
 from __future__ import annotations

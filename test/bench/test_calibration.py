@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the command line of `calibrate` says when a tour shows too little: offline.
 
 `make study NAME=calibrate` and `make study NAME=calibrate-demo` show what a whole calibration gives.

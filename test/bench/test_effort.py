@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer's exertion: what it is made of, from torques that are known, and what the terms save in the simulator."""
 
 from __future__ import annotations

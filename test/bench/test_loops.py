@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How often the benchmark repeats a run, what it says of one that was disturbed, and on which cores it runs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parts of a study: played once each, in the order that was asked for, and kept where the study is stopped."""
 
 from __future__ import annotations

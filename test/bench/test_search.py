@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The search: a seed replays its case, the truth judges it, and a run goes on where the last one ended."""
 
 from __future__ import annotations

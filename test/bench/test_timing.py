@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The loop timing that the benchmark reads from a bus, on frames with known delays."""
 
 from __future__ import annotations

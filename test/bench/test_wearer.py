@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The study of the wearer's torque: its virtual muscles, its tables and their limits."""
 
 from __future__ import annotations

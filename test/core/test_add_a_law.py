@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """CONTRIBUTING's "Add a law", step by step: a class with `torque` and `outside`, and its entry in LAWS."""
 
 import pytest

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """CONTRIBUTING's "Add a motor family": another distribution's entry points, and an arm with its motors is carried."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ANFIS inference against Jang's five layers written out, and the law that uses it only inside its training box."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ArmModel rejects invalid values by name, and adds a wearer's mass correctly."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The last hand on every drive: what it limits, and that no arm is thrown, by the truth of the simulated device."""
 
 from __future__ import annotations

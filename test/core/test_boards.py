@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a board says that is set up otherwise than its parameters say, told from its frames."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The bits of CAN frames and the bus load, against the CAN specification and hand-computed figures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator gives no torque without fresh and finite input, and no change of settings steps the torque."""
 
 from __future__ import annotations

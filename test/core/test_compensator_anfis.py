@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The law `anfis` in the compensator: where it was not trained, the exact law replaces it."""
 
 from __future__ import annotations

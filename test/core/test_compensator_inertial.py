@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`inertial`: the compensator answers what the arm feels of a trunk that accelerates and turns."""
 
 from __future__ import annotations

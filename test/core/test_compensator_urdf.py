@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator of another arm than the paper's: a pendulum of two joints."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Damiao motors' frames and registers, and the parameters of a motor of any family.
 
 Bytes are worked out by hand from the documents that core/motors/damiao.py names, or come from public drivers.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque in the replies: a motor that does not deliver is noticed, a noisy sensor is not, and a load adds up."""
 
 import math

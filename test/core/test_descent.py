@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The brake of one joint on its way down: which motion it opposes, how much, and when it gives way."""
 
 import itertools

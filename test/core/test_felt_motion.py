@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The trunk's motion, extrapolated to the moment at which the motors answer it."""
 
 from __future__ import annotations

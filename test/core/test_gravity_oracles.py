@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The gravity laws against Pinocchio, the Robotics Toolbox, and the paper's equations copied by hand."""
 
 import math

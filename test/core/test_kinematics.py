@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arm's inertia against Pinocchio's rnea and crba; the torque that turns it with its base against MuJoCo."""
 
 from __future__ import annotations

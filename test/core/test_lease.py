@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Who holds control of an arm: one holder at a time, with a name, for as long as they renew it."""
 
 import pytest

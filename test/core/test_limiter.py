@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What is sent to an effort controller, which keeps its last command forever."""
 
 import pytest

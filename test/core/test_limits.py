@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The limits of a worn arm, as parameters."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque as a linear function of eight moments, against the closed form, vectors and Pinocchio."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Torque that gravity cannot account for: what is explained, what is not, and what happens with a wrong compensator."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The power of a motor whose replies say whether it is on."""
 
 from __future__ import annotations

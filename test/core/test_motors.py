@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The frames of AK motors in every wire format, and a motor on a joint.
 
 Every code survives a round trip, the scaling is the manual's, no frame has two meanings, and any bytes or numbers give

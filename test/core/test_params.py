@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator's parameters as settings: every value is either applied or rejected with a message."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The load in the hand: its torque against MuJoCo, its inertia against Pinocchio, its change, and its loss."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rate of counted events."""
 
 from exo_gravity.core.numbers import Rate

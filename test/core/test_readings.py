@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Readings of ordinary motors: one wrong reading, lost frames and a late computer are no fault; two readings are."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Faults of a carried arm in the safety machine, and what holds under random sequences of events."""
 
 from __future__ import annotations

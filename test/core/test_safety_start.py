@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The start of the safety machine: the checks before torque flows, the ramp, and what is trusted from then on."""
 
 from __future__ import annotations

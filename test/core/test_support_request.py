@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A request for more support: which one counts, how the support follows it, and how it expires. In virtual time."""
 
 from __future__ import annotations

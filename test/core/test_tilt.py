@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Trunk tilt against SciPy's Rotation, and the signs of pitch and roll."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Gravity's vector as the tilt: over the whole sphere against Pinocchio, extrapolated, and before pitch and roll."""
 
 from __future__ import annotations

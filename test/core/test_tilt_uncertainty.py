@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How much each thing that was not measured adds to the tilt's uncertainty, and when the estimate starts again."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Trust in zeros and signs ends with the continuity of the angles, whichever fault wins, and not before."""
 
 from __future__ import annotations

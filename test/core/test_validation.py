@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameters of a bridge: impossible alone, impossible together, and gone."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's arm, against torques worked out from the two tables and against its single segments."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighing the load in the hand of a simulated arm, whose masses, friction and wearer the controller knows."""
 
 from __future__ import annotations

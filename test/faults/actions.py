@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How faults are caused: signals to processes, faults of the simulated device, foreign messages and frames."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of the fault matrix about buses, boards and the supply.
 
 Who owns a bus: other sessions, silent motors handed over, a closed terminal. V3 boards reply to nothing, send their

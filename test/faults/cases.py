@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The fault matrix: each fault, when it occurs, and how soon the arm must be let down."""
 
 from __future__ import annotations

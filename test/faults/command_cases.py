@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of the fault matrix about effort commands: wrong, late for a moment, by another clock, or unexplained.
 
 In most of them this process commands the arm.

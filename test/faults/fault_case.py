@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a row of the fault matrix is."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What happens in each minute of the soak: the operator changes the load of an arm, and its wearer acts, at random."""
 
 from __future__ import annotations

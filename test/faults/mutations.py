@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`make study NAME=mutations`: does the fault matrix see a defect? Each of these defects must turn a row unsafe.
 
     python -m test.faults.mutations [--only TEXT ...] [--busy]

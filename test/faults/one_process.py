@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The fault matrix where can_bridge and compensator of an arm share a process: `run --one-process`."""
 
 from __future__ import annotations

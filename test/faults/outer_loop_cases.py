@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of the fault matrix of people who leave: the author of the outer loop, and who holds control of the arm.
 
 Where the outer loop fails, gravity compensation goes on without it.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of the fault matrix about people and firmware between two mechanisms: each is safe only by an invariant.
 
 Operators whose requests are late, abandoned or made on a wrong picture of the arm; hardware that is connected wrongly;

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Processes that act on the right arm until their parent has ended: python -m test.faults.players PLAYER.
 
 outer_loop  publishes EFFORTS on /right/assist_efforts; signals make it go wrong. GO_WRONG: NaN from now on. FLOOD: far

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rig on which faults are tried: nodes as processes that carry a simulated arm, and the arm's true motion.
 
 The simulated device always has its own launcher: it outlives the other nodes, so that the judge sees the arm after its

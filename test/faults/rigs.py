@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The kinds of rig: which nodes run, in which processes, which node commands the arm, and what the arm is like."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`make faults`: run the fault matrix on the simulated device, with real processes; print a table and write JSON.
 
     python -m test.faults.run [--only TEXT ...] [--start N] [--output build/faults.json] [--busy] [--one-process]

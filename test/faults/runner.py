@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Runs one row of the fault matrix on a rig, and decides whether it was safe."""
 
 from __future__ import annotations

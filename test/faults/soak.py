@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m test.faults.soak [--minutes 60] [--seed 1]: both arms, live changes, an active wearer, harmless faults.
 
 Each minute the operator changes the right arm's load at random, while it is free and while its wearer reaches, shakes,

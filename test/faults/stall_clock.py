@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A process that measures how long the machine stands still, next to tests that need it to keep up.
 
 Run with `-m test.faults.stall_clock`, it wakes every `TICK` s on each processor: a virtual machine may halt one of

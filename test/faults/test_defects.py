@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The deliberate defects of `make study NAME=mutations` can be injected here, and name rows of the fault matrix."""
 
 from __future__ import annotations

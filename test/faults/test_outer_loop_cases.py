@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The judge of the outer loop's rows sees assistance that stays, gravity compensation that changes, and motion."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of the fault matrix with a wearer: who acts while the arm is let down, or for whom the load is changed.
 
 A wearer who acts is neither fought nor thrown. One who is passive is moved slowly by a change of load.

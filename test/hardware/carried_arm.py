@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm carried in virtual time, on motors that a test chooses: what they caused is the truth of the device."""
 
 from __future__ import annotations

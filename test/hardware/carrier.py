@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A process that carries an arm as a bridge does; `python -m test.hardware.carrier FILE`, FILE a pickled arm.
 
 It prints the PID of its watchdog once the motors are on and the watchdog runs.

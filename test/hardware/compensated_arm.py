@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated arm in virtual time, with a person's arm in it, that compensator and bridge carry."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A folder for the notes of buses."""
 
 from __future__ import annotations

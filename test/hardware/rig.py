@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated arm on a CAN bus, and the truth about it: how fast its joints really turn, and which motors are on."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A simulated arm on a separate bus, in real time, for tests of processes and threads."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The active wearer moves the simulated arm as each behaviour says."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A bus is bound to its adapter by the adapter's serial number, as Linux shows it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Arms of any number of joints, from a URDF, on the whole path of a torque: compensator, safety machine, bus, motors.
 
 MuJoCo's model of the same URDF says what gravity needs, and the simulated device what the motors did.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A motor bus is opened by the parameter file alone, and at the bit rate of the motors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The estimator on real motion with an optical reference: excerpts of BROAD, see test/data/broad/README.md."""
 
 from __future__ import annotations

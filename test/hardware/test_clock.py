@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a process may ask of Linux's scheduler."""
 
 from __future__ import annotations

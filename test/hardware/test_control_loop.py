@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The control loop on the simulated arm, in virtual time: whatever raises an exception, the arm is let down."""
 
 from __future__ import annotations

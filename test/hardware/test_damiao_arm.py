@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm on Damiao motors, in virtual time, on classic CAN and CAN FD: judged by what the motors did.
 
 The events and bounds are those of arms on AK motors.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer who acts while the arm is let down, in virtual time, judged by the true motion of the arm."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm on the motors of each firmware, in virtual time on a bus with arbitration: judged by what the motors did."""
 
 from __future__ import annotations

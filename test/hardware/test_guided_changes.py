@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Live changes of load, with a person's arm in the device: judged by the true motion of the joints."""
 
 from __future__ import annotations

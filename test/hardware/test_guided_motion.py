@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What has thrown an arm where a torque began or a load went: judged by how fast the motors truly drive a joint."""
 
 from __future__ import annotations

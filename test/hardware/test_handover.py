@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Letting down an arm that a dead process left with its motors on, in virtual time."""
 
 import itertools

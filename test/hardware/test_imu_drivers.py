@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Ordinary drivers with true data: no sample is refused, the tilt never stays away, and it is right."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Faults of IMUs, drivers and clocks: named, and no tilt is published that is off by more than 5 degrees.
 
 Each fault is put into the simulated motion of a trunk that bows, leans and then walks, from the start or amid the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An IMU that is unplugged and plugged in again, and the stamps of samples that arrive in batches."""
 
 import numpy as np

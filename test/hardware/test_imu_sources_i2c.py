@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """IMU chips on I2C: Adafruit's drivers behind ImuSource, on chips that answer byte by byte."""
 
 import adafruit_icm20x

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """IMUs on serial ports, by real pyserial on a pseudo-terminal."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Motors of V1, V2 and V3 boards on one bus: who is sent what, which frame is a reply, and who may still be on.
 
 In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The motor bus with simulated motors: the order of its frames, and which frames are replies.
 
 In virtual time, or on the bus that EXO_TEST_CAN_INTERFACE and EXO_TEST_CAN_CHANNEL name.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A bus full of foreign frames: only the motors' replies are read.
 
 A reply has 6, 7 or 8 bytes, of which only the first, the motor's ID, is known in advance. A foreign frame of that

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The short version of `make study NAME=ordinary`: ordinary equipment refuses no start and lets no arm down."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Ordinary motion is no fault of the IMU: a bow right after a walk, and random motions, are followed throughout."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What happens to arms on CAN happens to an elbow and to seven joints: by the same bounds, on what the motors did."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Orientations that drivers report: confirmed by gyroscope and accelerometer before and while they are used.
 
 The trunk stands, bows and stays bowed; or it bows and walks, or lives through a day of ordinary motion. Every published

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Queues between the bridge and its motors, and lost frames, which look the same for a while; in virtual time."""
 
 from __future__ import annotations

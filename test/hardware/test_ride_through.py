@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Late efforts, in virtual time: the arm is carried on under rising damping, judged by the arm's true motion."""
 
 from __future__ import annotations

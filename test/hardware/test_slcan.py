@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A serial adapter (slcan) on a pseudo-terminal: frames of both formats pass, and it may be unplugged and come back."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The supply of a carried arm is switched off and on, or its bus: what the motors truly do, in virtual time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The trunk's orientation from an IMU, on simulated motions known exactly; test_broad.py has recorded ones."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm whose motors are on two buses: one safety unit, a lock and notes for each bus. In virtual time."""
 
 from __future__ import annotations

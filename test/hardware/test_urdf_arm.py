@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Torques of arms from their URDF: against MuJoCo, and against the exact law on the exoskeleton's own description."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Descriptions that are incomplete but not empty: what changes the torque is used or refused, the rest is named."""
 
 from __future__ import annotations

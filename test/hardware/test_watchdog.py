@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The watchdog's process: after the bridge has died, its arm is let down, whatever else froze.
 
 What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py. What happens after

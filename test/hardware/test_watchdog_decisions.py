@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the watchdog decides from notes and pipe, and what becomes of the arm; in virtual time, without a process."""
 
 from __future__ import annotations

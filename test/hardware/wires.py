@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Ends of a wire that tests need, and the real bus that may take the place of a wire in virtual time."""
 
 from __future__ import annotations

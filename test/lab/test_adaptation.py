@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Support that adapts: what makes it rise, what does not, and how it is forgotten. One joint, in virtual time."""
 
 from __future__ import annotations

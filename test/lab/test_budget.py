@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque budget, against the known worst pose of each joint and against random poses."""
 
 import functools

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A contact is a torque that comes faster than a person's."""
 
 from __future__ import annotations

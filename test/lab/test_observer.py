@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque: momentum and C^T v against Pinocchio, the estimate against MuJoCo and known torques."""
 
 from __future__ import annotations

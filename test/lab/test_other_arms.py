@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The files of other arms that come with the package: carried without ROS, and judged by the device."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Work on many items in processes: an outcome for each, also where one of them ends its process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What viewers show: the arm's pose against Pinocchio and the description, arcs, and the words for each state."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A session: the subject's code names a folder, and texts are short."""
 
 from datetime import date

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """SPARC, against its integral for a bell whose spectrum is known, its authors' figure, and what must not change it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether an arm is simulated: as its device says, else as its parameter file does, else nobody knows."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Holds, drift, pushes, let-downs and the verdict, from synthetic recordings with known motion."""
 
 from __future__ import annotations

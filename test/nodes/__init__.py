@@ -1,0 +1,1 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Fixtures for the tests of running nodes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The launch file under `ros2 launch`, and the documents' commands of `ros2`, where ROS 2 is installed.
 
 Run them by their path; PyPI carries no `launch`. Judged by the simulated arm's true motion: the arm is let down

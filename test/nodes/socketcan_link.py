@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A SocketCAN link that goes down, on vcan0: `.ci/socketcan`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """CONTRIBUTING, "Add a topic", followed literally: a topic of an arm, with an entry in the recorder's table."""
 
 import signal

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """CONTRIBUTING, "Add an IMU", followed literally: a class with `read` and `close`, and its name in two places."""
 
 import pytest

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator's node with an outer loop and terms, over real DDS in this process."""
 
 from __future__ import annotations

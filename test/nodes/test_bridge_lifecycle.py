@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The lifecycle of can_bridge, in this process, with a simulated arm: every transition, and errors in each."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What an operator of can_bridge sees and may do: its report on /diagnostics, and its services."""
 
 from __future__ import annotations

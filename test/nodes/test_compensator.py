@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque of a running compensator, which the test feeds with joint states."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of a running compensator: what it refuses and how it describes them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator's node with `law: urdf` and `command_interface: multi_array`, over real DDS in this process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Readable values on /diagnostics, and the aggregator's configuration."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `imu` as a process, over real DDS, with a trunk that moves and with impossible samples."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An IMU on a serial port that the node reads itself: the device in virtual time, and the node over real DDS.
 
 How a device is opened again: hardware/test_imu_reopening.py.

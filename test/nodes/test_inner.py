@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the nodes use of rclpy's inner parts, and what is done without them, over real DDS in this process."""
 
 from __future__ import annotations

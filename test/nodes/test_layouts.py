@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The layouts of RViz, PlotJuggler and Foxglove, and the launch file: every topic, frame and executable that they name.
 
 The viewers themselves have no wheels. What is checked here is that each name exists, and that each layout has the form

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of another node, as it comes and goes."""
 
 from __future__ import annotations

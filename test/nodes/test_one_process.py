@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """can_bridge and compensator in one process: answers without a message, all else as between two processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm of three joints on two buses, known by its URDF, with all nodes as processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `recorder` as a process, over real DDS: every published message is in the recording."""
 
 from __future__ import annotations

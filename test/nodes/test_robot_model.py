@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `robot_model` with the real compensators and bridges of both arms, whose joint states the test sends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Which hosts a node communicates with, as set before it starts, which signals end it, and which clock it waits for."""
 
 import os

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
 
 The nodes are those of config/sim_both.yaml with a wearer for each arm, a recorder, robot_model, the panel, and an outer

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """All nodes as processes, over real DDS and a real CAN bus: the arm is carried, and is let down whoever dies."""
 
 from __future__ import annotations

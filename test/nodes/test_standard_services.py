@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Every standard service of every node, asked for wrong, random and repeated things while an arm is carried."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How nodes start: with a bad parameter, without a file, from a parameter dump, and with real-time threads."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Subscriptions outside the executor, with publishers in the same process, over real DDS."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A parameter file of a47959f4 starts unchanged; a person confirms the pose. The whole interface shows on the way."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `wearer` beside a compensator, which the test feeds with joint states and requests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Fixtures for the tests in a browser. They import its driver late: other tests run without it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Measures the operator's panel on the simulated device: delay from press to torque, processor load, late cycles.
 
     python -m test.panel.measure press [N]   N presses of the space bar in a real browser, 50 by default, 5 s each

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/panel.png and panel_phone.png: the page with two played arms, in a headless browser.
 
 `python -m test.panel.picture`; needs chromium and the extras panel and test.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The page in a real browser, with arms that the test plays: what its operator can do, and by which means."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The page for everyone: in German, by the keyboard alone, on a tablet, enlarged, and checked by axe."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the page tells its operator to do, in a real browser: what a check waits for, what caused a fault."""
 
 from __future__ import annotations

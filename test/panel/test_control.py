@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Who may do what: requests are checked, one page holds control, and letting down always works."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The panel as a process with the simulated device, driven by a real browser."""
 
 from __future__ import annotations

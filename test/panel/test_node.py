@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `panel` as a process with an arm that the test plays: its page, its parameters, what it asks of the arm."""
 
 from __future__ import annotations

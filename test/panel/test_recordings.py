@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Where recordings and saved parameters go, how a trial is followed, and what is kept of a subject."""
 
 import asyncio

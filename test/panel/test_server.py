@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The web server over real connections: what it refuses, and what it sends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The page's texts: complete in every language, and all that the page asks for."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Which change of load the panel names after a fault."""
 
 from __future__ import annotations

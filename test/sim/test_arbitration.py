@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames on a wire with a bit rate: their time, their order, and what two senders with one ID do to each other."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The mechanics of the simulated arm, against the exact law and the energy balance."""
 
 from __future__ import annotations

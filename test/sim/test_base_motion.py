@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arm on a moving base, against MuJoCo's inverse dynamics of the same arm on a trunk that has joints."""
 
 from __future__ import annotations

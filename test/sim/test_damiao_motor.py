@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated Damiao motor does what its firmware does: a frame, what it answers, and what the joint feels."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The way down, judged by the simulated arm's true motion: slow, to the ground in time, and no drop at the end."""
 
 from dataclasses import replace

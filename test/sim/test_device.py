@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated device: arm, motors and wearer, joined by frames alone, without a bus."""
 
 from __future__ import annotations

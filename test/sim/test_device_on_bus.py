@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated device in real time on a bus."""
 
 from __future__ import annotations

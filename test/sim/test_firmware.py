@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What each simulated firmware does with the same frames: frames in, and the state, the reply and the torque out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated IMU: axes, signs, noise and bias."""
 
 from __future__ import annotations

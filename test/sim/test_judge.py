@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The judge sees each way in which an arm can be let down badly, in made truth records."""
 
 import numpy as np

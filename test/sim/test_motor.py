@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The protocol of the simulated motor."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial without a bus and in simulated time: the arm is carried as on a real bus, and always let down at the end."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Two public drivers' ways of talking to AK motors, written after their protocol, against the simulated boards.
 
 In virtual time, on a python-can bus. The truth is that of the device: its motors, its angles, its torques.

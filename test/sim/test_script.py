@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial script is parsed completely, or rejected with the name of the invalid entry."""
 
 import pytest

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The trunk's motions: each agrees with its own derivatives, begins and ends at rest, and is as large as it says."""
 
 from __future__ import annotations

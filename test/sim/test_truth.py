@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The truth log: what a judge in another process reads of the simulated arm's motion."""
 
 import subprocess

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The simulated V3 board: what it obeys, what it reports, and when."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The virtual wearer moves the arm to a pose, releases it and pushes it."""
 
 from __future__ import annotations

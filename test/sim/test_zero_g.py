@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer's passive arm on the simulated device: Zero-G holds it.
 
 The controller's masses of robot and wearer are a few per cent off the true ones.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A wearer who acts on the simulated arm: lifts, pushes, holds still, shakes, reaches, throws. `attach` lets them act.
 
 A behaviour is a function of the time in s since it began and of the arm's true angles and velocities, (4,) rad and

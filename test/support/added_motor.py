@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm carried with a motor that another distribution provides, test/support/our_lab.
 
     PYTHONPATH=test/support/our_lab python -m test.support.added_motor

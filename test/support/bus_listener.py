@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An independent listener on a simulated CAN bus."""
 
 from __future__ import annotations

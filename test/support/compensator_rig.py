@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A running compensator in the test's process, and a node that plays its environment, over real DDS."""
 
 from __future__ import annotations

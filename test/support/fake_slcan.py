@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A serial CAN adapter that speaks the LAWICEL protocol on a pseudo-terminal, between a program and a python-can bus.
 
 Commands end with a carriage return (Lawicel, CANUSB manual): S0 to S8 set the bit rate, O opens, L opens for listening

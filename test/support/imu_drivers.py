@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trunk that sways, as ordinary drivers of an IMU deliver it."""
 
 from __future__ import annotations

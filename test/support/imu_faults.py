@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recorded or simulated motion of an IMU, and the faults of IMUs, drivers and clocks put into it."""
 
 from __future__ import annotations

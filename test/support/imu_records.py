@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Records of a simulated IMU for the calibration of its mounting: a person who stands and bows, and six rests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint states of an arm at rest, for a compensator without a bridge."""
 
 from __future__ import annotations

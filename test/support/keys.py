@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What docs/keys.md promises to programs: the keys of each node, and the values that each may have."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Real nodes as processes, started by the launcher from a parameter file that a test has changed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Processes that load the CAN bus or the processors.
 
 python -m test.support.load frames JSON    send random frames; the JSON has bus, count, rate (1/s), ids and seed

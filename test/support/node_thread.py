@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Nodes of a test, on a separate thread."""
 
 from __future__ import annotations

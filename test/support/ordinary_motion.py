@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What people do with an IMU on their trunk: walk, bow, lean, turn, sit down, jump up, clap, nod; in random order."""
 
 from __future__ import annotations

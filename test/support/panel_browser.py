@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A headless Chromium that drives the panel's page.
 
 Debian's chromium is used, because Playwright's own browsers come from elsewhere. Without it the tests are skipped.

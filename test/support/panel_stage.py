@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The panel's web server with two arms that a test plays: everything but ROS and the device is real."""
 
 from __future__ import annotations

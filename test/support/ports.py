@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Ports and ROS domains that other test runs, and the other workers of this one, leave alone."""
 
 from __future__ import annotations

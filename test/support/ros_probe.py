@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A ROS node in the test's process that records what the nodes under test publish, and calls their services."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A safety machine that a test drives through time, with the readings and efforts that the test sets."""
 
 from __future__ import annotations

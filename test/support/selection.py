@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Which packages a test file needs: what it imports, what that imports, and what it starts as a process."""
 
 from __future__ import annotations

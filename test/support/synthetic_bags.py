@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of known content: what motors measure of a known motion, its messages, and bags of them, by rosbags."""
 
 from __future__ import annotations

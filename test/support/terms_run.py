@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Terms on the simulated arm, through CAN frames and a delay: who gave which energy, and does the arm come to rest."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A tour on the simulated device, in virtual time."""
 
 from __future__ import annotations

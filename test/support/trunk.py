@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The orientation of a simulated trunk."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An offline trial of an arm on a trunk that moves, with little friction: device, controller, IMU and estimator."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Gravity torques of a URDF by MuJoCo, to compare Pinocchio's with."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Waiting for a condition as long as a busy machine may take."""
 
 from __future__ import annotations

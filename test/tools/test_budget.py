@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """budget: from a parameter file to a table, a verdict, figures and an exit code."""
 
 import re

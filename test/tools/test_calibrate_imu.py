@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate imu from recordings, through the command line."""
 
 from __future__ import annotations

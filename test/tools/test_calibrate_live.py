@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the person at the terminal is shown, how the program waits for them, and how it follows the calibrator."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate new: from a URDF and a list of motors to a file with which a simulated arm is carried."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The page of a calibration: what it says, and what its numbers are."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A calibrated parameter file: the old one with new values, and nothing else changed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated devices with a wrong parameter file: a tour, the identification and the new values, from start to end."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """From what a tour or a recording shows to the values of the new parameter file, or the reason for having none."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """doctor: from what a computer states of itself to findings, commands and an exit code."""
 
 import json

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Wrong use of each tool ends with exit code 2, and a sentence that names what is wrong in place of a traceback."""
 
 from __future__ import annotations

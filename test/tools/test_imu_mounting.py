@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The mounting of an IMU, from simulated records of a person who stands, bows and stands."""
 
 from __future__ import annotations

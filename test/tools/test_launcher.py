@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """launcher: which keys of a parameter file it accepts, which nodes start, and in which order they stop.
 
 test/nodes starts real nodes.

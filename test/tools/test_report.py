@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The command `report`, from a bag to the terminal, files and an exit code."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`report` of many recordings: a row for each, one that fails is named, one that has not changed is not read again."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a report says of the wearer, from recordings of an arm whose wearer gives a known share."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Training an ANFIS: it converges, beats the paper, learns from a recording, and refuses too little of one."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """trial, from script to report: offline, over ROS, interrupted, and used wrongly."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """trial's scripts, criteria and screen: what is a hold, what a person reads, why a trial ends early or is repeated."""
 
 from __future__ import annotations

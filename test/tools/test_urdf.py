@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The robot description: torques by Pinocchio and MuJoCo from its XML, the names, and the command."""
 
 from xml.etree import ElementTree

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The paper's comparison: references, cases, figures of merit, and the command from parameter file to exit code."""
 
 import math

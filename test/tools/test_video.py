@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Clips: what the command line accepts, and the frames of an offline trial, drawn in a separate process.
 
 MuJoCo chooses how it draws when it is imported, which other tests have done in this process.

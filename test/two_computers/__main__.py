@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arm on two computers over better and worse wires: `python -m test.two_computers [--output FILE] [CASE ...]`.
 
 Each case starts all nodes anew; the virtual wearer brings the arm to a pose and lets go. The table is printed, and

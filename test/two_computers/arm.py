@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One arm on two computers: bridge, IMU and simulated device on the robot; compensator, wearer, recorder on a desk."""
 
 from __future__ import annotations

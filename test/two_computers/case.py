@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One row of the table: an arm on two computers, carried and let go over one wire."""
 
 from __future__ import annotations

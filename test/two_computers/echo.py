@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Measures a wire with numbered datagrams: `echo ADDRESS` sends them back, `count ADDRESS NUMBER` prints each time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wire between two computers: passes Ethernet frames between two interfaces, late, and not all of them.
 
 Frames keep their order. Address resolution (ARP) is never lost. A frame that was sent to a virtual interface may lack

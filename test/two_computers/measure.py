@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What happened to one arm on two computers: from the recording on the robot, and from the arm's true motion."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Two computers in network namespaces, joined by a wire with delay, jitter and loss.
 
     robot eth0 -- veth -- [ forwarder ] -- veth -- eth0 desk

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wire between the two computers, without ROS: what arrives, how late, and that there is no other way out."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An arm whose compensator runs on another computer: carried over a fair wire.
 
 `make study NAME=two-computers` has worse ones.

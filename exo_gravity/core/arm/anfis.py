@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ANFIS: an adaptive-network-based fuzzy inference system, first-order Takagi-Sugeno on a grid partition.
 
 Jang, IEEE Transactions on Systems, Man, and Cybernetics 23 (1993) 665-685. Each of the d inputs has k membership

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The paper's arm as everything that carries an arm needs it (`Arm`): its data, closed forms, with NumPy alone."""
 
 from collections.abc import Mapping, Sequence

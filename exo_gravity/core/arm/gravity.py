@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
 
 `exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,

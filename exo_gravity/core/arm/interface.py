@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What everything that carries an arm of n joints asks of it: gravity, inertia, and what it holds.
 
 `ArmModel` (core/arm/arm.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm

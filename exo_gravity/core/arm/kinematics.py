@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Where the arm's joints and links are, and the torque that accelerates its links: all from Table 1 of the paper.
 
 With the unit vectors x_n along the links (standard Denavit-Hartenberg), a point of link n is at the sum of l_m x_m over

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Vectors (3,) and unit quaternions (x, y, z, w), ROS order, as plain floats.
 
 For one at a time this is faster than NumPy.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Trunk tilt: orientation of the trunk -> pitch and roll -> direction of gravity in each arm's base frame.
 
 Trunk axes (REP-103): x forward, y left, z up. The trunk rolls by r about x, then pitches by p about y, both fixed axes:

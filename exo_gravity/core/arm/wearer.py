@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's arm: body mass and segment lengths -> the mass that each link of the robot carries.
 
 Body segment tables give a segment's mass as a share of body mass, and its centre of gravity as a share of the segment's

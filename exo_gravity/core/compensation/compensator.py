@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
 `Compensator.step` is the whole way: it checks the input and the tilt, evaluates the law, adds the terms and what a

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Changes of load as guided motions, a load that leaves the hand, and a last fade; for any number of joints.
 
 A change of law, mode, masses, gain, `max_effort` or terms, and the end of a weighing, is a guided motion

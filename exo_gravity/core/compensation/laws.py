@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The laws by which the torque that holds an arm can be computed, by name.
 
 A law is an object with two methods, and its entry in `LAWS` is what makes it for the settings in force. A law that does

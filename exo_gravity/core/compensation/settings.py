@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The settings of the compensator, checked against each other, and the parameters that describe them."""
 
 import itertools

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Support that adapts: what the node `wearer` asks for beyond the parameter `support`, for as long as it renews it.
 
 The path of the torque does not depend on who asks: a request is bounded, late ones are refused, and one that is not

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How the calibration moves the arm, slowly along straight lines in joint space, and what a pose's sweeps show.
 
 All joints sweep through a pose there and back. At the same angle the torque of the way there is gravity plus friction,

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighs what is in the hand of a relaxed arm: the motors take it over, and sweep all joints a little there and back.
 
 At first the arm is held where it is, so that the wearer can relax and the motors get the load. The mean of both

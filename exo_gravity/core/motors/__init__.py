@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The motors: a record of each type, their frames, and the load of these on the bus. `families` has them all."""
 
 from exo_gravity.core.motors.ak import pack_reply, unpack_reply

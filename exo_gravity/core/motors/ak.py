@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """AK motors (CubeMars, T-Motor): a record of each type, and the frames of their boards.
 
 `mit`, V1 and V2 boards (CubeMars driver manual V1.0.15, "MIT mode"): commands of MIT mode (`frames`) with the motor's

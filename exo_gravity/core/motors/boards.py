@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What keeps the boards of an arm's motors from serving it, as far as their frames show it.
 
 A board that is set up otherwise than its parameters say is silent, or reports too seldom: without its own sentence, a

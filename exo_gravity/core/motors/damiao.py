@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Damiao motors (OpenArm, i2rt's YAM): a record of each type, and their frames in MIT mode, on CAN and CAN FD.
 
 Commands are those of MIT mode (`frames`), with the motor's ID, 1 to 15, as an 11-bit arbitration ID; FF x 7 and FC

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The motor families: our own, and those that other distributions provide.
 
 A laboratory's own motors need no fork: a distribution that names a `Family` under the entry point group GROUP in its

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What all motor families share: the record of a motor, the frames of MIT mode, and what a wire format is.
 
 MIT mode (Ben Katz's drive, from which AK and Damiao firmware descend) is a big-endian bit stream of 8 bytes:

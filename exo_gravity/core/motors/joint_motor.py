@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A motor on a joint, the parameters of an arm's motors, and the load of their frames on the CAN bus.
 
 A `JointMotor` translates a joint's effort and damping to the frames of its wire format, and frames to `JointSample`s.

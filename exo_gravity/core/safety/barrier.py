@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The last hand on every drive: no torque that is asked for, whatever asks for it, throws an arm.
 
 `shape` limits the torque of an arm that is carried, in this order: soft wall before a joint limit, clamp to the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the torque in the motors' replies shows: whether they deliver what was commanded, and whether they bear it.
 
 A motor that has been switched off, has restarted, missed its ENTER, or obeys another commander still replies, but with

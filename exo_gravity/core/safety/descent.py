@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The way down: lowers an arm at a bounded speed until nothing holds it, so that switching its motors off is safe.
 
 Each joint has a torque s, which starts as the last one applied, and a damping k, which the motor itself applies. With v

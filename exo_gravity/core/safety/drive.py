@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the safety machine decides: its state, what the motors receive, and the fault that let a worn arm down.
 
 Every fault has a code for programs and a sentence for people.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The start gate: what must hold before the motors of an arm are switched on, and before they carry it."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Guided motion: how a torque gets from what a joint has to what is wanted, whatever the cause.
 
 Where a torque begins or its law changes, the torque moves only as fast as the joint stays calm. With f what the joint

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Control of one arm: a lease that carries its holder's name, and that only its holder can renew.
 
     hold     takes the lease if it is free, and renews it

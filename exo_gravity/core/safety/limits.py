@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The limits of a worn arm, and which motor readings are a fault.
 
 `find_faults` checks a motor's reading; trust.py confirms what it finds. barrier.py keeps every drive within the limits.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
 `transitions.TRANSITIONS` has every transition, `power.NEXT` those of a single motor.

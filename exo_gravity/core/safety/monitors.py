@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the safety machine monitors besides the motors' readings: whether the arm is at rest, and the efforts' age."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An independent eye on the compensator: torque that gravity cannot account for, and the speed that it can cause.
 
 It shares no code and no masses with the compensator. Its own ground is `largest_moment`, M1..M4 in kg m: the largest

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether each motor is on, as far as its replies and silences tell, and what it is sent for that.
 
 No frame of an AK motor says whether it is on. What is known follows from what it was sent, whether it has replied, and

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What motors did while the control loop stood still: whether their own time-out took their torque away.
 
 A motor's firmware may let go of its joint if no command comes for a while, without damping and without a word, and the

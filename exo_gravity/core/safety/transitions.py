@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The states of an arm between off and carried: every transition, and what each state sends.
 
 Two states are safe. While nothing is proven (checking, proving), any fault switches the motors off at once: the arm

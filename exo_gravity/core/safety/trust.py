@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the motors' readings say: the newest that count, who is silent, a fault, and whether the angles can be trusted.
 
 After power-up a motor knows its angle modulo a turn of its rotor only: 60 degrees at the joint of an AK60-6, 40 at an

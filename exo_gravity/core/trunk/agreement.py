@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Whether orientation, gyroscope and accelerometer agree: what shows a wrong unit, axis or sign, and filled-in values.
 
 An accelerometer shows gravity only where its mean is 1 g. While a person moves it also measures the movement, so each

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What an IMU reports, and what no working one does: exceed its ranges, repeat values, run slowly or by a wrong clock.
 
 A value at the end of the sensor's range is saturated: only its sign is known. One beyond the range cannot come from

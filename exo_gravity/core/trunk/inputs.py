@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What messages bring of the trunk, extrapolated to the moment at which it acts: its tilt, and the motion an arm feels.
 
 A tilt becomes gravity's direction, an angular velocity and an age. Gravity's vector (`/imu/data`) goes before pitch and

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of `imu`."""
 
 from exo_gravity.core.params import Param

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How far the estimated tilt may be off: a small model, in which each thing that was not measured has its term.
 
 One standard deviation of the tilt is the root of the sum of the squares of the terms that docs/imu.md lists. Those of a

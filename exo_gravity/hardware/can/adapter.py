@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The serial number of a CAN adapter: whether a bus is still the one that its name meant.
 
 Names such as can0 are given in the order in which adapters are found. Of two exchanged adapters, motors with the same

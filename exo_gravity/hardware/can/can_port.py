@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A python-can bus that survives its adapter: every error becomes a BusError, and a failed bus is opened again.
 
 A send that fails once is a lost frame, as on the wire: a full transmit queue (ENOBUFS) is often empty a cycle later.

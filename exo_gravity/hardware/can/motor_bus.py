@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The motors of one arm, in MIT mode: command all, collect the replies until a deadline.
 
 They are on one python-can bus or on several. All buses are sent their commands before the replies of all are awaited.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How old the motors' replies are: each belongs to a command, and a queue on the way shows as commands under way.
 
 A reply does not say which command it answers, but a V1 or V2 board answers each command once, and in order. So the

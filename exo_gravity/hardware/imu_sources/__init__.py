@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """IMUs that the node `imu` reads itself; `open_source` opens the one that the parameters name."""
 
 from collections.abc import Callable, Mapping

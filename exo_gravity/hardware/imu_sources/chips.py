@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """IMU chips on an I2C bus, read by Adafruit's CircuitPython drivers.
 
 The drivers know the registers and the scales. They return the chip's newest values and queue none. So a chip measures

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Stamps for samples that arrive in batches over a serial port."""
 
 import itertools

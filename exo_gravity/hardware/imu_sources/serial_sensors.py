@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Sensors on serial ports, through `pyserial`: packets of a fixed length, cut out of a stream of bytes.
 
 WitMotion (WT901, WT61, HWT905 ...): packets of 11 bytes, 0x55, type, data, checksum. Data sheet WT901 v20-0702, 5.1 and

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """An open IMU, and one that is opened again after it was unplugged."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One owner per CAN bus and host, and a page of notes for the process that comes after it.
 
 The lock is an abstract UNIX socket named after the bus. Such a name belongs to the network namespace, as a CAN

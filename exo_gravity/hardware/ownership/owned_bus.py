@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The bus of an arm, or its buses, that this process owns: locks, watchdog, and what a previous owner left behind.
 
 Each bus has its own lock and notes. One watchdog holds all of them and lets the whole arm down: a joint without load

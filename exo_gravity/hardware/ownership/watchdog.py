@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The watchdog: a process that lets the arm down when its bridge dies, freezes or hands it over.
 
 It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The times of a recording without the steps of the computer's clock.
 
 A computer without a battery for its clock sets it when it finds a time server: times of arrival step back, or ahead by

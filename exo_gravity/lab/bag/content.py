@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a recording holds: its topics, and what the reader makes of them, as plain data that needs no bag library."""
 
 from dataclasses import dataclass, field

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The joint states or efforts of one topic -> arrays of the joints of one arm.
 
 Others publish there too: a gripper, or a driver of more joints. Messages are kept by the joints that they name, and

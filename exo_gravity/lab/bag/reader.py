@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A rosbag2 recording -> the arrays of each arm, its script, faults and parameters.
 
 An arm is a namespace with a `joint_states` topic. Each of its `effort_commands` carries the stamp of the joint state

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated arms -> a rosbag2 recording with the same topics as one of `recorder`: for trials without ROS."""
 
 import json

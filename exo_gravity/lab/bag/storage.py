@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Serialised messages of a rosbag2 recording: MCAP or sqlite3, compressed or not, complete or cut short.
 
 A killed recorder leaves neither metadata.yaml nor an index, so neither is needed: MCAP files are read record by record,

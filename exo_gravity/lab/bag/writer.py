@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Writes rosbag2 recordings (MCAP): from serialised messages, in a separate thread, and complete copies of cut ones.
 
 rosbags collects messages in a chunk of up to 1 MiB before it writes them. This writer closes the chunk and hands it to

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Finds the motors of all families on a bus without moving any.
 
 Each ID is asked what a motor of each family answers with its state (`WireFormat.questions`), those first that can have

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Held poses -> the arm's moments, the torque scale of each motor, and what the poses do not show.
 
 The commanded effort that holds the arm in a pose is, without friction, which averages out over both directions,

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate imu: the mounting of the IMU, from a recording of its samples or from the running driver.
 
 docs/calibration.md has the idea: upright, the accelerometer shows the trunk's z axis (up); the trunk bows about its y

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A calibration on the device: the person at the terminal, and the arm's nodes with `calibrator` for the compensator.
 
 Every observation is written to the record as it comes, so that Ctrl-C and faults lose nothing. On Ctrl-C, after the

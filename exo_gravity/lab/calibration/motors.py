@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate motors: which motor turns which joint, which way, and at which angle the arm hangs.
 
 docs/calibration.md has the steps. The encoder is on the rotor: after power-up the angle is ambiguous by a turn of the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate new: writes the parameter file of an arm from its URDF, its motors and their CAN IDs.
 
 What the URDF and the motors' records tell is filled in: limits, torques, where the arm hangs. What only the arm itself

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighted least squares for the unknowns of an arm in held poses.
 
 The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, three

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Which poses the calibration visits: given ones, or the most informative ones that the motors can hold.
 
 What holds the arm is expected with a mean and a standard deviation for every pose. Each joint has moments of its own,

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Observations from a recording: poses that were passed slowly in both directions, and poses that were held.
 
 A pose that was passed there and back gives gravity and friction. A held pose gives gravity to within friction only: the

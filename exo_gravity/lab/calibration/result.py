@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibration found, the parameter file that it writes, and its page.
 
 The new file is a copy of the old one in which everything else stays as it is, comments and order included. Each value

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The tour of a calibration: moves the arm slowly from pose to pose and measures what each of them needs to be held.
 
 Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is

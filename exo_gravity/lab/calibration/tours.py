@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)

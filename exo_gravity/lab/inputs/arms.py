@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arms of a parameter file: the one reader that the tools share.
 
 An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked as the nodes check them at start, so an

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of a file, checked as the nodes check them at their start."""
 
 from collections.abc import Mapping, Sequence

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameter file that drives everything: ROS 2's own YAML form, keyed by fully qualified node names.
 
     /imu: {ros__parameters: {...}}

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The two references: gravity torques by independent libraries, from the same masses and Table 1 of the paper.
 
 The Robotics Toolbox's `gravload` runs a recursive Newton-Euler algorithm over the Denavit-Hartenberg parameters;

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ROS 2's parameter YAML, read and written as rcl's own parser reads it: nodes and tools see the same values.
 
 YAML libraries decide by other rules what a plain scalar is: `5e-1` is a string for PyYAML and a number for rcl, `y` a

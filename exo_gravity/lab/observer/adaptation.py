@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Support that adapts: it rises while the arm sinks, and then decays. Why so: docs/wearer_torque.md.
 
 With w (n,) Nm, the torque that carries the wearer's arm,

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Contacts: a torque that comes faster than a person's does, as at a table's edge."""
 
 import math

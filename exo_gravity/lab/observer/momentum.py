@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque, by the generalized-momentum observer on the compensator's own model.
 
 A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' torque tau and friction f,

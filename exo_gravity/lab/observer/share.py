@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque over a recording, and their share of what carries their arm against gravity.
 
 With their torque tau and the torque w that carries their arm, both (4,), over any span of time

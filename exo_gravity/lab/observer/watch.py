@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """All estimates of the wearer of one arm, from one sample to the next: torque, share, contacts, support."""
 
 import math

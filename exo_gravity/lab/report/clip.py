@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A recording -> a clip: a wearer whose arms move as they did, torques and limits, and a caption with time and step.
 
 Everything is drawn in the trunk's axes, the arms from the parameters that the recording holds, and the wearer as a

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Many recordings -> tidy rows: one for each recording, arm and joint.
 
 `summary` is a pure function from a path to rows of plain values: processes or the workers of a cluster run it, and a

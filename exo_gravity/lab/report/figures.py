@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The figures of a report: the paper's plot of positions, velocities and torques; the drift; the wearer's torque.
 
 A long recording is drawn as the minimum and maximum of each of 2,000 intervals, so that no peak is lost.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """HTML pages that need nothing outside themselves, and the look of their figures.
 
 A function that returns a piece of HTML escapes every text that it is given; a line break in a heading is kept. The

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What many trials show together: a table, the trend of each subject over their sessions, and a page with both.
 
 A session is a day. Trials of one subject, arm, mode and support, all real or all simulated, are compared with each

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The smoothness of a movement: its spectral arc length (SPARC).
 
 Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet (2015), "On the analysis of movement smoothness", J. Neuroeng.

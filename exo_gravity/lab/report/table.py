@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The numbers of a report, in degrees: for the CSV files, for the page, and for the terminal."""
 
 import csv

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The report of a recorded trial: analysis and verdict of each arm, printed, and written as CSV, figures and a page."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The verdict of a report: under what settings each arm was recorded, whether it held, and the worst that happened."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
 
 import argparse

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque and share in a report, by the same observer that runs in the node `wearer`.
 
 It needs the compensator's parameters and, if that used an IMU, `/imu/data`. Parameters that were changed during the

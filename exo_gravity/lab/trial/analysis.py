@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The analysis of a trial: the holds of a recording, the drift in each, the response to pushes, and the verdict.
 
 Drift is the slope of Huber's M-estimator (Huber 1964) fitted to means over parts of the hold. Averaging resolves less

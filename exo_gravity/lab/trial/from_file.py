@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """trial --offline: the simulated arms of a parameter file perform a script without ROS, faster than real time.
 
 It is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.

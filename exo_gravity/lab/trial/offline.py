@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial without ROS and in virtual time: a compensator carries the simulated device, as fast as possible.
 
 The loop, the bus and the safety machine are those of `can_bridge` (sim/virtual_arm.py); the compensator answers the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The recorded arrays of one arm, and the time spans in which it was carried, left alone and still.
 
 Stillness is judged from position only. Motors report velocity in steps of 22 to 24 mrad/s without a code for 0, so a

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial in real time: starts the nodes, follows the script on the recorder's lines, and stops the nodes.
 
 A trial on the simulated device that fails because this computer was too busy is repeated: nothing is worn, and every

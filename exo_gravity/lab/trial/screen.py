@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The screen of a running trial: the current step, the time left, and angles, torques and drift of each arm.
 
 It reads the lines of JSON that `recorder` prints ten times a second. If a simulator performs the script, its steps are

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What is asked of a trial by its script: how long and how still the arm must be held."""
 
 import math

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a recording is of: the subject's code, the protocol and a note. No name of a person belongs in any of them."""
 
 import re

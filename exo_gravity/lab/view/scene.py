@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a viewer shows around the arms: gravity, the torque and the limits of each joint, and the state of each arm.
 
 Every shape is given in the trunk's axes, so that a viewer needs no transforms for it. A joint's range is an arc around

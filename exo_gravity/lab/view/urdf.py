@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The robot description (URDF) of one arm or of both, made from the same values as the control law.
 
 Every frame has the trunk's axes (REP-103: x forward, y left, z up) while the arm hangs at theta = 0. So the origins of

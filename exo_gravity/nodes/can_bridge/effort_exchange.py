@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Joint states out, effort commands in: which effort command answers which joint state, and how old that state is.
 
 Efforts carry the stamp of the joint state that they answer. The exchange remembers when, on the monotonic clock, each

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """can_bridge: CAN motors -> `joint_states`, `effort_commands` -> CAN, through the safety machine.
 
 A control thread runs the bus (hardware/control_loop.py). In each cycle it publishes the joint states and reads the

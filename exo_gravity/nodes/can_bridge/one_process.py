@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """can_bridge and the compensator of its arm in one process: where the last reply has arrived, its answer is computed.
 
 Each node keeps its own context (name, parameters, enclave) and its own executor, on a separate thread. All topics are

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """How `can_bridge` is operated: its services enable, clear_fault, resume, confirm_pose and set_zero; /diagnostics.
 
 Each service runs on the control thread between two cycles, and the executor does not wait for it: a request to let the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The arm that `compensator` carries: its parameters, what is reported of it, and where its efforts go.
 
 It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from a file or from `robot_description`.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """compensator: joint states and trunk tilt in, effort commands out, at the rate at which joint states arrive.
 
 It answers each joint state at once, with the joint state's stamp, so that `can_bridge` can tell how old the reading is.

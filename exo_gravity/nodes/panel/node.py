@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """panel: a web page on the machine that carries the arms: see them, set the support, let them down.
 
 It is a ROS client like any other: it uses the topics, services and parameters that `ros2` can use, and nothing depends

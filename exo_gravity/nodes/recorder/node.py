@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """recorder: writes a trial to a standard rosbag2 recording (MCAP), with the parameters of every node.
 
 Twice a second it looks for new topics, and records those of all arms, the IMU, diagnostics and parameter changes, each

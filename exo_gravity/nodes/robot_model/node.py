@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """robot_model: what viewers need of the arms that run: a description, joint states of both, and markers.
 
 It looks for compensators, requests the parameters of each and of its bridge, and publishes

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The inner parts of rclpy that the nodes use, in one file: they may change between distributions.
 
 Each has a fallback in rclpy's public interface, which does the same at a higher cost or says less:

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """ROS messages <-> plain values: stamps, joints by name and never by index, and a node's status on /diagnostics.
 
 Levels of a status:

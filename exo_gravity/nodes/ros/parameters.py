@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
 
 import math

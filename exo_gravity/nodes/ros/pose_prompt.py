@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Asks on a terminal whether an arm hangs as it is drawn, when the start of its can_bridge waits for the answer.
 
 The launcher runs it on its own terminal; arguments: the full names of the nodes can_bridge to ask for. It is an

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The life of every node: start, spin, and a clean stop on Ctrl-C, SIGTERM or an error.
 
 rclpy's own signal handlers close the context before a node can react. Here a signal only sets a flag, so that a node's

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Subscriptions, most of them outside the executor: on a thread with a wait set for one alone, or polled by its owner.
 
 rclpy's executor rebuilds its wait set, services included, for every message. That is most of a message's cost

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque budget of what an arm carries at present: whether its motors can hold it in every pose.
 
 It takes about 0.2 s of arithmetic, on a thread of its own, so that the estimate of the wearer's torque goes on.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """wearer: estimates what the wearer of an arm does, beside the path of the torque.
 
 It reads `joint_states`, the trunk's motion and the compensator's parameters, 100 times a second, and publishes

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated motors, a family a file: they behave as their firmware does.
 
 Those of other distributions' families are found by the entry point group GROUP: its name is that of the family, and it

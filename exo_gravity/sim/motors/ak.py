@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """AK motors that answer real frames: MIT mode of V1 and V2 boards, and of V3 boards.
 
 What all firmware of V1 and V2 boards does (CubeMars driver manual V1.0.15; Ben Katz's drive, from which it descends):

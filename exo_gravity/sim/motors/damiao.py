@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Damiao motors that answer real frames in MIT mode, as their firmware does.
 
 Frames and registers: core/motors/damiao.py. What the firmware does was read in a disassembled DM-J4310 firmware whose

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What the firmwares of AK boards do that the wire format does not say: a record each.
 
 Where the firmware of a family was not run or read, the record holds the worst case, and `assumed` names the field.

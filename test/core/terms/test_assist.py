@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The outer loop's input: followed while it is sound, faded within 100 ms when it is not."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Each term alone, and the sum of all behind its shaper."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The terms on the simulated arm: 12-bit frames, torques up to 10 ms late, random arms, frictions and wearers.
 
 A passive term gives no more energy than it took plus what it may have stored. `friction` and `inertia` are fed by the

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What goes wrong inside the nodes. It is injected as they start: Python imports sitecustomize from this folder."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Deliberate defects, each of which must turn a row of the fault matrix unsafe.
 
 A defect replaces methods, properties or constants of the running nodes as they start (sitecustomize.py). It names the

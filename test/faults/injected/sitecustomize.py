@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Imported by each Python process as it starts, where PYTHONPATH has this folder: injects what the tests ask for.
 
 EXO_TEST_DEFECT: the name of a defect. EXO_TEST_FAILURE: a file; once it exists, the compensator's step fails. What

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A synthetic recording: its arrays, its messages, and a bag of them."""
 
 import pytest

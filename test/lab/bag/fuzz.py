@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m test.lab.bag.fuzz --minutes 60: damaged recordings of every storage, each read and reported.
 
 Bytes are cut off, flipped, zeroed, moved or repeated. The report may refuse a recording in one sentence (DataError) and

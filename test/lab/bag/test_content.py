@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The time series of a recording as columns and as a table of pandas, against the arrays that they are made of."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Damaged recordings of every storage: a report, or a refusal in one sentence. `test.lab.bag.fuzz` goes on for long."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a recording shows of its arms: when each was carried, faults, changed parameters, parameters at the start."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages decoded in bulk, against rosbags, which decodes them one by one: the same numbers, bit for bit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of others: a clock that was set, copies beside them, damage, degrees, other joints on the same topic.
 
 Each kind comes from a public report. What was recorded is known, so is the verdict: the arm held in all of them.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of every form, complete, cut short, damaged or incomplete: what can be read is read, the rest is named.
 
 rosbags is the independent writer and decoder.

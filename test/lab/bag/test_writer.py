@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of `BagWriter` and complete copies of cut ones, read by independent readers; also of a killed process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Who answers on a bus, found without moving a motor; in virtual time."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Gravity measured in a slightly wrong direction: what the poses say of it, and the corrected mounting of the IMU."""
 
 from __future__ import annotations

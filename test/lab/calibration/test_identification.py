@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Identification from held poses: right on random devices, with stated errors, and with what it cannot show."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What an identification leaves out, and what it refuses with the reason and the pose that is missing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A tour on the simulated device: what it measures, within which limits it moves, and what stops it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """IMU chips on an I2C bus, as a driver of Adafruit's sees them: transfers of bytes to and from registers.
 
 Scales and registers are those of the data sheets: RM-MPU-6000A, DS-000189 (ICM-20948) and DS12814 (LSM6DSOX).

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Sensors on a pseudo-terminal, and the packets that they send."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A laboratory's own motor, in its own distribution: what CONTRIBUTING's "Add a motor family" says, and no more.
 
 Its board speaks MIT mode with the torque first, and replies with IDs of its own.

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The outer loop's input: efforts from the user's own node, added to gravity compensation only while they are sound.
 
     off        `max_effort` is 0

@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Each term that ships: what it adds to gravity compensation, and why it cannot harm.
 
 The torque reaches the joint late: the motor's reply, the computation, the bus. DELAY is what every term must bear

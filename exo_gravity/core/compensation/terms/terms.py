@@ -1,3 +1,4 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The terms at work: their parameters, and their bounded sum, plus the outer loop's input.
 
 The compensator guides a change of parameters. Whatever is wrong with the sum, gravity compensation goes on beneath it.
