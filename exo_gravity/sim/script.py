@@ -35,6 +35,7 @@ VALUED: dict[str, tuple[Callable[..., Any], float, float, str]] = {
     "lean": (one_float, -0.8, 0.8, "rad"),
     "load": (one_float, 0.0, MAX_PAYLOAD, "kg"),
 }
+PER_JOINT = ("move", "push")
 TRUNK_ACTIONS = ("bow", "lean", "walk", "sit")
 
 
@@ -84,12 +85,14 @@ class TrialScript:
         steps = content["steps"]
         if not isinstance(steps, list) or not steps:
             raise ParameterError("steps", steps, "a list of at least one step")
-        return cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+        script = cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+        script.check(next((len(step.value) for step in script.steps if step.action in PER_JOINT), 0))
+        return script
 
     def check(self, count: int) -> None:
         """Raise ParameterError unless the script is for an arm of `count` joints."""
         for i, step in enumerate(self.steps):
-            if step.action in ("move", "push") and len(step.value) != count:
+            if step.action in PER_JOINT and len(step.value) != count:
                 raise ParameterError(f"steps[{i}].{step.action}", list(step.value), f"{count} numbers, one per joint")
 
     @property

@@ -63,7 +63,7 @@ class CarriedArm(DirectController, VirtualArm):
         for joint in joints if remembered else ():
             for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
                 device.exchange(*frame)
-        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", max_effort=peak, use_imu=False,
+        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", support=1.0, max_effort=peak, use_imu=False,
                             wearer_mass=WORN_MASS, wearer_cog=WORN_COG)  # fmt: skip
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         limits = Limits(JOINTS, max_effort=peak, home_tolerance=tolerance)
@@ -85,6 +85,7 @@ class CarriedArm(DirectController, VirtualArm):
         script = TrialScript.parse({"name": "raise", "steps": [{"move": pose, "over": 2.0}]})
         self.device.start(VirtualWearer(script))
         self.run(3.0)
+        assert self.safety.state is State.ACTIVE, self.safety.fault
         self.truth = self.device.truth = TruthRecords()
 
     @property

@@ -61,6 +61,14 @@ def test_a_queue_that_is_there_at_once_is_found_and_forgotten_once_it_is_gone():
     assert not line.requests.late
 
 
+@pytest.mark.parametrize("rate", [100.0, 250.0, 1000.0])
+def test_a_device_that_stands_still_again_and_again_and_then_answers_all_at_once_is_no_queue(rate):
+    line = Line(1.0 / rate)
+    line.run(10.0, delay=lambda now: max(0.0003, 0.06 - now % 0.2))  # for 60 ms, five times a second
+    assert line.now == pytest.approx(10.0, abs=0.1)
+    assert not line.requests.late
+
+
 @pytest.mark.parametrize("rate", [50.0, 250.0, 1000.0])
 @pytest.mark.parametrize("delay", [0.0003, 0.016], ids=["prompt", "an adapter's timer of 16 ms"])
 def test_lost_frames_are_no_queue_and_hold_up_few_commands(rate, delay):

@@ -41,7 +41,7 @@ REFUSALS = [
     ({"robot.cog": [0.0, 0.0, 0.31, 0.0]}, "within its link"),
     ({"support": math.nan}, "support out of range Min: 0.0, Max: 1.0"),
     ({"wearer.body_mass": 0.9}, "wearer.body_mass = 0.9: must be a number from 10 to 300 kg"),
-    ({"wearer.mass": [0.0, 0.0, 9.0, 9.0]}, "total mass in kg = 19.85: must be at most 10 "),
+    ({"wearer.mass": [0.0, 0.0, 9.0, 9.0], "support": 1.0}, "total mass in kg = 19.85: must be at most 10 "),
     ({"use_imu": True}, "read-only parameter: use_imu"),
     ({"suport": 0.5}, "suport = 0.5: must be one of "),
     ({"mode": "two_g"}, "one of one_g, zero_g"),

@@ -208,9 +208,9 @@ def test_joint_states_that_are_old_by_their_stamps_are_ignored(rig):
 
 
 def test_a_missing_joint_fades_the_torque(rig):
-    rig.names, rig.pose, rig.applied = rig.names[:-1], rig.pose[:-1], ()
+    rig.names, rig.pose, rig.applied = rig.names[:-1], rig.pose[:-1], rig.applied[:-1]
     rig.wait_until(rig.is_zero)
-    carried(rig, lambda: "joint_states: name must be joint_a1" in rig.status.message)
+    carried(rig, lambda: f"joint_states: name must be {NAMES[0]}" in rig.status.message)
 
 
 def test_the_torque_fades_to_zero_before_the_node_ends(rig):

@@ -208,7 +208,8 @@ def test_every_page_gets_setup_and_state_and_a_reloaded_page_stays_the_same(stag
         assert first(connection, "page") == page
 
 
-def test_the_settings_of_an_arm_are_read_when_they_are_asked_for(stage):
+def test_the_settings_of_an_arm_are_read_when_they_are_asked_for(stages):
+    stage = stages()
     stage.arms.settings["right"]["support"] = 0.4  # of which the pages have not heard yet
     assert get(stage, "settings/right").json()["settings"]["support"] == 0.4
     assert get(stage, "settings/middle").status_code == 404

@@ -40,7 +40,7 @@ def test_a_step_of_the_hand_has_a_mass():
         ({"name": "x", "steps": []}, "steps"),
         ({"name": "x", "steps": [{"hold": 1, "over": 1}]}, "steps[0]"),
         ({"name": "x", "steps": [{"hold": "long"}]}, "steps[0].hold"),
-        ({"name": "x", "steps": [{"hold": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
+        ({"name": "x", "steps": [{"move": [0, 0, 0, 0], "over": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
         ({"name": "x", "steps": [{"move": [0, 0, 0, 90], "over": 1}]}, "steps[0].move"),
         ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
         ({"name": "x", "steps": [{"bow": 45, "over": 3}]}, "steps[0].bow"),

@@ -274,7 +274,8 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         anfis = AnfisLaw.load(read(path)) if path and read else None
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
+    with named("robot."):
+        by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
     return _settings_of(values, values["side"], robot_of(values), wearer_of(values), anfis=anfis, robot_by_mass=by_mass)
 
 

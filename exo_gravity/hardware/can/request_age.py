@@ -9,6 +9,7 @@ pause tells them apart: a motor that is sent nothing still replies to all that i
     oldest command without a reply older than `longest`    the motor is sent nothing until it is known why:
         no reply for `quiet`                                    those commands were lost, and are forgotten
         replies, which show a queue as long as `longest`        twice within `again`: the replies are `late`, a fault
+        replies at once                                         the device stood still: no queue, and nothing is wrong
 
 While replies are late, a motor is sent a command only if no more are under way than `longest` holds: a queue that our
 own commands fill gets no longer.
@@ -30,6 +31,9 @@ class ReplyAge:
     #: s at most that pass between two looks: where more have, the whole computer may have stood still, and the replies
     #: that wait are no older than others
     look: float = 0.025
+    #: least spread of a queue's replies, as a share of their commands'. A line that is slower than the commands, or as
+    #: fast, spreads replies like them; a device that stood still answers all at once
+    spread: float = 0.5
     again: float = 0.5  #: s within which a second such pause must follow: a device that stood still once is no queue
     most: int = 256  #: commands that are remembered
 
@@ -93,9 +97,10 @@ class Requests:
             self.late = 0.0
         if self._sent:
             self._replies.append(now)
-            count = len(self._replies)  # so many commands at least were under way when the pause began
-            age = self._replies[0] - self._sent[-min(count, len(self._sent))]
-            if count >= AGE.fewest and age > AGE.longest:
+            sent = self._sent[-len(self._replies) :]  # so many at least were under way when the pause began
+            age = self._replies[0] - sent[0]
+            is_spread = now - self._replies[0] >= AGE.spread * (sent[-1] - sent[0])
+            if len(sent) >= AGE.fewest and age > AGE.longest and is_spread:
                 self.late = age if now - self._suspected <= AGE.again else 0.0
                 self._suspected, self._sent = now, []
         return asked
