@@ -29,7 +29,7 @@ from .bus_cases import CUT, RELEASE, stays_off
 from .command_cases import stopped_for
 from .fault_case import ALL_JOINTS, FaultCase
 from .rig import Rig
-from .rigs import SignCheckRig, WearerRig, variant
+from .rigs import WORN_COG, WORN_MASS, SignCheckRig, WearerRig, variant
 
 GAP = 4.0  # s for which the bridge stands still
 BLIND = 30.0  # s, longer than a let-down waits for motors that do not reply
@@ -42,7 +42,9 @@ CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the j
 SUPPORT = itertools.cycle((1.0, 0.0, math.nan, 50.0, -1.0))
 
 TimeoutRig = variant(Rig, simulator={"firmware": {"timeout": TIMEOUT}})
-ExchangedRig = variant(SignCheckRig, bridge={**SignCheckRig.bridge, "can_id": [1, 2, 4, 3]})
+ExchangedRig = variant(
+    SignCheckRig, bridge={**SignCheckRig.bridge, "can_id": [1, 2, 4, 3], "position_min": [-1.65, -0.5, -0.78, -0.5]}
+)
 
 
 class AskingRig(WearerRig):
@@ -66,6 +68,11 @@ class AdaptiveRig(WearerRig):
     """Zero-G with a support that adapts, and the node `wearer`, which asks for it."""
 
     compensator: ClassVar[Parameters] = {**WearerRig.compensator, "support": 0.5, "support_adapts": True}
+    # The wearer carries half of their arm themselves, so that a support of one half holds it.
+    simulator: ClassVar[Parameters] = {
+        **WearerRig.simulator,
+        "wearer": {"mass": (0.5 * WORN_MASS).tolist(), "cog": WORN_COG.tolist()},
+    }
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         bridge = {"rate": self.rate}

@@ -275,7 +275,7 @@ class SuccessorRig(AssistedRig):
         super().bring_to(stage)
 
 
-_MASS, _COG = Wearer(75.0).on_links((0.05, 0.13, 0.3, 0.3))
+WORN_MASS, WORN_COG = Wearer(75.0).on_links((0.05, 0.13, 0.3, 0.3))
 
 
 class WearerRig(Rig):
@@ -284,7 +284,7 @@ class WearerRig(Rig):
     pose = (0.0, 0.4, 0.2, 0.5)
     compensator: ClassVar[Parameters] = {"mode": "zero_g", "support": 1.0, "wearer": {"body_mass": 75.0}}
     simulator: ClassVar[Parameters] = {
-        "wearer": {"mass": _MASS.tolist(), "cog": _COG.tolist()},
+        "wearer": {"mass": WORN_MASS.tolist(), "cog": WORN_COG.tolist()},
         "friction": {"coulomb": [0.1] * 4},
     }
 

@@ -129,11 +129,14 @@ def first_joint_only(applied: property) -> property:
 
 
 def off_after_a_fault(drive: Any, machine: Any, *_: Any) -> Any:
-    return drive._replace(powered=False) if machine.state == "letting down" and machine.fault else drive
+    is_off = machine.state == "letting down" and machine.fault
+    return type(drive).off(len(drive.effort))._replace(send=(Send.EXIT,) * len(drive.effort)) if is_off else drive
 
 
 def without_enter(drive: Any, machine: Any, *_: Any) -> Any:
-    return drive._replace(enter=[False] * len(drive.effort)) if machine.state == "letting down" else drive
+    if machine.state != "letting down":
+        return drive
+    return drive._replace(send=tuple(Send.COMMAND if send is Send.ENTER else send for send in drive.send))
 
 
 def replies_with_torque(dt: float, joints: Any, *others: Any) -> Any:
