@@ -6,6 +6,7 @@ A study that was stopped goes on where it was, unless the code or an installed p
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import shutil
@@ -60,7 +61,7 @@ def play(
     folder.mkdir(parents=True, exist_ok=True)
     failed, begin = [], time.monotonic()
     try:
-        for number, outcome in enumerate(in_processes(work, left, workers), 1):
+        for number, outcome in enumerate(in_processes(_importable(work), left, workers), 1):
             if outcome.problem:
                 failed.append(f"{outcome.item}: {outcome.problem}")
                 continue
@@ -83,6 +84,14 @@ def _keep(file: Path, result: object) -> None:
     whole = file.with_suffix(".new")
     whole.write_bytes(pickle.dumps(result))
     os.replace(whole, file)
+
+
+def _importable(work: Callable[[Item], Result]) -> Callable[[Item], Result]:
+    """Return `work` from its module's own name: other processes do not import the `__main__` of a package."""
+    if work.__module__ != "__main__":
+        return work
+    spec = sys.modules["__main__"].__spec__
+    return cast(Callable[[Item], Result], getattr(importlib.import_module(spec.name), work.__name__)) if spec else work
 
 
 def _state(files: Sequence[Path]) -> str:
