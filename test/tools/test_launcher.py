@@ -250,7 +250,8 @@ def test_a_node_whose_package_is_missing_is_refused_before_any_starts(monkeypatc
     monkeypatch.setattr(packages, "find_spec", lambda name: None)
     error = refused({})
     assert error == (
-        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install 'exo_gravity[sim]'\n"
+        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install '.[sim]' in the "
+        "source folder of exo_gravity\n"
     )
 
 

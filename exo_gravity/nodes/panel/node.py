@@ -33,6 +33,7 @@ from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.bag.content import MARKERS
+from exo_gravity.lab.packages import missing
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run
@@ -273,8 +274,7 @@ class Panel(Node):
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:
-            missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
-            raise ExoGravityError(missing) from None
+            raise ExoGravityError(missing(error.name or "", "panel")) from None
         self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(TIMING.state_period, self._send_state)
         self.create_timer(TIMING.discovery_period, self._arms.discover)
