@@ -24,6 +24,9 @@ class MeanLimits:
     offset: float = 0.04  #: share of 1 g: bias and scale of an accelerometer that was never calibrated
     walk: float = 0.67 / STANDARD_GRAVITY  #: s: 0.67 m/s; an IMU that is swung in a circle by hand needs 0.45
     direction_time: float = 0.3  #: s for which a movement keeps its direction
+    #: s from the start in which the estimate is still learnt from the same accelerations: what a movement adds counts
+    #: up to twice
+    start: float = 3.0
     removed: float = 0.5  #: share of 1 g below which gravity is not in the acceleration,
     in_g: float = 0.15  #: unless it is 1 g divided by 9.8, within this share
     downward: float = -0.5  #: share of 1 g along the world's z axis from which on the acceleration points down
@@ -51,7 +54,8 @@ class MeanAcceleration:
         self._mean = plus(self._mean, change, share)
         self.square += share * ((1.0 - share) * dot(change, change) - self.square)
         shift = math.dist(self._mean, UPWARD)
-        limit = limits.offset + (limits.walk + limits.direction_time * math.sqrt(self.square)) / span
+        moved = limits.walk + limits.direction_time * math.sqrt(self.square)
+        limit = limits.offset + moved * (1.0 + max(0.0, 1.0 - self.age / limits.start)) / span
         if shift > limit and self.age >= limits.shortest:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in self._mean]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: {self._mistake()}"
