@@ -24,6 +24,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.arm import ModelError
+from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
@@ -52,8 +53,8 @@ PERIOD = 0.01  # s
 class Tuning:
     """How the arm answers its wearer."""
 
-    assistance: float = 1.0  #: Nm of the motors for each Nm that is surely the wearer's, while the arm stands
-    lag: float = 0.05  #: s, of the admittance: its virtual mass over its virtual viscosity
+    assistance: float = 1.0  #: Nm of the motors for each Nm of the wearer: 1 halves the inertia that they feel
+    coasting: float = 0.3  #: s in which an arm that nobody pushes any more slows down
     stiffness: float = 3.0  #: 1/s, of the position loop: speed for each rad that the arm is behind
     reach: float = 0.1  #: rad that the wanted angle may be ahead of the arm
     fastest: float = 1.5  #: rad/s that is wanted at most
@@ -64,16 +65,16 @@ TUNING = Tuning()
 
 
 class Admittance:
-    """The cascade of every joint. It bounds itself as the terms do: docs/terms.md.
+    """The cascade of every joint, as stiff as is stable `late` s late. It bounds itself as the terms do: docs/terms.md.
 
-    least_inertia: that each joint feels, (n,) kg m^2. The velocity loop is as stiff as is stable `late` s late.
+    robot: the inertia of the arm alone, which decides what is stable. worn: with the wearer's arm, which they move.
     """
 
-    def __init__(self, least_inertia: Sequence[float], tuning: Tuning = TUNING) -> None:
-        count = len(least_inertia)
-        self.viscosity = [inertia / (2.0 * tuning.late) for inertia in least_inertia]  #: Nm s/rad, of the velocity loop
+    def __init__(self, robot: Links, worn: Links, tuning: Tuning = TUNING) -> None:
+        count = len(robot.least)
+        self.viscosity = [inertia / (2.0 * tuning.late) for inertia in robot.least]  #: Nm s/rad, of the velocity loop
         self.most = for_joints(SPRING.effort, count)  #: Nm, which a hand overcomes
-        self._tuning = tuning
+        self._worn, self._tuning = worn, tuning
         self._speed = [0.0] * count  # rad/s, that the wearer asks for
         self._angle: list[float] = []  # rad, that is wanted
 
@@ -90,30 +91,41 @@ class Admittance:
         """
         tuning, efforts = self._tuning, []
         self._angle = self._angle or list(position)
-        for n, (q, v, torque) in enumerate(zip(position, velocity, wearer, strict=True)):
+        inertias = self._worn.matrix(position).diagonal().tolist()
+        for n, (q, v, torque, inertia) in enumerate(zip(position, velocity, wearer, inertias, strict=True)):
             # What could be an error of the model is not followed: an arm that is left alone stays.
             sure = copysign(max(0.0, abs(torque) - COVER * deviation[n]), torque)
-            asked = tuning.assistance * sure / self.viscosity[n]
-            self._speed[n] += PERIOD / (PERIOD + tuning.lag) * (asked - self._speed[n])
+            # Admittance: the speed of an arm of less inertia, with friction. `given` is what the motors add for that.
+            gain, friction = 1.0 + tuning.assistance, inertia / tuning.coasting * self._speed[n]
+            given = tuning.assistance * sure - friction
+            speed = self._speed[n] + PERIOD * (gain * sure - friction) / inertia
+            self._speed[n] = clamp(speed, tuning.fastest)
+            # Position loop: the angle that this speed leads to, not far from the arm's.
             ahead = clamp(self._angle[n] + PERIOD * self._speed[n] - q, tuning.reach)
             self._angle[n] = q + ahead
             wanted = clamp(self._speed[n] + tuning.stiffness * ahead, tuning.fastest)
-            efforts.append(clamp(self.viscosity[n] * (wanted - v), self.most[n]))
+            # Velocity loop.
+            efforts.append(clamp(given + self.viscosity[n] * (wanted - v), self.most[n]))
         return efforts
+
+
+def cascade_of(settings: Settings) -> Admittance:
+    """Return the cascade for an arm and the wearer that its compensator knows."""
+    return Admittance(settings.robot.links, settings.robot.worn_links(settings.wearer_mass, settings.wearer_cog))
 
 
 class AdmittanceNode(Node):
     """The cascade between the nodes `wearer` and `compensator` of one arm.
 
-    names: of its joints (n,). least_inertia: as for `Admittance`.
+    names: of its joints (n,). settings: of its compensator.
     """
 
     silence = Duration(seconds=0.1)  # without joint states or the wearer's torque
 
-    def __init__(self, namespace: str, names: Sequence[str], least_inertia: Sequence[float]) -> None:
+    def __init__(self, namespace: str, names: Sequence[str], settings: Settings) -> None:
         super().__init__("admittance", namespace=namespace)
-        self.names, self.least_inertia = list(names), least_inertia
-        self.cascade = Admittance(least_inertia)
+        self.names, self.settings = list(names), settings
+        self.cascade = cascade_of(settings)
         self.heard = {}
         self.publisher = self.create_publisher(JointState, "assist_efforts", 1)
         for topic in ("joint_states", "wearer_efforts", "wearer_efforts_std"):
@@ -138,7 +150,7 @@ class AdmittanceNode(Node):
         inputs = [self.newest("joint_states", field) for field in ("position", "velocity")]
         inputs += [self.newest(topic, "effort") for topic in ("wearer_efforts", "wearer_efforts_std")]
         if None in inputs:  # no message: the compensator fades the assistance; later the cascade begins anew
-            self.cascade = Admittance(self.least_inertia)
+            self.cascade = cascade_of(self.settings)
             return
         message = JointState(name=self.names, effort=self.cascade.step(*inputs))
         message.header.stamp = self.get_clock().now().to_msg()
@@ -188,7 +200,7 @@ def reach(is_assisted):
     compensator, observer = Compensator(settings, JOINTS), MomentumObserver(settings)
     limits = Limits(JOINTS, max_effort=PEAK, sign_check_torque=0.0)
     arm = VirtualArm(device, DirectController(compensator, limits), motors, limits, 250.0)
-    cascade = Admittance(robot.links.least)
+    cascade = cascade_of(settings)
 
     def answer():
         position, velocity, effort, *_ = zip(*arm.loop.samples, strict=True)
@@ -236,7 +248,7 @@ def main(words):
     path, namespace = words
     arm = carried_arm(load(path), namespace)
     rclpy.init()
-    rclpy.spin(AdmittanceNode(namespace, arm.limits.joint_names, arm.settings.robot.links.least))
+    rclpy.spin(AdmittanceNode(namespace, arm.limits.joint_names, arm.settings))
 
 
 if __name__ == "__main__":

@@ -122,20 +122,20 @@ def test_the_cascade_takes_work_off_a_wearer_who_reaches_and_lets_the_arm_go_whe
 
 
 def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_damps_what_moves_by_itself():
-    variables = cascade()
-    still, inertia = [0.0, 0.0], [0.05, 0.1]
+    variables, still = cascade(), [0.0] * 4
+    robot, worn = ROBOT.links, ROBOT.worn_links(*LOAD)
 
-    def after(seconds: float, velocity: list[float], wearer: list[float], deviation: float) -> list[float]:
-        loop = variables["Admittance"](inertia)
+    def after(seconds: float, velocity: list[float], wearer: list[float], deviation: float) -> np.ndarray:
+        loop = variables["Admittance"](robot, worn)
         for _ in range(round(seconds / variables["PERIOD"])):
-            efforts = loop.step(still, velocity, wearer, [deviation] * 2)
-        return efforts
+            efforts = loop.step([0.3] * 4, velocity, wearer, [deviation] * 4)
+        return np.array(efforts)
 
-    assert after(1.0, still, [1.0, -1.0], deviation=0.6) == [0.0, 0.0]  # perhaps an error of the model
-    pushed = after(1.0, still, [1.0, -1.0], deviation=0.0)
-    assert 0.9 < pushed[0] <= 1.0 and -1.0 <= pushed[1] < -0.9
-    assert after(1.0, [0.5, -0.5], [0.0, 0.0], deviation=0.0) == pytest.approx([-0.5 * n / 0.06 for n in (0.05, -0.1)])
-    assert after(9.0, still, [99.0, -99.0], deviation=0.0) == [1.0, -1.0]  # a hand overcomes it
+    push = [1.0, -1.0, 1.0, -1.0]
+    assert not after(1.0, still, push, deviation=0.6).any()  # perhaps an error of the model
+    assert np.all(after(0.02, still, push, deviation=0.0) * push > 0.5)
+    assert np.all(after(0.5, push, still, deviation=0.0) * push < 0.0)
+    assert after(9.0, still, [99.0, -99.0, 99.0, 99.0], deviation=0.0).tolist() == [1.0, -2.0, 1.0, 1.0]  # as a spring
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def admittance() -> Iterator[tuple[Any, ...]]:
     rclpy.init()
     variables = cascade()
     carried = carried_arm(load(packaged_config("three_joints.yaml")), "/right")
-    node = variables["AdmittanceNode"]("/right", carried.limits.joint_names, carried.settings.robot.links.least)
+    node = variables["AdmittanceNode"]("/right", carried.limits.joint_names, carried.settings)
     arm, executor = rclpy.create_node("arm", namespace="/right"), SingleThreadedExecutor()
     for each in (node, arm):
         executor.add_node(each)
