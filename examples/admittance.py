@@ -54,7 +54,7 @@ class Tuning:
     """How the arm answers its wearer."""
 
     assistance: float = 1.0  #: Nm of the motors for each Nm of the wearer: 1 halves the inertia that they feel
-    coasting: float = 0.3  #: s in which an arm that nobody pushes any more slows down
+    coasting: float = 1.0  #: s in which an arm that nobody pushes any more slows down
     stiffness: float = 3.0  #: 1/s, of the position loop: speed for each rad that the arm is behind
     reach: float = 0.1  #: rad that the wanted angle may be ahead of the arm
     fastest: float = 1.5  #: rad/s that is wanted at most
