@@ -24,7 +24,6 @@ class MeanLimits:
     offset: float = 0.04  #: share of 1 g: bias and scale of an accelerometer that was never calibrated
     walk: float = 0.67 / STANDARD_GRAVITY  #: s: 0.67 m/s; an IMU that is swung in a circle by hand needs 0.45
     direction_time: float = 0.3  #: s for which a movement keeps its direction
-    start: float = 3.0  #: s in which an orientation that is learnt from the same accelerations may be off as they are
     removed: float = 0.5  #: share of 1 g below which gravity is not in the acceleration,
     in_g: float = 0.15  #: unless it is 1 g divided by 9.8, within this share
     downward: float = -0.5  #: share of 1 g along the world's z axis from which on the acceleration points down
@@ -43,12 +42,8 @@ class MeanAcceleration:
     square = 0.0  #: of the acceleration's deviation from its mean, in shares of 1 g
     _mean = ZERO  # acceleration in the world, in 1 g
 
-    def check(self, dt: float, acceleration: Floats3, is_learnt: bool) -> None:
-        """Take the mean acceleration in the world, in 1 g, of the next `dt` s. Raises Contradiction.
-
-        is_learnt: whether the orientation is fused from these accelerations: at first it follows a movement, which
-        then counts up to twice.
-        """
+    def check(self, dt: float, acceleration: Floats3) -> None:
+        """Take the mean acceleration in the world, in 1 g, of the next `dt` s. Raises Contradiction."""
         limits = self.limits
         self.age += dt
         span = min(self.age, limits.time)
@@ -56,10 +51,7 @@ class MeanAcceleration:
         self._mean = plus(self._mean, change, share)
         self.square += share * ((1.0 - share) * dot(change, change) - self.square)
         shift = math.dist(self._mean, UPWARD)
-        moved = limits.walk + limits.direction_time * math.sqrt(self.square)
-        if is_learnt:
-            moved *= 1.0 + max(0.0, 1.0 - self.age / limits.start)
-        limit = limits.offset + moved / span
+        limit = limits.offset + (limits.walk + limits.direction_time * math.sqrt(self.square)) / span
         if shift > limit and self.age >= limits.shortest:
             mean = [round(STANDARD_GRAVITY * component, 2) for component in self._mean]
             expected = f"within {STANDARD_GRAVITY * limit:.2f} m/s^2 of gravity upwards: {self._mistake()}"
@@ -303,7 +295,7 @@ class Agreement:
         self, dt: float, quaternion: Quaternion, acceleration: Floats3, last: float, swing: float, unmeasured: float
     ) -> None:
         """Check a fused orientation, world from IMU, at the end of the next `dt` s; the rest is as for `Turns`."""
-        self._mean.check(dt, rotated(quaternion, acceleration), is_learnt=True)
+        self._mean.check(dt, rotated(quaternion, acceleration))
         self._turns.check(dt, up_in_body(quaternion), acceleration, last, swing, unmeasured)
         if self._turns.is_trusted:
             self.is_suspect = False
@@ -316,7 +308,7 @@ class Agreement:
         acceleration: the mean of the `dt` s in 1 g, in the IMU's axes.
         turn: rad by the gyroscope, None if the IMU has none. The rest is as for `ReportedTurns`.
         """
-        self._mean.check(dt, rotated(quaternion, acceleration), is_learnt=False)
+        self._mean.check(dt, rotated(quaternion, acceleration))
         if turn is None:
             self._constant.check(dt, up_in_body(quaternion), acceleration)
             self.is_suspect = self.is_suspect and self._mean.age < self._turns.limits.quiet_time
