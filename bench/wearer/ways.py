@@ -152,7 +152,9 @@ def seen_of(worn: Worn) -> Seen:
             MomentumObserver(settings).update(0.0, (pose, (0.0,) * 4, effort), tilt)
             for pose, effort in zip(poses.tolist(), efforts.tolist(), strict=True)
         ]
-        curve = WearerCurve(np.arange(len(rows), dtype=float), *(np.array(column) for column in zip(*rows, strict=True)))
+        curve = WearerCurve(
+            np.arange(len(rows), dtype=float), *(np.array(column) for column in zip(*rows, strict=True))
+        )
         covered.append(np.mean(np.abs(curve.torque) <= COVER * curve.deviation, axis=0))
         share = share_of(curve)
         bands.append(COVER * float(share.deviation))

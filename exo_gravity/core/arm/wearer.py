@@ -11,8 +11,8 @@ Of the paper's arm, link 3 carries the upper arm and link 4 the forearm and hand
 wearer's shoulder and elbow. On another arm the user says which links do. A table is an average: a person's arm can
 differ from it by more than 10 %.
 
-Skin, muscles and capsule of a relaxed joint pull it towards a rest angle: in the middle of its range nearly as a spring,
-0.5 to 3 Nm/rad at a shoulder or an elbow (`Tissue`).
+Skin, muscles and capsule of a relaxed joint pull it towards a rest angle, in the middle of its range nearly as a spring
+(`Tissue`).
 """
 
 from collections.abc import Sequence

@@ -225,8 +225,8 @@ COMPENSATOR = (
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m", vector=True),
-    Param("wearer.first_moment", [0.0] * JOINT_COUNT, "what the wearer's arm adds to M1 to M4, by `calibrate wearer`; all "
-          "0: by mass and cog", (0.0, MAX_WORN_MOMENT), "kg m", expert=True),
+    Param("wearer.first_moment", [0.0] * JOINT_COUNT, "what the wearer's arm adds to M1 to M4, by `calibrate wearer`; "
+          "all 0: by mass and cog", (0.0, MAX_WORN_MOMENT), "kg m", expert=True),
     Param("wearer.off_axis", [0.0] * JOINT_COUNT, "what it adds to W, Z, Y3, Y4, where wearer.first_moment is given",
           (-MAX_WORN_BESIDE, MAX_WORN_BESIDE), "kg m", expert=True),
     *(replace(param, name=f"wearer.{param.name}") for param in params_of(Tissue)),

@@ -2,8 +2,8 @@
 """calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
-is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: what
-the arm needs beyond the robot's moments are the moments of the wearer's arm and springs in their joints (wearer_fit.py).
+is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: the
+moments of the wearer's arm and springs in their joints explain what the robot's moments do not (wearer_fit.py).
 """
 
 import argparse
@@ -226,7 +226,7 @@ def wearer_from(
     poses = np.random.default_rng(0).uniform(*WEARER.comfortable, (WEARER.samples, JOINT_COUNT))
     unsure = fit.torque_error(regressor(poses, direction[0], arm.robot.gravity) @ to_moments, poses)
     refusals = tuple(
-        f"{name}: {off:.2f} Nm between two visits of a pose, must be at most {WEARER.unrest:g}: the wearer did not relax"
+        f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
         for name, off in zip(arm.joint_names, change, strict=True)
         if off > WEARER.unrest
     )
@@ -280,7 +280,7 @@ def unseen_error(carried: float) -> float:
 def worn_moments(length: np.ndarray) -> np.ndarray:
     """Return the moments M1..M4, W, Z, Y3, Y4 by those that links 3 and 4 can add: (8, 6).
 
-    These are the mass in kg, with which both pull at the links before, and M3, M4, Z, Y3 and Y4 in kg m. length: (4,) m.
+    These are the mass in kg, with which both pull at the links before, and M3, M4, Z, Y3, Y4 in kg m. length: (4,) m.
     """
     matrix = np.zeros((len(MOMENTS), 6))
     matrix[:2, 0] = length[:2]
@@ -292,7 +292,8 @@ def _known(length: np.ndarray, mass: np.ndarray, cog: np.ndarray) -> tuple[np.nd
     """Return what is known before of the six columns of `worn_moments`, as `fit_wearer` takes it, by the table."""
     along, total = moments_along(length, cog, mass)[2:], mass.sum()
     upper, lower = cog[2], cog[3]
-    by_moments = np.array((1.0, -1.0 / upper, -(1.0 - length[2] / upper) / lower, 0.0, 0.0, 0.0))  # mass at these places
+    # The mass that the moments have at these places is the whole one.
+    by_moments = np.array((1.0, -1.0 / upper, -(1.0 - length[2] / upper) / lower, 0.0, 0.0, 0.0))
     matrix = np.vstack((by_moments / (PRIOR.mass * total), np.eye(6)[1:]))
     beside = PRIOR.beside * np.array((total, mass[2], mass[3]))
     matrix[1:] /= np.concatenate((PRIOR.moments * along, beside))[:, None]

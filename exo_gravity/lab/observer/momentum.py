@@ -6,9 +6,9 @@ A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' tor
     p' = tau + f + C^T v - g + wearer        residual r = p's share that tau + f + C^T v - g does not explain,
 
 behind a low-pass of `bandwidth`: no acceleration is needed. M, C, g are those of the robot plus the wearer's whole
-passive arm, and g contains the tissue of their relaxed joints as far as it is known, so the residual is what their
-muscles add; without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that
-changes steadily passes without lag.
+passive arm, g with the tissue of their relaxed joints as far as it is known: so the residual is what their muscles add.
+Without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r,
+which a torque that changes steadily passes without lag.
 
 The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
 the model stays the same for as long as a pose is held.

@@ -5,7 +5,8 @@ With their torque tau and the torque w that carries their arm against gravity al
 
     share = sum tau . w / sum w . w                of joint j: sum tau_j w_j / sum w_j^2
 
-The whole share is the mean of the joints', weighted by sum w_j^2: a joint that carries little hardly changes it. What accelerates the arm and overcomes friction cancels out of the sum over a movement there and back. The errors of one
+The whole share is the mean of the joints', weighted by sum w_j^2: a joint that carries little hardly changes it. What
+accelerates the arm and overcomes friction cancels out of the sum over a movement there and back. The errors of one
 joint are taken to be the same over the whole span, as those of a model are: a longer span has no narrower band. An
 error of the weight itself is the same share of it in every joint.
 """

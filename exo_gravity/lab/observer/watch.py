@@ -68,9 +68,7 @@ class WearerWatch:
         return values | {"contact age (s)": f"{now - at:.0f}"}
 
 
-def values_of(
-    names: Sequence[str], estimate: WearerEstimate | None, shares: Shares | None
-) -> dict[str, str]:
+def values_of(names: Sequence[str], estimate: WearerEstimate | None, shares: Shares | None) -> dict[str, str]:
     """Return torques and shares with half their 95 % bands, for /diagnostics.
 
     names: of the joints (n,). estimate, shares: None if there are none.
