@@ -15,7 +15,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, moments_along
 from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, gravity_torque, load_moments, moments_of, regressor
-from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.arm.wearer import MAX_TISSUE, Wearer
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
@@ -211,6 +211,13 @@ def wearer_from(
     if len(observations) - again < WEARER.least_poses:
         measured = f"{len(observations) - again} different poses were measured"
         raise DataError(f"{measured}, must be at least {WEARER.least_poses}")
+    restless = [
+        f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
+        for name, off in zip(arm.joint_names, change, strict=True)
+        if off > WEARER.unrest
+    ]
+    if restless:
+        raise DataError("; ".join(restless))
     to_moments = worn_moments(length)
     fit = fit_wearer(rows @ to_moments, theta, torque, spread, _known(length, *map(np.array, table)))
     own = fit.covariance[: len(fit.moments), : len(fit.moments)]
@@ -225,18 +232,19 @@ def wearer_from(
     moments = to_moments @ np.array((mass, *fit.moments[1:3], *beside))
     poses = np.random.default_rng(0).uniform(*WEARER.comfortable, (WEARER.samples, JOINT_COUNT))
     unsure = fit.torque_error(regressor(poses, direction[0], arm.robot.gravity) @ to_moments, poses)
-    refusals = tuple(
-        f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
-        for name, off in zip(arm.joint_names, change, strict=True)
-        if off > WEARER.unrest
-    )
     ratio = moments[2:4] / moments_along(length, *map(np.array, (table[1], table[0])))[2:]
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], WEARER.table_ratio
     compared = f"a person of {WEARER.body_mass * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    refusals: tuple[str, ...] = ()
     if body_mass:
         compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
         if not np.all((ratio >= low) & (ratio <= high)):
-            refusals += (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
+            refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
+    refusals += tuple(
+        f"{name}: a spring of {stiffness:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
+        for name, stiffness in zip(arm.joint_names, fit.stiffness.tolist(), strict=True)
+        if stiffness > MAX_TISSUE
+    )
     lines = (
         f"largest remainder of a pose: {np.abs(fit.remainder).max():.2f} Nm", compared,
         f"{again} poses were visited again, and differed by {change.max():.2f} Nm at most",
