@@ -125,6 +125,7 @@ def test_the_wearers_moments_and_springs_hold_their_arm_in_poses_that_were_not_m
     settings, arm = settings_from(result), SimulatedArm(PERSON)
     weight = holding(arm, OTHER_POSES[0])
     assert result.refusals == () and value(result, "model_error.wearer") == 0.0
+    assert "largest_moment [" in result.lines[-1] and "largest_addition " in result.lines[-1]
     unsure = np.hypot(0.05, value(result, "model_error.wearer_torque"))
     for pose in OTHER_POSES:
         off = settings.torque(pose, Tilt.of("right"))[0] - holding(arm, pose)

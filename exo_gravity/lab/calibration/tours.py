@@ -7,6 +7,7 @@ moments of the wearer's arm and springs in their joints explain what the robot's
 """
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, moments_along
 from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, gravity_torque, load_moments, moments_of, regressor
-from exo_gravity.core.arm.wearer import MAX_TISSUE, Wearer
+from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
@@ -250,6 +251,7 @@ def wearer_from(
         f"{again} poses were visited again, and differed by {change.max():.2f} Nm at most",
         f"a wearer who holds up to {carried:.0%} of their arm throughout looks like one with a lighter arm: "
         "the band contains that, and nothing shows it",
+        _bridge_line(arm, moments_of(arm.robot) + moments, fit),
     )  # fmt: skip
     return CalibrationResult(
         _wearer_changes(arm, fit, moments, error, unsure, carried), lines, refusals, arm, tuple(observations)
@@ -274,6 +276,22 @@ def _wearer_changes(
     if arm.compensator["law"] != "exact":
         changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
     return tuple(changes)
+
+
+def _bridge_line(arm: ConfiguredArm, moments: np.ndarray, fit: WearerFit) -> str:
+    """Return what can_bridge must let the efforts of this wearer have at support 1, if it checks them.
+
+    moments: (8,) kg m of robot and wearer.
+    """
+    along, (w, z, y3, y4) = moments[:JOINT_COUNT], np.abs(moments[JOINT_COUNT:])
+    beside = arm.robot.gravity * np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
+    way = np.maximum(np.abs(arm.low - fit.rest), np.abs(arm.high - fit.rest))
+    added = beside + fit.stiffness * np.minimum(way, TISSUE_REACH)
+    values = ", ".join(f"{math.ceil(100.0 * moment) / 100.0:g}" for moment in along)
+    more = ", ".join(f"{math.ceil(10.0 * torque) / 10.0:g}" for torque in added)
+    return (
+        f"can_bridge, for this wearer at support 1: largest_moment [{values}] kg m, largest_addition {more} Nm or more"
+    )
 
 
 def unseen_error(carried: float) -> float:
