@@ -13,7 +13,7 @@ function withdrawn(values, now) {
   const lengths = now?.["wearer.segment_length"] ?? [];
   const isNear = lengths.every((length, n) => Math.abs(length - values["wearer.segment_length"][n]) < ROUNDED);
   if (isNear && ["wearer.body_mass", "wearer.sex"].every((name) => values[name] === now?.[name])) return {};
-  const known = CALIBRATED.filter((name) => now?.[name]);
+  const known = CALIBRATED.filter((name) => now?.[name]?.some((value) => value !== 0));
   return Object.fromEntries(known.map((name) => [name, now[name].map(() => 0)]));
 }
 
