@@ -107,11 +107,11 @@ class MomentumObserver:
         tuning, bandwidth = self._tuning, self._tuning.bandwidth
         columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
-        level = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]  # gravity alone
+        gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
-        gravity = list(map(operator.add, level, self._tissue.torque(theta))) if self._has_tissue else level
-        unexplained = [tau + rub + c - g for tau, rub, c, g in zip(effort, rubbing, coriolis, gravity, strict=True)]
+        held = tuple(map(operator.add, gravity, self._tissue.torque(theta))) if self._has_tissue else gravity
+        unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
         dt, self._time = now - self._time, now
         if 0.0 < dt <= tuning.max_gap:
             # The input since the last sample, with the momentum's mean.
@@ -139,7 +139,7 @@ class MomentumObserver:
                 self._error.torque[n],
                 self._error.scale[n] * effort[n],
                 self._error.wearer_torque[n],
-                self._error.tilt * math.sqrt(max(0.0, (tilt.magnitude * largest[n]) ** 2 - level[n] ** 2)),
+                self._error.tilt * math.sqrt(max(0.0, (tilt.magnitude * largest[n]) ** 2 - gravity[n] ** 2)),
                 shaken * largest[n],
                 friction[n],
                 self._code[n],
