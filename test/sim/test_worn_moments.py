@@ -105,6 +105,8 @@ def test_moments_in_place_of_masses_and_what_is_impossible_is_refused():
     assert tabled.arm == alone.arm and tuple(tabled.wearer_mass) == tuple(mass)
     with pytest.raises(ParameterError, match=r"exact with wearer\.first_moment"):
         settings_of({**values, "law": "paper_static"})
+    with pytest.raises(ParameterError, match=r"wearer\.first_moment.* at most 10 kg, not 1[0-9]"):
+        settings_of({**values, "wearer.first_moment": [0.2, 0.6, 2.0, 2.0]})
     for name, wrong in (("first_moment", 4.1), ("first_moment", -0.1), ("off_axis", 0.6), ("off_axis", float("nan"))):
         with pytest.raises(ParameterError, match=f"wearer.{name}"):
             replace(SETTINGS, **{f"wearer_{name}": (0.0, 0.0, wrong, 0.1)})

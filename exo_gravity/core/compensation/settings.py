@@ -376,7 +376,12 @@ def wearer_of(
     length: of the links, (n,) m; None: `link_length`. links: as in `Wearer.on_links`.
     """
     if not any(values["wearer.mass"]) and not values["wearer.body_mass"] and any(values.get("wearer.first_moment", ())):
-        return load_by_moments(values["link_length"], values["wearer.first_moment"])
+        moments = values["wearer.first_moment"]
+        load = load_by_moments(values["link_length"], moments)
+        if load.mass.sum() > MAX_CARRIED:
+            heaviest = f"that of an arm of at most {MAX_CARRIED:g} kg, not {load.mass.sum():.1f}"
+            raise ParameterError("wearer.first_moment", moments, heaviest)
+        return load
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
