@@ -15,11 +15,9 @@ from typing import NamedTuple
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import numpy as np
-
 from ..device_study import as_markdown, options_of
 from ..parts import play as part_by_part
-from . import payload, tiring, ways
+from . import payload, tiring
 from .devices import draw
 from .report import picture, points, verdict
 from .study import Trial, judge, play
@@ -30,7 +28,6 @@ class Judged(NamedTuple):
 
     trial: Trial
     weighed: payload.Weighings
-    left: np.ndarray
     tired: tuple[tiring.Tired, tiring.Tired]
 
     @property
@@ -45,15 +42,15 @@ def judged(seed: int) -> Judged:
     """Play and judge one wearer."""
     worn = draw(seed)
     tired = tiring.tire(worn, adapts=True), tiring.tire(worn, adapts=False)
-    return Judged(judge(play(worn)), payload.weigh(worn), ways.left_over(worn), tired)
+    return Judged(judge(play(worn)), payload.weigh(worn), tired)
 
 
 def main() -> int:
     """Run the study; return the exit code."""
     options = options_of("bench.wearer", "Judge the estimate of the wearer's torque.", Path("build/wearer"))
     found = part_by_part("wearer", judged, options.seeds, lambda one: one.line)
-    trials, weighed, left, tired = zip(*found, strict=True)
-    rows = [*verdict(trials), *payload.verdict(weighed), *tiring.verdict(tired), *ways.verdict(left)]
+    trials, weighed, tired = zip(*found, strict=True)
+    rows = [*verdict(trials), *payload.verdict(weighed), *tiring.verdict(tired)]
     text = as_markdown(rows)
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)

@@ -58,9 +58,9 @@ KINDS = ("reach", "hold", "rest", "trunk in motion")
 class Played:
     """What one trial left: what was recorded, and what is true.
 
-    trunk: (m, 7), s, angular velocity in rad/s and felt gravity in g as measured, in the trunk's axes. elapsed, torque,
-    weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of their muscles and that carry their arm. trouble: ''
-    if the arm was carried to the end.
+    trunk: (m, 10), s, angular velocity in rad/s, felt gravity in g and gravity's direction as measured, in the trunk's
+    axes. elapsed, torque, weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of their muscles and that carry
+    their arm. trouble: '' if the arm was carried to the end.
     """
 
     worn: Worn
@@ -129,7 +129,7 @@ class WornImu:
         rate, force = map(np.asarray, self._imu.sample(state))
         force = np.linalg.norm(force) * turned(force / np.linalg.norm(force), self._mounting)
         gravity = turned(gravity_in_trunk(state.pitch, state.roll), self._mounting + self._drift)
-        self.log.append((now, *rate, *(-force / STANDARD_GRAVITY)))
+        self.log.append((now, *rate, *(-force / STANDARD_GRAVITY), *gravity))
         return TrunkReading(gravity.tolist(), force.tolist(), rate.tolist())
 
 
@@ -172,16 +172,18 @@ def judge(played: Played) -> Trial:
     length = sum(phase.move + phase.hold for phase in phases)
     keep = (recording.time > start + 1.0) & (recording.time < start + length)
 
-    def trunk_at(now: float) -> tuple[Tilt, tuple[float, float, float]]:
+    def trunk_at(now: float) -> tuple[Tilt, tuple[float, float, float], Tilt]:
         row = played.trunk[np.searchsorted(played.trunk[:, 0], now - 0.5 / RATE) - 1, 1:].tolist()  # one cycle late
-        return Tilt.of_felt(worn.side, row[3:]), turning_in_base(worn.side, row[:3])
+        felt, gravity = Tilt.of_felt(worn.side, row[3:6]), Tilt.of_gravity(worn.side, row[6:])
+        return felt, turning_in_base(worn.side, row[:3]), gravity
 
     joints = (recording.position, recording.velocity, recording.effort)
     whole = observed(worn.settings, recording.time, joints, trunk_at)
     others = baselines(worn.settings, recording.time, joints, lambda now: trunk_at(now)[0])
     index = np.searchsorted(played.elapsed, recording.time[keep] - start).clip(max=len(played.elapsed) - 1)
     curve = only(whole, keep)
-    truth = WearerCurve(curve.time, played.torque[index], np.zeros_like(curve.torque), played.weight[index])
+    exact = np.zeros_like(curve.torque)
+    truth = WearerCurve(curve.time, played.torque[index], exact, played.weight[index], exact)
     error = np.stack([curve.torque, *(other[keep] for other in others)]) - truth.torque
     at = [phase_at(phases, now) for now in (curve.time - start).tolist()]
     kind = np.array([_kind(phases[n], since) for n, since in at])

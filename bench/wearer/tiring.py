@@ -117,7 +117,7 @@ def tire(worn: Worn, adapts: bool) -> Tired:
     setup = ArmSetup(worn.side, device, worn.motors, limits, settings, RATE, imu)
     trial = OfflineTrial(setup, script, DELAY, compensator, wearer)
     compensator.read = lambda: [joint.effort for joint in trial.samples]
-    compensator.trunk = lambda: Tilt.of_felt(worn.side, imu.log[-2][4:])
+    compensator.trunk = lambda: Tilt.of_felt(worn.side, imu.log[-2][4:7])
     recording = trial.run()
     start = recording.steps[0].start + MOVE + RESTED
     time, support = np.array(compensator.supports).T

@@ -116,7 +116,13 @@ def budget(
     of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if the load does not fit the
     robot.
     """
-    full = robot.with_wearer(*load)
+    return budget_worn(robot, robot.with_wearer(*load), support, bounds, rated, peak)
+
+
+def budget_worn(
+    robot: ArmModel, full: ArmModel, support: float, bounds: np.ndarray, rated: Vector, peak: Vector
+) -> tuple[JointBudget, ...]:
+    """Return the same where `full` is the robot with the wearer's whole arm, without the tissue of their joints."""
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""

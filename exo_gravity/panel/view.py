@@ -29,7 +29,9 @@ PANEL = (
 )
 # fmt: on
 # What the page may change on a compensator. Every limit stays with the compensator and the bridge.
-LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", "support", "payload.mass")
+# Found by `calibrate wearer`: the page withdraws them with another wearer's data.
+CALIBRATED = ("wearer.first_moment", "wearer.off_axis", "wearer.joint_stiffness")
+LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", *CALIBRATED, "support", "payload.mass")
 SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
 # What belongs to a subject: in the wearer's file, and set by the page together with the wearer's data.
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.lower", "limits.upper")}

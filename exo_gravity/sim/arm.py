@@ -32,6 +32,7 @@ from exo_gravity.core.arm.gravity import MAX_OFFSET
 from exo_gravity.core.arm.kinematics import ROTORS
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
+from exo_gravity.core.arm.wearer import MAX_TISSUE
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, floats
 from exo_gravity.core.params import check_owned, owned
@@ -78,6 +79,9 @@ class JointConfig:
     #: The passive arm of a wearer: the upper arm on link 3, forearm and hand on link 4.
     wearer_mass: Sequence[float] = owned(_ZEROS, "mass of the wearer's passive arm on each link", (0.0, MAX_MASS), "kg")
     wearer_cog: Sequence[float] = owned(_ZEROS, "its centre of gravity from joint n", (0.0, MAX_LENGTH), "m")
+    #: The springs of their relaxed joints.
+    wearer_stiffness: Sequence[float] = owned(_ZEROS, "stiffness of the wearer's joints", (0.0, MAX_TISSUE), "Nm/rad")
+    wearer_rest: Sequence[float] = owned(_ZEROS, "angle at which they rest", _STOPS, "rad")
     rotor_inertia: Sequence[float] = owned(ROTORS, "rotor inertia at the gear's output", (0.0, 1.0), "kg m^2")
     #: Estimates for backdrivable planetary gears.
     coulomb_friction: Sequence[float] = owned((0.2, 0.4, 0.2, 0.2), "Coulomb friction", (0.0, 10.0), "Nm")
@@ -106,6 +110,16 @@ class JointConfig:
         """Return what the base of the `side` arm feels, in its own axes, as for `SimulatedArm.move_base`."""
         raise NotImplementedError
 
+    def with_tissue(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        """Add the springs of the wearer's joints to those of `model`, whose last joints are the arm's; return it."""
+        count = len(self.wearer_stiffness)
+        joints, angles = slice(model.njnt - count, None), slice(model.nq - count, None)
+        own, worn = model.jnt_stiffness[joints].copy(), np.array(self.wearer_stiffness)
+        pull = own * model.qpos_spring[angles] + worn * self.wearer_rest
+        model.jnt_stiffness[joints] = both = own + worn
+        model.qpos_spring[angles] = np.divide(pull, both, out=np.zeros(count), where=both > 0.0)
+        return model
+
 
 @dataclass(frozen=True, eq=False)
 class ArmConfig(JointConfig):
@@ -115,6 +129,8 @@ class ArmConfig(JointConfig):
     #: Beside the link in the frames of Table 1.
     cog_y: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along y_n", _BESIDE, "m")
     cog_z: Sequence[float] = owned(_ZEROS, "true centre of gravity beside link n, along z_n", _BESIDE, "m")
+    wearer_cog_y: Sequence[float] = owned(_ZEROS, "that of the wearer's segment, along y_n", _BESIDE, "m")
+    wearer_cog_z: Sequence[float] = owned(_ZEROS, "that of the wearer's segment, along z_n", _BESIDE, "m")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,7 +144,8 @@ class ArmConfig(JointConfig):
         """Return the arm, and the same on a base that can turn about its origin."""
         xml = _mjcf(self, payload)
         on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
-        return mujoco.MjModel.from_xml_string(xml), mujoco.MjModel.from_xml_string(on_ball)
+        arm, turning = map(self.with_tissue, map(mujoco.MjModel.from_xml_string, (xml, on_ball)))
+        return arm, turning
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the base of the `side` arm feels, in its own axes."""
@@ -260,7 +277,7 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
         position, alpha = (links.length[n - 1], _ALPHA[n - 1]) if n else (0.0, 0.0)
         worn = ""
         if config.wearer_mass[n] > 0:
-            at = f"{config.wearer_cog[n]} 0 0"
+            at = _in_joint(n, config.wearer_cog[n], config.wearer_cog_y[n], config.wearer_cog_z[n])
             worn = f"<body>{_tube(links.length[n], at, config.wearer_mass[n])}</body>"
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
@@ -283,9 +300,14 @@ def _attributes(stiffness: Stiffness, of: str) -> str:
 
 
 def _centre(config: ArmConfig, n: int) -> str:
-    """Return the centre of gravity of link n + 1 in the axes of its joint: x_n, and z_{n-1} as z."""
-    cosine, sine, y, z = math.cos(_ALPHA[n]), math.sin(_ALPHA[n]), config.cog_y[n], config.cog_z[n]
-    return f"{config.links.cog[n]} {cosine * y - sine * z} {sine * y + cosine * z}"
+    """Return the centre of gravity of link n + 1 in the axes of its joint."""
+    return _in_joint(n, float(config.links.cog[n]), config.cog_y[n], config.cog_z[n])
+
+
+def _in_joint(n: int, x: float, y: float, z: float) -> str:
+    """Return a place on link n + 1, in m along x_n, y_n and z_n, in the axes of its joint: x_n, and z_{n-1} as z."""
+    cosine, sine = math.cos(_ALPHA[n]), math.sin(_ALPHA[n])
+    return f"{x} {cosine * y - sine * z} {sine * y + cosine * z}"
 
 
 def _tube(length: float, centre: str, mass: float) -> str:

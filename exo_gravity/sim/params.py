@@ -28,6 +28,10 @@ ARM_FIELDS = {
     "cog_z": "robot.cog_z",
     "wearer_mass": "wearer.mass",
     "wearer_cog": "wearer.cog",
+    "wearer_cog_y": "wearer.cog_y",
+    "wearer_cog_z": "wearer.cog_z",
+    "wearer_stiffness": "wearer.joint_stiffness",
+    "wearer_rest": "wearer.joint_rest",
     "coulomb_friction": "friction.coulomb",
     "viscous_friction": "friction.viscous",
     "stribeck_friction": "friction.stribeck",
@@ -108,7 +112,7 @@ URDF = (
     Param("joint_names", [""], "joints in the order of the URDF's chain", fixed=True, required=True, any_length=True),
     Param("home", [0.0] * JOINT_COUNT, "angles in which the arm begins", (-math.pi, math.pi), "rad", fixed=True),
 )
-PAPER = {"link_length", "robot.mass", "robot.cog", "robot.cog_y", "robot.cog_z"}
+PAPER = {"link_length", "robot.mass", "robot.cog", "robot.cog_y", "robot.cog_z", "wearer.cog_y", "wearer.cog_z"}
 STOPS = {"stop.min", "stop.max"}
 
 

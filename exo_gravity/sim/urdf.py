@@ -97,7 +97,7 @@ class UrdfConfig(JointConfig):
         model.jnt_range[joints] = np.transpose((self.position_min, self.position_max))
         model.jnt_solref[joints], model.jnt_solimp[joints, : len(STOP.impedance)] = STOP
         mujoco.mj_setConst(model, mujoco.MjData(model))  # what depends on the rotors
-        return model
+        return self.with_tissue(model)
 
     @cached_property
     def _spec(self) -> mujoco.MjSpec:

@@ -64,6 +64,9 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option("--rests", type=Path, metavar="FOLDER", help="recording of the IMU resting on each of its six sides")
         if name == "gravity":
             option("--poses", type=int, default=MAX_POSES, metavar="N", help="largest number of poses (%(default)s)")
+        if name == "wearer":
+            carried = "share of their arm that the wearer may have held throughout (0.2); 0 where EMG was silent"
+            option("--carried", type=float, metavar="SHARE", help=carried)
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")

@@ -115,9 +115,12 @@ def test_a_joint_that_is_too_fast_and_an_arm_that_is_let_down_miss_their_limits(
 
 
 def test_torques_measured_in_poses_know_an_arm_better_than_a_table():
-    average, full, equilibrium = ways.left_over(draw(3))
-    assert full < 0.03 < average < 0.2 and full < equilibrium < average
-    assert len(ways.verdict([np.array((0.1, 0.01, 0.03))])) == 3
+    plain, sprung, carried = (ways.seen_of(draw(3, effect)) for effect in ("none", "springs", "carries"))
+    assert plain.left[ways.NOW] < 0.03 < plain.left[0] and sprung.left[ways.NOW] < 0.03
+    assert np.all(sprung.left[: ways.NOW] > 2.0 * sprung.left[ways.NOW])  # no other way knows springs
+    assert carried.left[ways.NOW] > 0.05  # which no torque shows,
+    assert carried.share_covered[1] and np.all(carried.covered[1] > 0.9) and carried.band[1] > 0.2  # but its band says
+    assert ways.tables([[plain, plain, sprung, carried, carried]]).count("\n") == 20
 
 
 def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rises_with_it():
@@ -150,6 +153,6 @@ def test_the_table_of_straps_has_a_row_for_each_tie():
 def judge_of_constant(error: float) -> Trial:
     """Return a trial whose estimate is off by `error` Nm everywhere."""
     ones = np.ones((1000, 4))
-    curve = WearerCurve(np.arange(1000.0), ones, ones, ones)
+    curve = WearerCurve(np.arange(1000.0), ones, ones, ones, ones)
     share = Share(np.array(0.5), np.array(0.1))
     return Trial(0, curve, curve, np.full((3, 1000, 4), error), np.zeros(1000, int), share, 0.5, (), "")

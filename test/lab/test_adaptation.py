@@ -31,7 +31,8 @@ class Arm:
 
     def sample(self, speed: float, torque: float, weight: float, is_known: bool = True) -> None:
         """Give the adaptation a sample of the joint at `angle`, read and estimated as on the device."""
-        estimate = WearerEstimate((0.0, torque, 0.0, 0.0), (0.0, self.deviation, 0.0, 0.0), (0.0, weight, 0.0, 0.0))
+        deviation = (0.0, self.deviation, 0.0, 0.0)
+        estimate = WearerEstimate((0.0, torque, 0.0, 0.0), deviation, (0.0, weight, 0.0, 0.0), deviation)
         joints = (0.0, round(self.angle / CODE) * CODE, 0.0, 0.0), (0.0, speed, 0.0, 0.0)
         before = self.adaptation.requested
         self.adaptation.update(self.now, joints, estimate if is_known else None, self.settings)

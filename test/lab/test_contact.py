@@ -20,7 +20,8 @@ def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> C
     watch = ContactWatch()
     for number, torque in enumerate(torques, 1):
         now = PERIOD * number + gap * (number == len(torques))
-        watch.update(now, WearerEstimate((0.0, 0.0, 0.0, torque), (deviation,) * 4, (0.0,) * 4))
+        band = (deviation,) * 4
+        watch.update(now, WearerEstimate((0.0, 0.0, 0.0, torque), band, (0.0,) * 4, band))
     return watch
 
 

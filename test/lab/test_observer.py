@@ -18,8 +18,16 @@ from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.numbers import COVER
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
-from exo_gravity.lab.observer.share import PERIOD, WearerCurve, observed, share_of, while_between
+from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver, WearerEstimate
+from exo_gravity.lab.observer.share import (
+    PERIOD,
+    RunningShare,
+    WearerCurve,
+    joint_shares,
+    observed,
+    share_of,
+    while_between,
+)
 from exo_gravity.lab.observer.watch import WearerWatch
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
@@ -176,7 +184,8 @@ def test_a_torque_that_rises_steadily_is_followed_without_lag_and_a_gap_starts_a
 def test_each_error_of_the_model_widens_the_band():
     needed = gravity_torque(WHOLE, POSE, TILT.direction).tolist()
     narrow = np.array(still(needed).deviation)
-    for name, value in (("torque", (0.3,) * 4), ("scale", (0.1,) * 4), ("wearer", 0.1), ("tilt", 0.05)):
+    errors = {"torque": (0.3,) * 4, "scale": (0.1,) * 4, "wearer": 0.1, "tilt": 0.05, "wearer_torque": (0.3,) * 4}
+    for name, value in errors.items():
         wider = still(needed, settings=replace(SETTINGS, model_error=replace(EXACT, **{name: value})))
         assert np.all(np.array(wider.deviation) >= narrow) and wider.deviation[1] > 1.05 * narrow[1], name
 
@@ -185,7 +194,8 @@ def curve(share, count=500, deviation=0.1):
     """Return the curve of a wearer who gives `share`, a number or (n,), of a weight that changes."""
     time = PERIOD * np.arange(count)
     weight = np.column_stack((np.zeros(count), 8.0 + np.sin(time), 4.0 * np.cos(time), np.ones(count)))
-    return WearerCurve(time, np.reshape(share, (-1, 1)) * weight, np.full((count, 4), deviation), weight)
+    band = np.full((count, 4), deviation)
+    return WearerCurve(time, np.reshape(share, (-1, 1)) * weight, band, weight, band)
 
 
 def test_the_share_is_that_of_the_weight_that_the_wearer_gives_and_a_sliding_one_forgets():
@@ -201,6 +211,45 @@ def test_a_longer_time_does_not_narrow_the_band_of_the_share():
     assert share_of(curve(0.5, deviation=0.2)).deviation == pytest.approx(2.0 * share_of(curve(0.5)).deviation)
 
 
+def test_the_whole_share_hides_a_joint_that_carries_little_and_its_own_share_shows_it():
+    needed = gravity_torque(WHOLE, POSE, TILT.direction)
+    own = gravity_torque(ArmModel(DEFAULT_LINKS.length, LOAD.cog, LOAD.mass), POSE, TILT.direction)
+    values, _, _ = watched(effort=(needed - (0.0, 0.0, 0.0, own[3])).tolist())  # the wearer carries all of the elbow
+    assert float(values["share of the wearer (%)"]) < 5.0
+    assert values["elbow share (%)"] == "100" and values["b share (%)"] == "0"
+    assert values["a share (%)"] == "unknown" != values["elbow share band (%)"]  # joint 1 carries nothing
+    held = curve((0.2,))
+    held = held._replace(torque=held.weight * (0.0, 0.1, 0.9, 0.5))
+    assert joint_shares(held).value[1:] == pytest.approx((0.1, 0.9, 0.5))
+    assert np.isnan(joint_shares(held).value[0])
+
+
+def test_an_error_of_the_weight_is_the_same_share_in_every_joint_and_does_not_average_out():
+    light = curve(0.1, deviation=0.0)
+    light = light._replace(deviation=0.12 * np.abs(light.weight))
+    assert share_of(light).deviation == pytest.approx(0.12)
+    assert joint_shares(light).deviation[1:] == pytest.approx(0.12)
+    watch, joints = RunningShare(), (light.torque[-1], light.deviation[-1], light.weight[-1], light.independent[-1])
+    assert watch.update(PERIOD, WearerEstimate(*map(tuple, joints))).whole is None  # not yet
+    for _ in range(500):
+        shares = watch.update(PERIOD, WearerEstimate(*map(tuple, joints)))
+    assert shares.whole == pytest.approx((0.1, 0.12)) and shares.joints[1] == pytest.approx((0.1, 0.12))
+
+
+def test_the_share_of_a_wearer_who_walks_is_not_biased_by_what_shakes_their_arm():
+    """They carry 60 % of gravity, and all of what the trunk's acceleration adds."""
+    estimates, observer = [], MomentumObserver(SETTINGS)
+    own = ArmModel(DEFAULT_LINKS.length, LOAD.cog, LOAD.mass)
+    for n in range(600):
+        shaken = TILT._replace(magnitude=1.0 + 0.2 * math.sin(4.0 * math.pi * n * PERIOD))
+        carried = np.array(WHOLE.torque(POSE, TILT)) - 0.6 * np.array(own.torque(POSE, TILT))
+        estimates.append(observer.update(n * PERIOD, (POSE, STILL, carried.tolist()), shaken, (0.0, 0.0, 0.0), TILT))
+    columns = (np.array(column) for column in zip(*estimates[100:], strict=True))
+    walked = WearerCurve(PERIOD * np.arange(500.0), *columns)
+    assert share_of(walked).value == pytest.approx(0.6, abs=0.01)
+    assert walked.weight == pytest.approx(np.tile(own.torque(POSE, TILT), (500, 1)))
+
+
 def test_a_hanging_arm_has_no_share():
     for hanging in (curve(0.5)._replace(weight=np.full((500, 4), 0.1)), while_between(curve(0.5), ())):
         assert np.isnan(share_of(hanging).value)
@@ -211,7 +260,7 @@ def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_ar
     needed = np.tile(gravity_torque(WHOLE, POSE, TILT.direction), (len(time), 1))
     needed[400:500] = np.nan
     joints = np.tile(POSE, (len(time), 1)), np.zeros_like(needed), needed
-    found = observed(SETTINGS, time, joints, lambda now: (TILT, turning_in_base("right", (0.0, 0.0, 0.0))))
+    found = observed(SETTINGS, time, joints, lambda now: (TILT, turning_in_base("right", (0.0, 0.0, 0.0)), TILT))
     assert np.diff(found.time[:50]) == pytest.approx(PERIOD)
     assert not np.any((found.time > 0.8) & (found.time < 0.998))
     assert found.torque == pytest.approx(0.0, abs=1e-9)
@@ -223,7 +272,7 @@ def watched(settings=SETTINGS, effort=None):
     watch = WearerWatch(("a", "b", "c", "elbow"), SETTINGS)
     watch.apply(settings)
     joints = (POSE, STILL, effort) if effort is not None else None
-    estimates = [watch.update(n * PERIOD, joints, (TILT, (0.0, 0.0, 0.0))) for n in range(200)]
+    estimates = [watch.update(n * PERIOD, joints, (TILT, (0.0, 0.0, 0.0), TILT)) for n in range(200)]
     return watch.values(2.0), estimates[-1], watch
 
 

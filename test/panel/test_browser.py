@@ -252,6 +252,7 @@ def test_zero_g_and_one_g_of_an_arm_that_is_carried_ask_first_and_the_support_st
 def test_the_first_wearers_data_of_a_carried_arm_ask_first_and_set_the_support_to_0(visit, stage):
     stage.arms.states["right"] = "active"
     stage.arms.settings["right"].update({"mode": "zero_g", "support": 1.0, "wearer.body_mass": 0.0})
+    stage.arms.settings["right"]["wearer.first_moment"] = [0.2, 0.4, 0.8, 0.3]  # of the last wearer
     page = visit()
     wait_for_state(page, "active")
     page.fill("input[name=body_mass]", "62")
@@ -261,6 +262,7 @@ def test_the_first_wearers_data_of_a_carried_arm_ask_first_and_set_the_support_t
     wait_until(page, lambda: len(stage.arms.calls) == 2)
     right, left = (stage.arms.settings[arm] for arm in ("right", "left"))
     assert (right["wearer.body_mass"], right["support"], left["support"]) == (62.0, 0.0, 0.05)
+    assert right["wearer.first_moment"] == [0.0] * 4
 
 
 def test_a_heavier_wearers_data_lower_the_support_to_what_rated_torque_allows(visit, stage):
@@ -486,6 +488,16 @@ def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, active)
             assert abs(part / whole - 0.4) < 0.02 and abs(band / whole - 0.2) < 0.02
             assert abs((low - start) / whole - 0.3) < 0.02
     assert boxes[1]["width"] == 0.0
+
+
+def test_the_share_of_each_joint_is_shown_with_its_band_where_it_is_known(visit, active):
+    elbow, abduction = "right_elbow_flexion", "right_shoulder_abduction"
+    active.arms.joint_shares = {f"{elbow} share (%)": "100", f"{elbow} share band (%)": "14"}
+    active.arms.joint_shares |= {f"{abduction} share (%)": "3", f"{abduction} share band (%)": "60"}
+    page = visit()
+    page.wait_for_selector(f"{of_arm('.shares')}:has-text('Elbow flexion 100 % (±14)')")
+    assert "abduction too uncertain" in page.inner_text(of_arm(".shares"))
+    assert "rotation" not in page.inner_text(of_arm(".shares"))
 
 
 def test_the_share_is_shown_only_while_it_means_something(visit, stage):

@@ -65,6 +65,7 @@ class PlayedArms:
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
     adapts: dict[str, str] = field(default_factory=dict)  #: what it reports of a support that adapts
     share: tuple[str, str] = ("unknown", "unknown")  #: of their arm's weight that the wearer carries, and its band, %
+    joint_shares: dict[str, str] = field(default_factory=dict)  #: the same of joints, by key
     limit: str = "0.068"  #: the largest support that it reports
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     reports: dict[str, dict[str, str]] = field(default_factory=dict)  #: further keys of the bridges, by arm
@@ -141,6 +142,7 @@ class PlayedArms:
         carried |= {"changing load": self.changing, "reason": "none", "weighing": "none", **self.compensator}
         of_wearer = {"largest support": self.limit, "support adapts": "off", **self.adapts, **self.contact}
         of_wearer["share of the wearer (%)"], of_wearer["share band (%)"] = self.share
+        of_wearer |= self.joint_shares
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         statuses = {"bridge": bridge, "compensator": carried, "wearer": of_wearer, "simulator": self.simulator}

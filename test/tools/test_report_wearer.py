@@ -55,7 +55,9 @@ def test_the_share_of_the_recording_is_found_and_said(share, tmp_path):
     written = trial_report.write(report, tmp_path)
     assert "right_wearer.png" in [path.name for path in written]
     said = wearer_share.sentence(part, Source.UNKNOWN)  # as this recording has it
-    assert said.split("(")[0] in (tmp_path / "report.html").read_text(encoding="utf-8").replace("&#x27;", "'")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("&#x27;", "'")
+    assert said.split("(")[0] in page
+    assert all(f"{name} {100 * share:.0f} % (±" in page for name in JOINTS[1:])  # of each joint
 
 
 def test_without_a_wearer_in_the_parameters_nothing_is_said_of_one():

@@ -25,6 +25,8 @@ MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 
 MAX_PAYLOAD = 5.0  # kg in the hand; at 0.7 m from the shoulder it takes 34 Nm, about twice an AK80-9's peak torque
 MAX_REACH = 0.5  # m of its centre of gravity from the hand
 MAX_MOMENT = 10.0  # kg m; it takes 98 Nm to hold, several times a motor's peak torque
+MAX_WORN_MOMENT = 4.0  # kg m, of a wearer's arm along a link; stretched out, that of a 150 kg person has 2
+MAX_WORN_BESIDE = 0.5  # kg m, of the same across the links: 7 kg at 7 cm
 MAX_GAIN = 2.0
 MAX_GRAVITY = 25.0  # m/s^2
 
@@ -163,6 +165,19 @@ class ArmData:
             worn = type(self)(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
         return worn.with_payload(self.payload[0], self.payload[1:])
 
+    def with_moments(self: Self, first_moment: Vector, off_axis: Vector, support: float = 1.0) -> Self:
+        """Return this arm plus a share `support` (0..1) of a wearer's arm that is known by its moments.
+
+        first_moment, off_axis: what it adds to M1..M4 and to W, Z, Y3, Y4, (4,) kg m each. Raises ParameterError.
+        """
+        share = one_float("support", support, 0.0, 1.0)
+        along = four_floats("wearer.first_moment", first_moment, 0.0, MAX_WORN_MOMENT, "kg m")
+        across = four_floats("wearer.off_axis", off_axis, -MAX_WORN_BESIDE, MAX_WORN_BESIDE, "kg m")
+        bare = self.with_payload(0.0)
+        moments = bare.first_moment + share * along, bare.off_axis + share * across
+        worn = type(self).from_moments(self.length, *moments, self.gain, self.gravity)
+        return worn.with_payload(self.payload[0], self.payload[1:])
+
 
 @dataclass(frozen=True)
 class ModelError:
@@ -180,6 +195,12 @@ class ModelError:
         0.15, "standard error of the wearer's arm's weight, as a share of it, by `calibrate`", (0.0, 1.0)
     )
     tilt: float = owned(0.0175, "standard error of the trunk's tilt", (0.0, 0.5), "rad")
+    wearer_torque: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "standard error of the torque of the wearer's passive arm beyond that share, by `calibrate`",
+        (0.0, 5.0),
+        "Nm",
+    )
 
     def __post_init__(self) -> None:
         check_owned(self)

@@ -10,6 +10,9 @@ length from the proximal joint. Mass and centre always come from the same table:
 Of the paper's arm, link 3 carries the upper arm and link 4 the forearm and hand; its joints 3 and 4 turn about the
 wearer's shoulder and elbow. On another arm the user says which links do. A table is an average: a person's arm can
 differ from it by more than 10 %.
+
+Skin, muscles and capsule of a relaxed joint pull it towards a rest angle, in the middle of its range nearly as a spring
+(`Tissue`).
 """
 
 from collections.abc import Sequence
@@ -19,7 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import Vector, floats, one_float
+from exo_gravity.core.numbers import JOINT_COUNT, Vector, floats, one_float
+from exo_gravity.core.params import check_owned, owned
 
 SEX = ("female", "male")
 _WINTER = ((0.028, 0.436), (0.016, 0.430), (0.006, 0.506))
@@ -34,6 +38,9 @@ TABLES = {
 # m, rounded values of an adult man: shoulder to elbow, elbow to wrist, wrist to third knuckle. Prefer measured lengths.
 TYPICAL_LENGTH = (0.28, 0.27, 0.086)
 PAPER_LINKS = (3, 4)
+TYPICAL_PLACE = (0.55, 0.6)  # share of link 3 and of link 4 at which the table has the centres of gravity
+TISSUE_REACH = 1.2  # rad from the rest angle, beyond which a spring that was found in the middle says nothing
+MAX_TISSUE = 4.0  # Nm/rad; the motors push a joint away from its rest angle with what the tissue does not have of it
 
 
 class LinkLoad(NamedTuple):
@@ -41,6 +48,45 @@ class LinkLoad(NamedTuple):
 
     mass: np.ndarray  #: (n,) kg
     cog: np.ndarray  #: (n,) m from joint n along link n
+
+
+def load_by_moments(length: Vector, first_moment: Vector) -> LinkLoad:
+    """Return the masses at typical places of links 3 and 4 that have the moments M3 and M4, for the inertia alone.
+
+    length: (4,) m. first_moment: M1..M4 in kg m that the wearer's arm adds.
+    """
+    (_, _, upper, lower), (_, _, whole, outer) = length, first_moment
+    places = TYPICAL_PLACE[0] * upper, TYPICAL_PLACE[1] * lower
+    forearm = outer / places[1] if lower else 0.0
+    arm = max(0.0, whole - forearm * upper) / places[0] if upper else 0.0
+    return LinkLoad(np.array((0.0, 0.0, arm, forearm)), np.array((0.0, 0.0, *places)))
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """The springs of a wearer's relaxed joints, on an arm of n joints. Raises ParameterError.
+
+    Of joint n at theta, it takes stiffness (theta - rest) Nm to hold it, and no more beyond TISSUE_REACH.
+    """
+
+    joint_stiffness: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "stiffness of the wearer's relaxed joints, by `calibrate wearer`; zero_g compensates `support` of it",
+        (0.0, MAX_TISSUE),
+        "Nm/rad",
+        expert=True,
+    )
+    joint_rest: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT, "angle at which they rest", (-np.pi, np.pi), "rad", expert=True
+    )
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+
+    def torque(self, theta: Sequence[float]) -> tuple[float, ...]:
+        """Return the torque (n,) in Nm that holds the relaxed joints at `theta` (n,) rad."""
+        springs = zip(self.joint_stiffness, self.joint_rest, theta, strict=True)
+        return tuple([k * max(-TISSUE_REACH, min(TISSUE_REACH, angle - rest)) for k, rest, angle in springs])
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,17 @@ from exo_gravity.core.arm.arm import (
     MAX_MOMENT,
     MAX_PAYLOAD,
     MAX_REACH,
+    MAX_WORN_BESIDE,
+    MAX_WORN_MOMENT,
     STANDARD_GRAVITY,
     ArmModel,
     ModelError,
+    papers,
 )
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.tilt import SIDES, Tilt
-from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Wearer
+from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Tissue, Wearer, load_by_moments
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
 from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
@@ -82,6 +85,11 @@ class Settings:
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none
     wearer_cog: Sequence[float] = ()  #: (n,) m from joint n, its centre of gravity
+    #: (4,) kg m, what the wearer's arm adds to M1..M4 of the paper's arm, in place of these masses in all but the
+    #: inertia; () for none
+    wearer_first_moment: Sequence[float] = ()
+    wearer_off_axis: Sequence[float] = ()  #: (4,) kg m, the same of W, Z, Y3, Y4
+    tissue: Tissue = field(default_factory=Tissue)  #: of the wearer's relaxed joints
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
@@ -116,6 +124,11 @@ class Settings:
         check_owned(self, len(self.robot.scale))
         for name in ("wearer_mass", "wearer_cog"):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
+        for name in ("wearer_first_moment", "wearer_off_axis"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        if any(self.tissue.joint_stiffness) and len(self.tissue.joint_stiffness) != len(self.robot.scale):
+            stiffness = list(self.tissue.joint_stiffness)
+            raise ParameterError("wearer.joint_stiffness", stiffness, f"{len(self.robot.scale)} numbers")
         self._carry(self.robot)
         object.__setattr__(self, "chosen", LAWS[self.law](self))
         object.__setattr__(self, "exact", ExactLaw(self.arm))
@@ -124,7 +137,9 @@ class Settings:
         """Compute what is carried."""
         loaded = robot.with_payload(self.payload_mass, self.payload_cog)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
-        whole = loaded.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
+        whole = self.worn(loaded, self.support_now)
+        if any(self.wearer_first_moment) and self.mode == "zero_g" and self.law not in ("exact", URDF_LAW):
+            raise ParameterError("law", self.law, "exact with wearer.first_moment: it needs mass and cog")
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
         given = loaded.given_mass
         if given + wearer > MAX_CARRIED:
@@ -141,6 +156,12 @@ class Settings:
         object.__setattr__(self, "loaded", loaded)
         object.__setattr__(self, "arm", whole if self.mode == "zero_g" else loaded)
         object.__setattr__(self, "moving", carried if self.mode == "zero_g" else by_mass)
+
+    def worn(self, arm: Arm, support: float = 1.0) -> Arm:
+        """Return `arm` plus a share `support` (0..1) of the wearer's arm. Raises ParameterError."""
+        if any(self.wearer_first_moment):
+            return papers(arm).with_moments(self.wearer_first_moment, self.wearer_off_axis, support)
+        return arm.with_wearer(self.wearer_mass, self.wearer_cog, support)
 
     @cached_property
     def unit_load(self) -> Arm:
@@ -168,11 +189,16 @@ class Settings:
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; exact: by the exact law in any case.
 
-        And why the chosen law does not apply here, or ''. Then the exact law replaces it.
+        In zero_g with `support` of the wearer's tissue. And why the chosen law does not apply here, or ''. Then the
+        exact law replaces it.
         """
         reason = self.chosen.outside(theta, tilt)
         law = self.exact if exact or reason else self.chosen
-        return law.torque(theta, tilt), reason
+        torque = law.torque(theta, tilt)
+        if self.mode == "zero_g" and any(self.tissue.joint_stiffness):
+            share = self.support_now
+            torque = tuple([tau + share * own for tau, own in zip(torque, self.tissue.torque(theta), strict=True)])
+        return torque, reason
 
 
 # fmt: off
@@ -199,6 +225,11 @@ COMPENSATOR = (
     Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m", vector=True),
+    Param("wearer.first_moment", [0.0] * JOINT_COUNT, "what the wearer's arm adds to M1 to M4, by `calibrate wearer`; "
+          "all 0: by mass and cog", (0.0, MAX_WORN_MOMENT), "kg m", expert=True),
+    Param("wearer.off_axis", [0.0] * JOINT_COUNT, "what it adds to W, Z, Y3, Y4, where wearer.first_moment is given",
+          (-MAX_WORN_BESIDE, MAX_WORN_BESIDE), "kg m", expert=True),
+    *(replace(param, name=f"wearer.{param.name}") for param in params_of(Tissue)),
     Param("payload.mass", 0.0, "load in the hand, carried in full in both modes; 0 once it was dropped",
           (0.0, MAX_PAYLOAD), "kg"),
     Param("payload.cog", [0.0] * 3, "its centre of gravity in frame 4: from the end of link 4, along x_4, y_4, z_4",
@@ -236,7 +267,8 @@ URDF = (
     Param("wearer.links", list(PAPER_LINKS), "which links carry the upper arm, and forearm and hand, from 1 on; 0: the "
           "robot does not carry it", (0, MAX_JOINTS), vector=True, fixed=True),
 )
-PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis"}
+PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
+         "wearer.first_moment", "wearer.off_axis"}
 # fmt: on
 
 
@@ -276,7 +308,10 @@ def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = N
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
     with named("robot."):
         by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
-    return _settings_of(values, values["side"], robot_of(values), wearer_of(values), anfis=anfis, robot_by_mass=by_mass)
+    along, across = (values.get(f"wearer.{name}", ()) for name in ("first_moment", "off_axis"))
+    worn = {"wearer_first_moment": along, "wearer_off_axis": across} if any(along) else {}
+    own = {"anfis": anfis, "robot_by_mass": by_mass, **worn}
+    return _settings_of(values, values["side"], robot_of(values), wearer_of(values), **own)
 
 
 def urdf_settings_of(values: Mapping[str, Any], robot: UrdfModel) -> Settings:
@@ -307,6 +342,7 @@ def _settings_of(
         use_imu=values["use_imu"],
         terms=term_settings_of(values),
         model_error=ModelError(*sized),
+        tissue=tissue_of(values),
         payload_mass=values["payload.mass"],
         payload_cog=tuple(values["payload.cog"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
@@ -324,13 +360,28 @@ def robot_of(values: Mapping[str, Any]) -> ArmModel:
         return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, across)
 
 
+def tissue_of(values: Mapping[str, Any]) -> Tissue:
+    """Return the springs of the wearer's relaxed joints that parameter values describe, or raise ParameterError."""
+    with named("wearer."):
+        return Tissue(*(values[f"wearer.{param.name}"] for param in params_of(Tissue)))
+
+
 def wearer_of(
     values: Mapping[str, Any], length: Vector | None = None, links: Sequence[int] = PAPER_LINKS
 ) -> tuple[Sequence[float], Sequence[float]]:
     """Return mass and centre of gravity (n,) of the wearer on each link; explicit values override the table's.
 
+    Where only the moments are given, those of typical masses: they are for the inertia alone.
+
     length: of the links, (n,) m; None: `link_length`. links: as in `Wearer.on_links`.
     """
+    if not any(values["wearer.mass"]) and not values["wearer.body_mass"] and any(values.get("wearer.first_moment", ())):
+        moments = values["wearer.first_moment"]
+        load = load_by_moments(values["link_length"], moments)
+        if load.mass.sum() > MAX_CARRIED:
+            heaviest = f"that of an arm of at most {MAX_CARRIED:g} kg, not {load.mass.sum():.1f}"
+            raise ParameterError("wearer.first_moment", moments, heaviest)
+        return load
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}

@@ -189,7 +189,7 @@ class Weighing:
             return
         if fastest > WEIGHING.start_speed:
             self.trouble = Reason(WeighingTrouble.MOVES, f"the arm moves at {fastest:.2f} rad/s: hold it still")
-        wearer = s.robot.massless(gravity).with_wearer(s.wearer_mass, s.wearer_cog)
+        wearer = s.worn(s.robot.massless(gravity))
         self._worn = np.array(wearer.torque(theta, tilt))  # Nm
         by_tilt = np.array([s.arm.torque(theta, axis) for axis in AXES]).T  # (n, 3) Nm/rad
         covariance = np.diag(np.hypot(error.torque, WEIGHING.least_error) ** 2) + error.tilt**2 * by_tilt @ by_tilt.T

@@ -132,13 +132,17 @@ class Itinerary:
 
     given: by default the hanging arm.
     duration: s, of the whole tour, which the choice keeps within.
+    again: how many of the first poses are visited again at the end, to see whether anything has changed.
     """
 
-    def __init__(self, limits: Limits, count: int, duration: float, given: Sequence[Station] = ()) -> None:
+    def __init__(
+        self, limits: Limits, count: int, duration: float, given: Sequence[Station] = (), again: int = 0
+    ) -> None:
         self._limits, self._most, self._duration = limits, count, duration
         self._home, self._candidates = hanging(limits), candidates(limits)
         stations = given or [self._home]
-        self.count, self._given = max(count, len(stations)), iter(stations)
+        self._again = again
+        self.count, self._given = max(count, len(stations)) + again, iter(stations)
 
     def next(
         self, taken: np.ndarray, position: np.ndarray, elapsed: float, guess: TorqueGuess, friction: Vector
@@ -153,9 +157,11 @@ class Itinerary:
         Returns None after the last; raises DataError if no pose can be held.
         """
         station = next(self._given, None)
-        if station or len(taken) >= self._most:
+        if station or len(taken) >= self._most + self._again:
             return station
-        in_time = np.flatnonzero(self._is_in_time(self._most - len(taken), position, elapsed))
+        if len(taken) >= self._most:
+            return Station(tuple(taken[len(taken) - self._most].tolist()))
+        in_time = np.flatnonzero(self._is_in_time(self._most + self._again - len(taken), position, elapsed))
         room = self._room(self._candidates[in_time], position, guess, friction)
         if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")

@@ -251,6 +251,7 @@ CALIBRATOR = (
     Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
     *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
+    Param("tour.again", 0, "number of the first poses that are visited again at the end", (0, 100), fixed=True),
     Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
@@ -264,5 +265,5 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
     count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
-    itinerary = Itinerary(limits, count, DURATION, given)
+    itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
     return Tour(limits, guess, itinerary, values["rate"], load)

@@ -2,12 +2,12 @@
 """calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
-is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: two
-masses explain what the arm needs beyond the robot's moments, one on link 3 and one on link 4, at the centres of gravity
-of the body-mass table: torque shows only mass times distance.
+is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: the
+moments of the wearer's arm and springs in their joints explain what the robot's moments do not (wearer_fit.py).
 """
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, moments_along
-from exo_gravity.core.arm.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
-from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.settings import wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import COVER, JOINT_COUNT, one_float
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, tour_parameters
@@ -29,8 +29,10 @@ from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
+from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit, fit_wearer, unrest
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 
+MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to relax
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
@@ -38,22 +40,26 @@ LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 
 @dataclass(frozen=True)
 class WearerTour:
-    """The tour of a worn arm, and which masses a wearer can have."""
+    """The tour of a worn arm, and which arms a wearer can have."""
 
-    poses: int = 4  #: the hanging arm and three others
+    poses: int = 8  #: the hanging arm and seven others
+    again: int = 2  #: of them, visited again at the end
+    least_poses: int = 5  #: different ones: fewer do not tell springs from weight
     #: rad: a comfortable part of the joints' ranges.
     comfortable: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
-    breathing: float = 0.1  #: Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
-    body_mass: float = 70.0  #: kg, where the file has none
-    largest_error: float = 0.25  #: of a mass, as a standard error
+    #: share of their arm's weight that a relaxed person may hold throughout, unseen: it looks like a lighter arm
+    carried: float = 0.2
+    unrest: float = 0.5  #: Nm by which what holds the arm may differ between two visits of a pose: breathing, 3.5 times
+    largest_error: float = 0.25  #: of M3 and M4, as a standard error
     most: float = 15.0  #: kg of a person's arm
+    body_mass: float = 70.0  #: kg, where the file has none
     table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled moments that are plausible
+    samples: int = 200  #: poses of the comfortable range in which the error of the torque is taken
 
 
 WEARER = WearerTour()
 
 
-WORN = ("upper arm", "forearm and hand")  # on links 3 and 4
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
@@ -180,53 +186,152 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
 
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
+    carried = WEARER.carried if options.carried is None else one_float("carried", options.carried, 0.0, MOST_CARRIED)
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, WEARER.comfortable[0]), np.minimum(arm.high, WEARER.comfortable[1])
-    changes = {"tour.poses": WEARER.poses, "position_min": low.tolist(), "position_max": high.tolist()}
+    changes = {"tour.poses": WEARER.poses, "tour.again": WEARER.again}
+    changes |= {"position_min": low.tolist(), "position_max": high.tolist()}
     expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
     request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
-    return wearer_from(arm, _observations(options, arm, say, changes, request, expected))
+    return wearer_from(arm, _observations(options, arm, say, changes, request, expected), carried)
 
 
-def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
-    """Return the masses on links 3 and 4 that explain what the robot alone does not. Raises DataError if none do."""
-    if len(observations) < 3:
-        raise DataError(f"{len(observations)} poses were measured, must be at least 3")
+def wearer_from(
+    arm: ConfiguredArm, observations: Sequence[Observation], carried: float = WEARER.carried
+) -> CalibrationResult:
+    """Return moments and springs of the wearer's arm: what the robot alone does not explain.
+
+    carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
+    not show an arm.
+    """
+    length, table = arm.robot.length, _wearer(arm, tabled=True)
     theta, direction, effort, spread = columns(observations)
-    cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
-    per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
-    weight = 1.0 / np.hypot(spread, WEARER.breathing).ravel()
-    matrix = (rows[..., :JOINT_COUNT] @ per_mass).reshape(-1, 2) * weight[:, None]
-    extra = (effort - rows @ moments_of(arm.robot)).ravel() * weight
-    covariance = np.linalg.pinv(matrix.T @ matrix)
-    mass = covariance @ matrix.T @ extra
-    remainder = extra - matrix @ mass
-    covariance *= max(1.0, float(remainder @ remainder) / (remainder.size - 2))
-    error, moments = np.sqrt(np.diag(covariance)), (per_mass @ mass)[2:]
-    moment_error = np.sqrt(np.diag(per_mass @ covariance @ per_mass.T))[2:]
-    for part, own, e in zip(WORN, mass, error, strict=True):
-        if not 0.0 < own < WEARER.most:
-            relaxed = "is the arm relaxed, the robot calibrated?"
-            raise DataError(f"{part}: {own:.2f} kg: must be from 0 to {WEARER.most:g}: {relaxed}")
-        if e > WEARER.largest_error * own:
-            raise DataError(f"{part}: {own:.2f} +- {e:.2f} kg: add a pose with the arm further forward")
-    node, note = f"{arm.namespace}/compensator", f"kg, +-{error[0]:.2f} and {error[1]:.2f}"
-    changes = (
-        Change(node, "wearer.mass", [0.0, 0.0, *mass.round(3).tolist()], note),
-        Change(node, "wearer.cog", cog.round(4).tolist(), "m, of the body-mass table"),
-        Change(node, "model_error.wearer", round(float((moment_error / moments).max()), 3), "share of M3 and M4"),
-    )
+    rows = regressor(theta, direction, arm.robot.gravity)
+    torque = effort - rows @ moments_of(arm.robot)
+    again, change = unrest(theta, torque)
+    if len(observations) - again < WEARER.least_poses:
+        measured = f"{len(observations) - again} different poses were measured"
+        raise DataError(f"{measured}, must be at least {WEARER.least_poses}")
+    restless = [
+        f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
+        for name, off in zip(arm.joint_names, change, strict=True)
+        if off > WEARER.unrest
+    ]
+    if restless:
+        raise DataError("; ".join(restless))
+    to_moments = worn_moments(length)
+    fit = fit_wearer(rows @ to_moments, theta, torque, spread, _known(length, *map(np.array, table)))
+    own = fit.covariance[: len(fit.moments), : len(fit.moments)]
+    moments, error = to_moments @ fit.moments, np.sqrt(np.diag(to_moments @ own @ to_moments.T))
+    for index in (2, 3):
+        shown = f"{MOMENTS[index]} of the wearer = {moments[index]:.3f} +- {error[index]:.3f} kg m"
+        if not moments[index] > error[index] / WEARER.largest_error:
+            raise DataError(f"{shown}: is the arm relaxed, the robot calibrated?")
+    mass, beside = _bounded(fit.moments, length)
+    if mass > WEARER.most:
+        raise DataError(f"the wearer's arm = {mass:.1f} kg: must be at most {WEARER.most:g}: is the arm relaxed?")
+    moments = to_moments @ np.array((mass, *fit.moments[1:3], *beside))
+    poses = np.random.default_rng(0).uniform(*WEARER.comfortable, (WEARER.samples, JOINT_COUNT))
+    unsure = fit.torque_error(regressor(poses, direction[0], arm.robot.gravity) @ to_moments, poses)
+    ratio = moments[2:4] / moments_along(length, *map(np.array, (table[1], table[0])))[2:]
     body_mass, (low, high) = arm.compensator["wearer.body_mass"], WEARER.table_ratio
-    tabled_mass, tabled_cog = map(np.array, _wearer(arm, tabled=True))
-    ratio = moments / moments_along(length, tabled_cog, tabled_mass)[2:]
-    refusals: tuple[str, ...] = ()
     compared = f"a person of {WEARER.body_mass * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
+    refusals: tuple[str, ...] = ()
     if body_mass:
         compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
         if not np.all((ratio >= low) & (ratio <= high)):
             refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
-    lines = f"largest remainder of a pose: {np.abs(remainder / weight).max():.2f} Nm", compared
-    return CalibrationResult(changes, lines, refusals, arm, tuple(observations))
+    refusals += tuple(
+        f"{name}: a spring of {stiffness:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
+        for name, stiffness in zip(arm.joint_names, fit.stiffness.tolist(), strict=True)
+        if stiffness > MAX_TISSUE
+    )
+    lines = (
+        f"largest remainder of a pose: {np.abs(fit.remainder).max():.2f} Nm", compared,
+        f"{again} poses were visited again, and differed by {change.max():.2f} Nm at most",
+        f"a wearer who holds up to {carried:.0%} of their arm throughout looks like one with a lighter arm: "
+        "the band contains that, and nothing shows it",
+        _bridge_line(arm, moments_of(arm.robot) + moments, fit),
+    )  # fmt: skip
+    return CalibrationResult(
+        _wearer_changes(arm, fit, moments, error, unsure, carried), lines, refusals, arm, tuple(observations)
+    )
+
+
+def _wearer_changes(
+    arm: ConfiguredArm, fit: WearerFit, moments: np.ndarray, error: np.ndarray, unsure: np.ndarray, carried: float
+) -> tuple[Change, ...]:
+    """Return the new values; unsure: standard error (n,) in Nm of the wearer's torque."""
+    node, stiffness_error = f"{arm.namespace}/compensator", fit.stiffness_error
+    changes = [
+        Change(node, f"wearer.{name}", np.round(moments[part], 4).tolist(), f"kg m, +-{_row(error[part])}")
+        for name, part in (("first_moment", slice(JOINT_COUNT)), ("off_axis", slice(JOINT_COUNT, None)))
+    ]
+    changes += [
+        Change(node, "wearer.joint_stiffness", fit.stiffness.round(3).tolist(), f"Nm/rad, +-{_row(stiffness_error)}"),
+        Change(node, "wearer.joint_rest", fit.rest.round(3).tolist(), "rad"),
+        Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
+        Change(node, "model_error.wearer", round(unseen_error(carried), 3), "share that the wearer may have held"),
+    ]
+    if arm.compensator["law"] != "exact":
+        changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
+    return tuple(changes)
+
+
+def _bridge_line(arm: ConfiguredArm, moments: np.ndarray, fit: WearerFit) -> str:
+    """Return what can_bridge must let the efforts of this wearer have at support 1, if it checks them.
+
+    moments: (8,) kg m of robot and wearer.
+    """
+    along, (w, z, y3, y4) = moments[:JOINT_COUNT], np.abs(moments[JOINT_COUNT:])
+    beside = arm.robot.gravity * np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
+    way = np.maximum(np.abs(arm.low - fit.rest), np.abs(arm.high - fit.rest))
+    added = beside + fit.stiffness * np.minimum(way, TISSUE_REACH)
+    values = ", ".join(f"{math.ceil(100.0 * moment) / 100.0:g}" for moment in along)
+    more = ", ".join(f"{math.ceil(10.0 * torque) / 10.0:g}" for torque in added)
+    return (
+        f"can_bridge, for this wearer at support 1: largest_moment [{values}] kg m, largest_addition {more} Nm or more"
+    )
+
+
+def unseen_error(carried: float) -> float:
+    """Return the standard error of the weight, as a share of what was found, if up to `carried` (0..1) was held.
+
+    Any share up to that is as likely. Two of these errors cover 95 % of them.
+    """
+    usual = 0.95 * carried
+    return usual / (1.0 - usual) / COVER
+
+
+def worn_moments(length: np.ndarray) -> np.ndarray:
+    """Return the moments M1..M4, W, Z, Y3, Y4 by those that links 3 and 4 can add: (8, 6).
+
+    These are the mass in kg, with which both pull at the links before, and M3, M4, Z, Y3, Y4 in kg m. length: (4,) m.
+    """
+    matrix = np.zeros((len(MOMENTS), 6))
+    matrix[:2, 0] = length[:2]
+    matrix[[2, 3, 5, 6, 7], np.arange(1, 6)] = 1.0
+    return matrix
+
+
+def _known(length: np.ndarray, mass: np.ndarray, cog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what is known before of the six columns of `worn_moments`, as `fit_wearer` takes it, by the table."""
+    along, total = moments_along(length, cog, mass)[2:], mass.sum()
+    upper, lower = cog[2], cog[3]
+    # The mass that the moments have at these places is the whole one.
+    by_moments = np.array((1.0, -1.0 / upper, -(1.0 - length[2] / upper) / lower, 0.0, 0.0, 0.0))
+    matrix = np.vstack((by_moments / (PRIOR.mass * total), np.eye(6)[1:]))
+    beside = PRIOR.beside * np.array((total, mass[2], mass[3]))
+    matrix[1:] /= np.concatenate((PRIOR.moments * along, beside))[:, None]
+    return matrix, np.concatenate(([0.0], np.full(2, 1.0 / PRIOR.moments), np.zeros(3)))
+
+
+def _bounded(found: np.ndarray, length: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return a mass in kg, and Z, Y3 and Y4 in kg m, that an arm with the moments `found` (6,) can have."""
+    mass, m3, m4 = found[:3]
+    mass = max(float(mass), m3 / length[2], m4 / length[3])
+    most = MAX_OFFSET * mass
+    return mass, np.clip(found[3:], -most, most)
 
 
 def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:

@@ -25,7 +25,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import REQUEST
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.observer.momentum import OBSERVER, WearerEstimate
-from exo_gravity.lab.observer.share import SHARE, RunningShare
+from exo_gravity.lab.observer.share import SHARE, Known, RunningShare, Shares
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,8 @@ class AdaptationTuning:
     memory: float = 60.0  #: s, time constant with which a raised support is forgotten
     reach: float = 0.2  #: rad/s of any joint: faster is a movement
     #: of the wearer's arm: half the width of the share's 95 % band beyond which it says nothing
-    widest: float = 0.25
+    #: (as much of it as `calibrate wearer` cannot know, 0.23, fits in; that of the body-mass table, 0.29, does not)
+    widest: float = 0.28
 
 
 ADAPTATION = AdaptationTuning()
@@ -49,15 +50,15 @@ class SupportAdaptation:
     """How much of the wearer's arm is to be carried, from one estimate of their torque to the next.
 
     support: 0..1, at present. requested: 0..1, the same as the compensator is asked for it, in steps that leave it time
-    for a guided change; None while nothing adapts. problem: why the support cannot rise, or ''. share: the wearer's
-    share as `RunningShare` returns it, known without an adaptation, too.
+    for a guided change; None while nothing adapts. problem: why the support cannot rise, or ''. shares: the wearer's,
+    None if nothing is estimated; known without an adaptation, too.
     """
 
     def __init__(self, tuning: AdaptationTuning = ADAPTATION) -> None:
         self.support = 0.0
         self.requested: float | None = None
         self.problem = ""
-        self.share: tuple[float, float] | None = None
+        self.shares: Shares | None = None
         self._tuning = tuning
         self._running = RunningShare()
         self._time = self._due = -math.inf  # s
@@ -80,9 +81,9 @@ class SupportAdaptation:
         dt, self._time = now - self._time, now
         is_running = 0.0 < dt <= OBSERVER.max_gap
         if is_running and joints and estimate:
-            self.share = self._running.update(dt, estimate)
+            self.shares = self._running.update(dt, estimate)
         else:
-            self._running, self.share = RunningShare(), None
+            self._running, self.shares = RunningShare(), None
             self._theta, self._speed = None, 0.0
         if not settings.is_adaptive or dt > REQUEST.expires:
             self.requested = None
@@ -103,6 +104,11 @@ class SupportAdaptation:
         if now >= self._due and abs(self.support - in_force) >= REQUEST.least_change:
             self.requested, self._due = self.support, now + REQUEST.pause
 
+    @property
+    def share(self) -> Known | None:
+        """The wearer's share of the whole arm."""
+        return self.shares.whole if self.shares else None
+
     def _sunk(self, dt: float, joints: Sequence[Sequence[float]], weight: Torque, asked: float) -> float:
         """Return how fast the arm sinks as a share of `full`, at most 1, and at least -`lift` while it is lifted.
 
@@ -119,7 +125,8 @@ class SupportAdaptation:
         self.problem = ""
         if self.share is None:  # the arm hangs
             return 0.0
-        share, band = self.share[0], COVER * self.share[1]
+        share, deviation = self.share
+        band = COVER * deviation
         if band > tuning.widest:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
         sunk = max(-tuning.lift, min(1.0, -self._speed / tuning.full))

@@ -6,9 +6,9 @@ A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' tor
     p' = tau + f + C^T v - g + wearer        residual r = p's share that tau + f + C^T v - g does not explain,
 
 behind a low-pass of `bandwidth`: no acceleration is needed. M, C, g are those of the robot plus the wearer's whole
-passive arm, so the residual is what their muscles (and the passive tissue of their joints) add; without a wearer in the
-settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that
-changes steadily passes without lag.
+passive arm, g with the tissue of their relaxed joints as far as it is known: so the residual is what their muscles add.
+Without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r,
+which a torque that changes steadily passes without lag.
 
 The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
 the model stays the same for as long as a pose is held.
@@ -55,7 +55,10 @@ class WearerEstimate(NamedTuple):
 
     torque: Torque
     deviation: Torque  #: one standard deviation
-    weight: Torque  #: that carries the wearer's arm against gravity, 0 without a wearer in the settings
+    #: that carries the wearer's arm against gravity alone, also while the trunk shakes it; 0 without a wearer
+    weight: Torque
+    #: the part of the deviation in which one joint's error says nothing of another's: all but the error of the weight
+    independent: Torque
 
     @property
     def distinguishable(self) -> tuple[bool, ...]:
@@ -70,9 +73,10 @@ class MomentumObserver:
     def __init__(self, settings: Settings, tuning: ObserverTuning = OBSERVER) -> None:
         s, self._tuning = settings, tuning
         self._error = s.model_error
-        self._whole = s.loaded.with_wearer(s.wearer_mass, s.wearer_cog)
+        self._whole = s.worn(s.loaded)
         self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
-        self._wearer = s.robot.massless(s.loaded.gravity).with_wearer(s.wearer_mass, s.wearer_cog)
+        self._wearer, self._tissue = s.worn(s.robot.massless(s.loaded.gravity)), s.tissue
+        self._has_tissue = any(s.tissue.joint_stiffness)
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
@@ -85,13 +89,19 @@ class MomentumObserver:
         self._momentum = self._input = self._inner = self._outer = self._slow = (0.0,) * count
 
     def update(
-        self, now: float, joints: Sequence[Sequence[float]], tilt: Tilt, turning: Floats3 = ZERO
+        self,
+        now: float,
+        joints: Sequence[Sequence[float]],
+        tilt: Tilt,
+        turning: Floats3 = ZERO,
+        gravity_tilt: Tilt | None = None,
     ) -> WearerEstimate:
         """Return the estimate at `now` (s, monotonic), when the joints were read.
 
         joints: angles rad, velocities rad/s, and the motors' efforts Nm from now on, (n,) each.
         tilt: of what the trunk feels as gravity, with its magnitude.
         turning: the trunk's angular velocity in the arm's base frame, (3,) rad/s.
+        gravity_tilt: of gravity alone, for the weight; None: `tilt`, as if the trunk were not shaken.
         """
         theta, velocity, effort = joints
         tuning, bandwidth = self._tuning, self._tuning.bandwidth
@@ -100,7 +110,8 @@ class MomentumObserver:
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
-        unexplained = [tau + rub + c - g for tau, rub, c, g in zip(effort, rubbing, coriolis, gravity, strict=True)]
+        held = tuple(map(operator.add, gravity, self._tissue.torque(theta))) if self._has_tissue else gravity
+        unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
         dt, self._time = now - self._time, now
         if 0.0 < dt <= tuning.max_gap:
             # The input since the last sample, with the momentum's mean.
@@ -119,14 +130,15 @@ class MomentumObserver:
             self._outer, self._slow, self._felt = tuple(once), momentum, felt
         self._input, self._momentum = tuple(unexplained), momentum
         lag = list(map(operator.sub, once, self._outer))
-        worn = tuple(map(operator.mul, self._gain, self._wearer.torque(theta, tilt)))
+        still = (gravity_tilt or tilt)._replace(magnitude=1.0)
+        worn = tuple(map(operator.mul, self._gain, self._wearer.torque(theta, still)))
         shaken = tuning.motion_share * math.dist(felt, self._felt)
         largest = [math.hypot(*column) for column in zip(*columns, strict=True)]  # gravity in any direction
-        deviation = [
+        independent = [
             math.hypot(
                 self._error.torque[n],
                 self._error.scale[n] * effort[n],
-                self._error.wearer * worn[n],
+                self._error.wearer_torque[n],
                 self._error.tilt * math.sqrt(max(0.0, (tilt.magnitude * largest[n]) ** 2 - gravity[n] ** 2)),
                 shaken * largest[n],
                 friction[n],
@@ -136,7 +148,8 @@ class MomentumObserver:
             )
             for n in range(len(lag))
         ]
-        return WearerEstimate(tuple(map(operator.add, once, lag)), tuple(deviation), worn)
+        deviation = [math.hypot(own, self._error.wearer * w) for own, w in zip(independent, worn, strict=True)]
+        return WearerEstimate(tuple(map(operator.add, once, lag)), tuple(deviation), worn, tuple(independent))
 
     def _friction(self, velocity: Sequence[float]) -> tuple[list[float], list[float]]:
         """Return the joints' friction (n,) in Nm, against the motion, and its standard deviation."""

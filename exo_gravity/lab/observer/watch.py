@@ -12,6 +12,7 @@ from exo_gravity.core.vocabulary import NONE, UNKNOWN, Adapts
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.contact import ContactWatch
 from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
+from exo_gravity.lab.observer.share import Known, Shares
 
 OLD = 1.0  # s after which an estimate is no longer shown
 
@@ -34,13 +35,13 @@ class WearerWatch:
             self._observer = MomentumObserver(settings)
 
     def update(
-        self, now: float, joints: Sequence[Sequence[float]] | None, trunk: tuple[Tilt, Floats3] | None
+        self, now: float, joints: Sequence[Sequence[float]] | None, trunk: tuple[Tilt, Floats3, Tilt] | None
     ) -> WearerEstimate | None:
         """Take a sample of `now` s; return the estimate, None if there is none.
 
         joints: angles rad, velocities rad/s and the motors' efforts Nm, (n,) each; None if one is missing.
-        trunk: tilt of what it feels as gravity, and its angular velocity (3,) rad/s in the arm's base frame; None if
-        it is not known.
+        trunk: tilt of what it feels as gravity, its angular velocity (3,) rad/s in the arm's base frame, and tilt of
+        gravity alone; None if it is not known.
         """
         self._time, self._estimate = now, None
         if joints is not None and trunk is not None:
@@ -52,7 +53,7 @@ class WearerWatch:
     def values(self, now: float) -> dict[str, str]:
         """Return torques and share with their 95 % bands, the newest contact, and the support, for /diagnostics."""
         estimate = self._estimate if now - self._time <= OLD else None
-        values = values_of(self._names, estimate, self.adaptation.share if estimate else None)
+        values = values_of(self._names, estimate, self.adaptation.shares if estimate else None)
         requested, problem, contact = self.adaptation.requested, self.adaptation.problem, self._contact
         values |= {
             "support adapts": (Adapts.HELD if problem else Adapts.ON) if self._settings.is_adaptive else Adapts.OFF,
@@ -67,25 +68,31 @@ class WearerWatch:
         return values | {"contact age (s)": f"{now - at:.0f}"}
 
 
-def values_of(
-    names: Sequence[str], estimate: WearerEstimate | None, share: tuple[float, float] | None
-) -> dict[str, str]:
-    """Return torques and share with half their 95 % bands, for /diagnostics.
+def values_of(names: Sequence[str], estimate: WearerEstimate | None, shares: Shares | None) -> dict[str, str]:
+    """Return torques and shares with half their 95 % bands, for /diagnostics.
 
-    names: of the joints (n,). estimate: None if there is none. share: of the wearer, and its standard deviation, 0..1.
+    names: of the joints (n,). estimate, shares: None if there are none.
     """
-    value, deviation = share or (None, 0.0)
-    values = {"share of the wearer (%)": UNKNOWN, "share band (%)": UNKNOWN}
-    if value is not None:
-        values["share of the wearer (%)"] = f"{round(100.0 * value)}"
-        values["share band (%)"] = f"{round(100.0 * COVER * deviation)}"
+    whole, joints = shares or (None, (None,) * len(names))
+    values = dict(zip(("share of the wearer (%)", "share band (%)"), _percent(whole), strict=True))
+    for name, share in zip(names, joints, strict=True):
+        values[f"{name} share (%)"], values[f"{name} share band (%)"] = _percent(share)
     for n, name in enumerate(names):
         values[f"{name} wearer (Nm)"] = f"{round(estimate.torque[n], 1) + 0.0:.1f}" if estimate else UNKNOWN
         values[f"{name} wearer band (Nm)"] = f"{COVER * estimate.deviation[n]:.1f}" if estimate else UNKNOWN
     return values
 
 
+def _percent(share: Known | None) -> tuple[str, str]:
+    """Return a share and half its 95 % band."""
+    if share is None:
+        return UNKNOWN, UNKNOWN
+    value, deviation = share
+    return f"{round(100.0 * value)}", f"{round(100.0 * COVER * deviation)}"
+
+
 def _known_of(s: Settings) -> object:
     """Return what the observer depends on."""
     load = *s.wearer_mass, *s.wearer_cog, s.payload_mass, *s.payload_cog
-    return s.robot, load, s.terms.friction, s.model_error
+    worn = s.wearer_first_moment, s.wearer_off_axis, s.tissue
+    return s.robot, load, worn, s.terms.friction, s.model_error

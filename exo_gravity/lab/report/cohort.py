@@ -32,7 +32,7 @@ BLOCK = 2**22  # bytes that are hashed at once
 COLUMNS = (
     "recording", "date", "subject", "protocol", "arm", "source", "mode", "support", "held", "verdict", "problem",
     "holds", "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
-    "range_of_motion_deg", "rms_torque_nm",
+    "range_of_motion_deg", "rms_torque_nm", "wearer_share_of_joint",
 )  # fmt: skip
 
 Row = dict[str, Any]  # by COLUMNS; None where unknown
@@ -95,6 +95,7 @@ def summary(path: str, judging: Judging) -> list[Row]:
         }
         for joint, name in enumerate(recording.joint_names):
             of_joint = {"joint": name, **_of_joint(recording, analysis, joint)}
+            of_joint["wearer_share_of_joint"] = part and float(part.joints.value[joint])
             row = dict.fromkeys(COLUMNS) | of_arm | of_joint
             rows.append({key: _plain(value) for key, value in row.items()})
     return rows

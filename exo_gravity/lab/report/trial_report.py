@@ -101,7 +101,8 @@ def write(
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
             if part:
-                pictures.append(html.bullets("Wearer", [wearer_share.sentence(part, source)]))
+                shares = wearer_share.sentence(part, source), wearer_share.joint_sentence(part, recording.joint_names)
+                pictures.append(html.bullets("Wearer", shares))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
@@ -123,6 +124,7 @@ def print_report(report: Report, console: Console | None = None) -> None:
         table.print_tables(console, recording, analysis)
         if part := report.wearers.get(recording.name):
             console.print(marked(wearer_share.sentence(part, report.bag.source(recording.name))))
+            console.print(marked(wearer_share.joint_sentence(part, recording.joint_names)))
     for note in report.notes:
         console.print(f"[yellow]Note:[/] {marked(note)}.")
     for problem in report.bag.problems:

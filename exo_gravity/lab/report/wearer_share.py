@@ -1,11 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque and share in a report, by the same observer that runs in the node `wearer`.
 
-It needs the compensator's parameters and, if that used an IMU, `/imu/data`. Parameters that were changed during the
-recording are those of its start.
+It needs the compensator's parameters and, if that used an IMU, `/imu/data`; without `/imu/pitch_yaw`, the weight of the
+wearer's arm is taken along what the trunk feels. Parameters that were changed during the recording are those of its
+start.
 """
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +22,7 @@ from exo_gravity.core.numbers import COVER
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
-from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, observed, share_of, while_between
+from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, joint_shares, observed, share_of, while_between
 from exo_gravity.lab.trial.recording import Recording
 
 
@@ -30,6 +32,7 @@ class WearerPart(NamedTuple):
     curve: WearerCurve
     sliding: Share  #: over the last second, at each time of the curve
     whole: Share  #: over the recording
+    joints: Share  #: of each joint (n,) over the recording
 
 
 def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
@@ -42,18 +45,25 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
+    tilted_at, angles = bag.tilt[:, 0].tolist(), bag.tilt[:, 1:].tolist()
     if settings.use_imu and not times:
         raise DataError("the recording has no /imu/data")
 
-    def trunk_at(now: float) -> tuple[Tilt, Floats3]:
+    def trunk_at(now: float) -> tuple[Tilt, Floats3, Tilt]:
+        upright = Tilt.of(settings.side)
         if not settings.use_imu:
-            return Tilt.of(settings.side), ZERO
+            return upright, ZERO, upright
         row = rows[min(bisect_left(times, now), len(rows) - 1)]
-        return Tilt.of_felt(settings.side, row[3:]), turning_in_base(settings.side, row[:3])
+        felt = gravity = Tilt.of_felt(settings.side, row[3:])
+        if angles:
+            gravity = Tilt.of(settings.side, *angles[min(bisect_left(tilted_at, now), len(angles) - 1)])
+        return felt, turning_in_base(settings.side, row[:3]), gravity
 
     curve = observed(settings, recording.time, (recording.position, recording.velocity, recording.effort), trunk_at)
     curve = while_between(curve, recording.while_carried(-np.inf, np.inf))
-    return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve)) if len(curve.time) else None
+    if not len(curve.time):
+        return None
+    return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve), joint_shares(curve))
 
 
 def sentence(part: WearerPart, source: Source) -> str:
@@ -66,3 +76,13 @@ def sentence(part: WearerPart, source: Source) -> str:
     value = f"{100.0 * float(share.value):.0f} % of their arm's weight (95 % band ±{100.0 * band:.0f})"
     caveat = "" if abs(share.value) > band else ": not distinguishable from zero"
     return f"{where} wearer carried {value}{caveat}."
+
+
+def joint_sentence(part: WearerPart, names: Sequence[str]) -> str:
+    """Return the share of each joint over the recording, with its 95 % band. names: of the joints (n,)."""
+    known = [
+        f"{name} {100.0 * value:.0f} % (±{100.0 * COVER * deviation:.0f})"
+        for name, value, deviation in zip(names, *part.joints, strict=True)
+        if np.isfinite(value)
+    ]
+    return f"Of each joint's own weight: {', '.join(known) or 'no joint had any'}."

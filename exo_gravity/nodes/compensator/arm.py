@@ -99,6 +99,8 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         **facts,
         "wearer mass (kg)": row(s.wearer_mass),
         "wearer cog (m)": row(s.wearer_cog),
+        "wearer moments (kg m)": row((*s.wearer_first_moment, *s.wearer_off_axis)) if s.wearer_first_moment else NONE,
+        "wearer stiffness (Nm/rad)": row(s.tissue.joint_stiffness),
         "payload mass (kg)": f"{s.payload_mass:.3f}",
         "terms": words(*terms.active),
         "assist": terms.assist.state,

@@ -16,13 +16,13 @@ from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
-from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
+from exo_gravity.lab.budget import USUAL_TILT, budget_worn, largest_support, motor_torques, overload, workspace
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 WITHIN = "within rated torque everywhere"
 BRIDGE_PARAMETERS = {"motor", "torque_scale", "position_min", "position_max"}
-Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (n,) kg and centre of gravity (n,) m
-Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
+# robot, the same with the wearer's whole arm, support 0..1, largest tilt in rad
+Request = tuple[ArmModel, ArmModel, float, float]
 
 
 class BudgetWatch:
@@ -67,7 +67,7 @@ def request_of(s: Settings) -> Request:
     """Return what the motors must be able to hold with these settings."""
     support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
     tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return papers(s.loaded), (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
+    return papers(s.loaded), papers(s.worn(s.loaded)), support, tilt
 
 
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
@@ -76,13 +76,13 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     names: of the joints (n,).
     bridge: its parameter values.
     """
-    robot, load, support, tilt = request
+    robot, full, support, tilt = request
     try:
         bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
         rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
-        joints = budget(robot, load, support, bounds, rated, peak)
+        joints = budget_worn(robot, full, support, bounds, rated, peak)
     except ParameterError as error:
         return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
     overloaded = overload(names, joints)
     result = Reason(Budget.ABOVE_RATED, overloaded) if overloaded else Reason(Budget.WITHIN_RATED, WITHIN)
-    return result, f"{largest_support(joints) or 0.0:g}" if any(load[0]) else NONE
+    return result, f"{largest_support(joints) or 0.0:g}" if full != robot else NONE

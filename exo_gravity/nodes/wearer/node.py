@@ -65,16 +65,17 @@ class Trunk:
         """Use the compensator's new settings."""
         self._tilt.timeout = settings.tilt_timeout
 
-    def at(self, now: float) -> tuple[Tilt, Floats3] | None:
-        """Return the tilt of what the trunk feels as gravity, and its angular velocity; None if none is fresh.
+    def at(self, now: float) -> tuple[Tilt, Floats3, Tilt] | None:
+        """Return the tilt of what the trunk feels as gravity, its angular velocity, and the tilt of gravity alone.
 
-        now: monotonic s. The angular velocity is in the arm's base frame, (3,) rad/s.
+        now: monotonic s. The angular velocity is in the arm's base frame, (3,) rad/s. None if none is fresh.
         """
         self._subscription.poll()
+        gravity = None if self._tilt.problem(now) else self._tilt.at(now)
         if now - self._felt_at < FRESH and FELT.range[0] < math.hypot(*self._force) < FELT.range[1]:
             tilt = Tilt.of_felt(self._side, [-component for component in self._force], STANDARD_GRAVITY)
-            return tilt, turning_in_base(self._side, self._rate)
-        return None if self._tilt.problem(now) else (self._tilt.at(now), ZERO)
+            return tilt, turning_in_base(self._side, self._rate), gravity or tilt
+        return (gravity, ZERO, gravity) if gravity else None
 
     def _on_motion(self, now: float, force: Floats3, rate: Floats3, _age: float) -> None:
         self._felt_at, self._force, self._rate = now, force, rate
@@ -251,8 +252,9 @@ class WearerNode(Node):
         except ParameterError:
             return None
 
-    def _trunk_at(self, now: float, settings: Settings) -> tuple[Tilt, Floats3] | None:
-        return self._trunk.at(now) if self._trunk else (Tilt.of(settings.side), ZERO)
+    def _trunk_at(self, now: float, settings: Settings) -> tuple[Tilt, Floats3, Tilt] | None:
+        upright = Tilt.of(settings.side)
+        return self._trunk.at(now) if self._trunk else (upright, ZERO, upright)
 
     def _ask_for_support(self) -> None:
         """Renew the request, or change it at once."""

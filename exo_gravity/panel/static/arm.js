@@ -1,6 +1,6 @@
 // The card of one arm: its state, why, what to do and the button that does it; below its mode, support, load and joints.
 
-import { showLoad, showShare } from "./load.js";
+import { showJointShares, showLoad, showShare } from "./load.js";
 import { changes, jointText, poseAsked, tell } from "./telling.js";
 import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
@@ -188,6 +188,7 @@ export class ArmCard {
     if (this.setup?.settings) this.follow();
     this.showSupport();
     this.showJoints(alive ? state.joints : null, bridge);
+    showJointShares(this, alive ? state.joints : null, wearer, name === "active");
     this.showReports(bridge, compensator, alive);
   }
 

@@ -3,7 +3,7 @@
 import { finite, has, number, t, write } from "./texts.js";
 import { jointText } from "./telling.js";
 
-const WIDEST = 25; // %, half a 95 % band; a wider one does not tell a lifting wearer from a resting one
+const WIDEST = 28; // %, half a 95 % band; a wider one does not tell a lifting wearer from a resting one
 const inside = (percent) => Math.min(100, Math.max(0, percent));
 
 // How much of their arm's weight the wearer carries, to be read from two metres. It is shown while it means something:
@@ -30,6 +30,18 @@ function whyNoShare(card, wearer, value, band, isCarried) {
   if (!wearer) return t("share.silent");
   if (value === null || band === null) return t("share.none");
   return band > WIDEST ? t("share.wide", number(band, 0)) : "";
+}
+
+// The share of each joint's own weight: a whole share hides a joint that carries little. Below the buttons: it may be empty.
+export function showJointShares(card, joints, wearer, isCarried) {
+  const known = [];
+  for (const { name } of isCarried && card.hasWearer && wearer ? (joints ?? []) : []) {
+    const value = finite(wearer[`${name} share (%)`]);
+    const band = finite(wearer[`${name} share band (%)`]);
+    if (value === null || band === null) continue;
+    known.push(t(band > WIDEST ? "share.joint_wide" : "share.joint", jointText(card.name, name), number(value, 0), number(band, 0)));
+  }
+  write(card.find(".shares"), known.length ? t("share.joints", known.join(", ")) : "");
 }
 
 // The load in the hand, the weighing, and the last contact.

@@ -5,6 +5,17 @@ import { degrees, has, number, t, write } from "./texts.js";
 
 const byId = (id) => document.getElementById(id);
 const LENGTHS = ["upper_arm", "forearm", "hand"];
+const CALIBRATED = ["wearer.first_moment", "wearer.off_axis", "wearer.joint_stiffness"]; // of one person, on one arm
+const ROUNDED = 0.0006; // m, of a length in the form
+
+// What withdraws the last wearer's calibration from an arm with the settings `now`, if `values` are another person's.
+function withdrawn(values, now) {
+  const lengths = now?.["wearer.segment_length"] ?? [];
+  const isNear = lengths.every((length, n) => Math.abs(length - values["wearer.segment_length"][n]) < ROUNDED);
+  if (isNear && ["wearer.body_mass", "wearer.sex"].every((name) => values[name] === now?.[name])) return {};
+  const known = CALIBRATED.filter((name) => now?.[name]?.some((value) => value !== 0));
+  return Object.fromEntries(known.map((name) => [name, now[name].map(() => 0)]));
+}
 
 export class Sections {
   constructor({ send, sure }, cards) {
@@ -62,7 +73,8 @@ export class Sections {
       const support = card.supportFor(...Object.values(values));
       const isLess = !(support >= card.support);
       if (isLess) lowered.push(t("applied_lower", card.armText(), number(100 * support, 1)));
-      if (!(await this.send({ do: "set", arm, values: isLess ? { ...values, support } : values }))) return;
+      const all = { ...values, ...withdrawn(values, card.setup?.settings) };
+      if (!(await this.send({ do: "set", arm, values: isLess ? { ...all, support } : all }))) return;
     }
     this.edited = false;
     say([t("applied"), ...lowered].join(" "));

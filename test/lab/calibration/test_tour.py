@@ -253,6 +253,14 @@ def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more
     assert len(taken) == 8
 
 
+def test_the_first_poses_are_visited_again_at_the_end():
+    guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
+    itinerary, taken = Itinerary(LIMITS, 4, 160.0, again=2), np.empty((0, 4))
+    while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
+        taken = np.vstack((taken, station.theta))
+    assert len(taken) == itinerary.count == 6 and np.array_equal(taken[4:], taken[:2])
+
+
 def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
     weak = replace(LIMITS, max_effort=(0.1,) * 4)
     guess = TorqueGuess(DEFAULT_LINKS.length, moments_of(DEFAULT_LINKS), Tilt.of("right"), 9.81)
