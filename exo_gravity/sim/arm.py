@@ -29,6 +29,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
 from exo_gravity.core.arm.gravity import MAX_OFFSET
+from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.arm.kinematics import ROTORS
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
@@ -85,6 +86,9 @@ class JointConfig:
     #: On top at standstill; it fades with speed v as exp(-(v / stribeck_speed)^2).
     stribeck_friction: Sequence[float] = owned(_ZEROS, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
     stribeck_speed: Sequence[float] = owned((0.05,) * JOINT_COUNT, "speed at which it fades", (0.001, 10.0), "rad/s")
+    #: Cables and hoses across the joints.
+    spring_stiffness: Sequence[float] = owned(_ZEROS, "springs across the joints", (0.0, MAX_STIFFNESS), "Nm/rad")
+    spring_rest: Sequence[float] = owned(_ZEROS, "angle at which they are slack", (-MAX_REST, MAX_REST), "rad")
     #: The paper's motor mounts turn 190 degrees.
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
@@ -265,6 +269,7 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
               <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
+                stiffness="{config.spring_stiffness[n]}" springref="{config.spring_rest[n]}"
                 frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
                 range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>
               {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}

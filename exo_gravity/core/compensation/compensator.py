@@ -168,7 +168,7 @@ class Compensator:
 
     def _largest_torque(self, theta: Sequence[float]) -> float:
         """Return the most in Nm that gravity takes of any joint at `theta` (n,) rad, whatever its direction."""
-        torques = [self.settings.torque(theta, axis, exact=True)[0] for axis in AXES]
+        torques = [self.settings.exact.torque(theta, axis) for axis in AXES]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
     def _replace_load(self, settings: Settings) -> Load:

@@ -5,9 +5,9 @@ A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' tor
 
     p' = tau + f + C^T v - g + wearer        residual r = p's share that tau + f + C^T v - g does not explain,
 
-behind a low-pass of `bandwidth`: no acceleration is needed. M, C, g are those of the robot plus the wearer's whole
-passive arm, so the residual is what their muscles (and the passive tissue of their joints) add; without a wearer in the
-settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that
+behind a low-pass of `bandwidth`: no acceleration is needed. f is friction and the device's own springs. M, C, g are
+those of the robot plus the wearer's whole passive arm, so the residual is what their muscles (and the passive tissue of
+their joints) add; without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that
 changes steadily passes without lag.
 
 The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
@@ -74,6 +74,7 @@ class MomentumObserver:
         self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
         self._wearer = s.robot.massless(s.loaded.gravity).with_wearer(s.wearer_mass, s.wearer_cog)
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
+        self._spring = s.joint_spring
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
         self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
@@ -100,7 +101,8 @@ class MomentumObserver:
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
         rubbing, friction = self._friction(velocity)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
-        unexplained = [tau + rub + c - g for tau, rub, c, g in zip(effort, rubbing, coriolis, gravity, strict=True)]
+        held = tuple(map(operator.add, gravity, self._spring.torque(theta))) if self._spring.on else gravity
+        unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
         dt, self._time = now - self._time, now
         if 0.0 < dt <= tuning.max_gap:
             # The input since the last sample, with the momentum's mean.

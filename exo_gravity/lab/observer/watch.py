@@ -88,4 +88,4 @@ def values_of(
 def _known_of(s: Settings) -> object:
     """Return what the observer depends on."""
     load = *s.wearer_mass, *s.wearer_cog, s.payload_mass, *s.payload_cog
-    return s.robot, load, s.terms.friction, s.model_error
+    return s.robot, load, s.joint_spring, s.terms.friction, s.model_error
