@@ -68,7 +68,7 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
         load = wearer.on_links(robot.length)
-        torques = motor_torques(motors, configured.can_bridge["torque_scale"])
+        torques = motor_torques(configured.can_bridge)
         joints = budget(robot, load, support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
     return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)

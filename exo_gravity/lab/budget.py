@@ -10,8 +10,9 @@ these and improves one coordinate after another until nothing gets worse.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,9 @@ from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.joint_motor import scale_at
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
+from exo_gravity.core.safety.limits import HEAT
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
 
@@ -37,11 +40,17 @@ def motor_for(torque: float) -> str | None:
     return min(strong, key=lambda spec: spec.rated_torque).name if strong else None
 
 
-def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
-    """Return rated and peak torque (2, 4) in Nm of `motors` whose real torque is `torque_scale` times the command."""
+def motor_torques(bridge: Mapping[str, Any]) -> np.ndarray:
+    """Return rated and peak torque (2, 4) in Nm of the motors of `can_bridge`'s parameter values.
+
+    They are as warm as they may be with all of their torque. Raises ParameterError.
+    """
+    names = ("torque_scale", "torque_scale_slope", "torque_scale_temperature")
+    columns = zip(*(bridge[name] for name in names), strict=True)
+    weakest = [min(motor[0], scale_at(*motor, HEAT.most - HEAT.span)) for motor in columns]
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
-    scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
-    torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in motors]
+    scale = np.minimum(four_floats("torque_scale", weakest, 0.1, 2.0), 1.0)
+    torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in bridge["motor"]]
     return np.asarray(scale * np.transpose(torques))
 
 

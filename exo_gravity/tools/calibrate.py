@@ -41,7 +41,7 @@ MAX_POSES = 12
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
-    parser.set_defaults(bag=None, rests=None)
+    parser.set_defaults(bag=None, rests=None, earlier=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
@@ -64,6 +64,12 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option("--rests", type=Path, metavar="FOLDER", help="recording of the IMU resting on each of its six sides")
         if name == "gravity":
             option("--poses", type=int, default=MAX_POSES, metavar="N", help="largest number of poses (%(default)s)")
+        if name in ("gravity", "scale"):
+            option(
+                "--earlier", type=Path, metavar="TOUR.jsonl",
+                help="record of an earlier tour of this arm by the same file, its motors colder or warmer: "
+                "shows how torque_scale depends on the temperature",
+            )  # fmt: skip
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
@@ -111,7 +117,7 @@ def _run(options: argparse.Namespace) -> int:
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.output, options.record, page):
         check_output(path)
-    for path in (options.bag, options.rests):
+    for path in (options.bag, options.rests, options.earlier):
         if path is not None and not path.exists():
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()

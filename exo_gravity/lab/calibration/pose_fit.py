@@ -132,9 +132,7 @@ class Solution(NamedTuple):
     left: np.ndarray  #: (n, 4), part of each residual's variance that the fit leaves, 0..1
     freedom: np.ndarray  #: (4,), degrees of freedom of each joint's residuals
     hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
-    inverse: (
-        np.ndarray
-    )  #: (COUNT, 4 n + k), change of the unknowns with each effort and condition, by its error
+    inverse: np.ndarray  #: (COUNT, 4 n + k), change of the unknowns with each effort and condition, by its error
 
 
 def rows_of(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:

@@ -52,6 +52,7 @@ class Tour:
 
     measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
     the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
+    temperature: (4,) degC of the motors, set by who knows it; () if it is not known.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Tour:
         self.done = False
         self.progress = "choosing the first pose"
         self.elapsed = 0.0
+        self.temperature: Sequence[float] = ()
         self._limits, self._most = limits, np.array(limits.max_effort)
         self._guess, self._itinerary, self._load = guess, itinerary, load
         self._tracker = Tracker(rate, limits.max_effort)
@@ -207,7 +209,9 @@ class Tour:
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         weight, lever = self._load
-        self.measured.append(seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed))
+        warmth = tuple(self.temperature)
+        known = {"load_mass": weight, "load_lever": lever, "speed": station.speed, "temperature": warmth}
+        self.measured.append(seen._replace(effort=effort, **known))
         before = self._guess.torque(theta.tolist())
         self._guess.learn(theta, effort, seen.spread)
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
@@ -229,7 +233,8 @@ class TourController(SampleController):
         self._has_begun = False
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        position, velocity, _, _, _, times, *_ = zip(*samples, strict=True)
+        position, velocity, _, temperature, _, times, *_ = zip(*samples, strict=True)
+        self.tour.temperature = () if None in temperature else tuple(map(float, temperature))
         self._has_begun = self._has_begun or self._is_carried()
         if self._has_begun:
             effort = self.tour.step(now, position, velocity, self._tilt)

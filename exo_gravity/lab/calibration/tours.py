@@ -8,6 +8,7 @@ of the body-mass table: torque shows only mass times distance.
 """
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,15 +17,16 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, moments_along
 from exo_gravity.core.arm.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.settings import wearer_of
+from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
+from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
-from exo_gravity.lab.calibration.live import Say, tour_parameters
+from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
 from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
@@ -59,7 +61,8 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
-    return moments_from(arm, _observations(options, arm, say, {"tour.poses": options.poses}))
+    earlier = observations_in(options.earlier) if options.earlier else []
+    return moments_from(arm, earlier + _observations(options, arm, say, {"tour.poses": options.poses}))
 
 
 def _observations(
@@ -85,16 +88,23 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
     load_moments(arm.robot.length.tolist(), mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
+    earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
     bare = _observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
-        bare = [one._replace(effort=gravity_torque(arm.robot, one.theta, one.direction)) for one in bare]
+        bare = [one._replace(effort=_held(arm, one)) for one in bare]
     else:
         hang = f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = _observations(options, arm, say, changes, hang)
-    return moments_from(arm, bare + weighed)
+    return moments_from(arm, earlier + bare + weighed)
+
+
+def _held(arm: ConfiguredArm, pose: Observation) -> np.ndarray:
+    """Return the torque (4,) in Nm that the file's arm needs in a pose."""
+    springs = joint_spring_of(arm.compensator).torques(np.asarray(pose.theta))
+    return np.asarray(gravity_torque(arm.robot, pose.theta, pose.direction) + springs)
 
 
 def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
@@ -102,7 +112,7 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
     robot, (low, high) = arm.robot, TORQUE_SCALE_BOUNDS
     found = identify(observations, robot.length, robot.gravity)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
-    scale = np.round(factor * arm.can_bridge["torque_scale"], 4).tolist()
+    scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
         f"{name}: torque_scale = {value:g}: must be from {low:g} to {high:g}: check torque_range of its firmware"
         for name, value in zip(arm.joint_names, scale, strict=True)
@@ -113,6 +123,14 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
     changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
+
+
+def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
+    """Return the file's torque scales (4,) at the temperatures of the poses."""
+    bridge = arm.can_bridge
+    columns = (bridge[name] for name in ("torque_scale", "torque_scale_slope", "torque_scale_temperature"))
+    motors = zip(*columns, found.temperature.tolist(), strict=True)
+    return np.array([scale_at(*motor) if math.isfinite(motor[-1]) else motor[0] for motor in motors])
 
 
 def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple[Change, ...]:
@@ -127,9 +145,11 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
         changes.append(Change(node, name, moments[part], note))
     changes += [
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
+        *_temperature_changes(arm, found),
+        *_spring_changes(arm, found),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
-        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0)) * found.scale
+        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2) * found.scale
         changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
     if not found.relative:
         known = np.isfinite(found.scale_error)
@@ -140,6 +160,37 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
         changes.append(Change(node, "gain", [1.0] * 4, "now part of the moments and of torque_scale"))
     return tuple(changes)
+
+
+def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+    """Yield at which temperatures the torque scales are true, and their slopes."""
+    node, bridge = f"{arm.namespace}/can_bridge", arm.can_bridge
+    if not np.all(np.isfinite(found.temperature)):
+        return
+    yield Change(node, "torque_scale_temperature", found.temperature.round(1).tolist(), "degC, mean of the tours")
+    given = np.array(bridge["torque_scale_slope"])
+    if np.any(given) or np.any(found.slope):
+        slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.slope
+        note = f"1/K, +-{_row(found.slope_error)}; 0: the poses show none, the file's is kept"
+        yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
+
+
+def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+    """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
+    node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
+    if not (np.any(found.stiffness) or before.on):
+        return
+    new = JointSpring(found.stiffness.round(4).tolist(), found.rest.round(4).tolist())
+    note = f"Nm/rad, +-{_row(found.stiffness_error)}; 0: the poses show none"
+    yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
+    yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
+    bridge = arm.can_bridge
+    if any(bridge["largest_moment"]):
+        low, high = arm.low.tolist(), arm.high.tolist()
+        own = np.subtract(bridge["largest_addition"], before.largest(low, high))
+        addition = np.ceil(100.0 * (np.maximum(own, 0.0) + new.largest(low, high)) - 1e-6) / 100.0
+        note = "Nm, with the largest torque of the joints' own springs"
+        yield Change(f"{arm.namespace}/can_bridge", "largest_addition", addition.tolist(), note)
 
 
 def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
@@ -193,6 +244,7 @@ def wearer_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cali
     if len(observations) < 3:
         raise DataError(f"{len(observations)} poses were measured, must be at least 3")
     theta, direction, effort, spread = columns(observations)
+    effort = effort - joint_spring_of(arm.compensator).torques(theta)
     cog, length, rows = np.array(_wearer(arm)[1]), arm.robot.length, regressor(theta, direction, arm.robot.gravity)
     per_mass = np.stack([moments_along(length, cog, one) for one in np.eye(JOINT_COUNT)[2:]], axis=1)
     weight = 1.0 / np.hypot(spread, WEARER.breathing).ravel()

@@ -7,8 +7,8 @@ A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' tor
 
 behind a low-pass of `bandwidth`: no acceleration is needed. f is friction and the device's own springs. M, C, g are
 those of the robot plus the wearer's whole passive arm, so the residual is what their muscles (and the passive tissue of
-their joints) add; without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r, which a torque that
-changes steadily passes without lag.
+their joints) add; without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the
+estimate is 2 r - h r, which a torque that changes steadily passes without lag.
 
 The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
 the model stays the same for as long as a pose is held.

@@ -19,7 +19,9 @@ from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_to
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 WITHIN = "within rated torque everywhere"
-BRIDGE_PARAMETERS = {"motor", "torque_scale", "position_min", "position_max"}
+BRIDGE_PARAMETERS = {
+    "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
+}  # fmt: skip
 Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (n,) kg and centre of gravity (n,) m
 Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
 
@@ -75,7 +77,7 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     robot, load, support, tilt = request
     try:
         bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
-        rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
+        rated, peak = motor_torques(bridge)
         joints = budget(robot, load, support, bounds, rated, peak)
     except ParameterError as error:
         return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
