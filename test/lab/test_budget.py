@@ -125,5 +125,11 @@ def test_overload_names_each_overloaded_joint_and_the_support_that_fits():
 
 
 def test_a_torque_scale_below_1_reduces_the_motors_torque_and_one_above_1_does_not_raise_it():
-    rated, peak = motor_torques(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), (1.0, 0.5, 1.5, 1.0))
+    bridge = values_of(CAN_BRIDGE, {**BUS, "torque_scale": [1.0, 0.5, 1.5, 1.0]})
+    rated, peak = motor_torques(bridge)
     assert rated.tolist() == [3.0, 4.5, 3.0, 3.0] and peak.tolist() == [9.0, 9.0, 9.0, 9.0]
+
+
+def test_a_motor_that_weakens_when_warm_is_counted_as_warm():
+    rated, _ = motor_torques(values_of(CAN_BRIDGE, {**BUS, "torque_scale_slope": [-0.001, 0.0, 0.001, -0.001]}))
+    assert rated == pytest.approx([3.0 * (1.0 - 0.045), 9.0, 3.0, 3.0 * (1.0 - 0.045)])
