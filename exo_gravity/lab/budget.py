@@ -18,6 +18,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import scale_at
@@ -114,6 +115,7 @@ def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
 def budget(
     robot: ArmModel,
     load: tuple[Vector, Vector],
+    spring: JointSpring,
     support: float,
     bounds: np.ndarray,
     rated: Vector,
@@ -121,19 +123,19 @@ def budget(
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
-    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. bounds:
-    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if the load does not fit the
-    robot.
+    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. spring:
+    the device's own. bounds: of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if
+    the load does not fit the robot.
     """
     full = robot.with_wearer(*load)
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""
+        """Return the torques (n, 4) in Nm of robot and springs, and what the wearer's whole arm adds; points: (n, 6)."""
         chunks = []
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        return own, with_all - own
+        return own + spring.torques(points[:, :JOINT_COUNT]), with_all - own
 
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Motors whose torque depends on their temperature, on the bus in virtual time: judged by the simulated motors' torque."""
+"""Motors whose torque depends on their temperature, on the bus in virtual time, judged by what the motors give."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from typing import Any
 from rclpy.node import Node
 
 from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
@@ -23,7 +24,7 @@ BRIDGE_PARAMETERS = {
     "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
 }  # fmt: skip
 Load = tuple[tuple[float, ...], tuple[float, ...]]  # the wearer's mass (n,) kg and centre of gravity (n,) m
-Request = tuple[ArmModel, Load, float, float]  # robot, wearer, support 0..1, largest tilt in rad
+Request = tuple[ArmModel, Load, JointSpring, float, float]  # robot, wearer, springs, support 0..1, largest tilt in rad
 
 
 class BudgetWatch:
@@ -65,7 +66,7 @@ def request_of(s: Settings) -> Request:
     """Return what the motors must be able to hold with these settings."""
     support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
     tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return papers(s.loaded), (tuple(s.wearer_mass), tuple(s.wearer_cog)), support, tilt
+    return papers(s.loaded), (tuple(s.wearer_mass), tuple(s.wearer_cog)), s.joint_spring, support, tilt
 
 
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
@@ -74,11 +75,11 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     names: of the joints (n,).
     bridge: its parameter values.
     """
-    robot, load, support, tilt = request
+    robot, load, spring, support, tilt = request
     try:
         bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
         rated, peak = motor_torques(bridge)
-        joints = budget(robot, load, support, bounds, rated, peak)
+        joints = budget(robot, load, spring, support, bounds, rated, peak)
     except ParameterError as error:
         return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
     overloaded = overload(names, joints)
