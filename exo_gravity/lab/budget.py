@@ -130,7 +130,7 @@ def budget(
     full = robot.with_wearer(*load)
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the torques (n, 4) in Nm of robot and springs, and what the wearer's whole arm adds; points: (n, 6)."""
+        """Return the torques (n, 4) in Nm of robot and springs, and what the wearer's arm adds; points: (n, 6)."""
         chunks = []
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
