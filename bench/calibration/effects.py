@@ -6,7 +6,7 @@ weight, the stand leant otherwise. Each device is played without any effect, wit
 weaker when warm. There `calibrate gravity` follows on the warm arm, with `--earlier` the cold record.
 
 Judged by the torque that holds MuJoCo's arm in 300 poses that no tour visited: the largest error of any joint, as a
-share of the largest torque, and the share of the poses within the 95 % band that the file's `model_error` gives. `before`
+share of the largest torque, and the share of the poses within the 95 % band that `model_error` gives. `before`
 is the same without springs and slopes in the identification.
 """
 

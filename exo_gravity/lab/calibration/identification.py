@@ -72,16 +72,16 @@ class Acceptance:
 ACCEPTED = Acceptance()
 
 
-STRIBECK_SPEEDS = np.geomspace(0.01, 0.2, 30)  # rad/s
+STRIBECK_SPEEDS = np.geomspace(0.01, 0.1, 20)  # rad/s; a slower fall is not told from viscous friction below 0.3 rad/s
+STRIBECK_PARAMETERS = 4  # Coulomb, viscous, Stribeck, and its speed
 
 
 @dataclass(frozen=True)
 class FrictionFit:
     """How friction is fitted over the speed."""
 
-    significant: float = 3.0  #: of its standard errors, that a Stribeck part must have to be kept
     least_ratio: float = 2.0  #: of the fastest to the slowest speed
-    resolution: float = 0.003  #: Nm: standard error of a friction that was measured once
+    resolution: float = 0.003  #: Nm: least standard error of a friction that was measured once
 
 
 FRICTION = FrictionFit()
@@ -239,11 +239,16 @@ class FrictionCurve(NamedTuple):
     viscous: float  #: Nm s/rad
     stribeck: float  #: Nm, 0 if the data show none
     stribeck_speed: float  #: rad/s, 0 without Stribeck friction
-    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck
+    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck, with that of the choice
 
 
-def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
-    """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s.
+def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray) -> FrictionCurve:
+    """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s, with standard errors `error` (n,) in Nm.
+
+    A Stribeck part is kept if it lowers the sum of squares by more than the extended criterion of J. Chen and Z. Chen,
+    Biometrika 95 (2008), permits for its two parameters and the Stribeck speeds that were tried. None is kept that
+    leaves no Coulomb friction. The errors include the choice: every fit counts with its weight by the criterion
+    (S. Buckland et al., Biometrics 53 (1997)).
 
     Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
     """
@@ -255,18 +260,29 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray) -> FrictionCurve:
         raise DataError(
             f"friction was measured {measured}, the fastest must be {FRICTION.least_ratio:g} times the slowest"
         )
-    fits = [_fit(speed, torque, own) for own in STRIBECK_SPEEDS.tolist()]
-    best = min(fits, key=lambda fit: float(np.sum((fit.fitted - torque) ** 2)))
-    return best if speeds > 3 and best.stribeck > FRICTION.significant * best.error[2] else _fit(speed, torque)
+    tried = [0.0, *(STRIBECK_SPEEDS.tolist() if speeds > 3 else ())]
+    fits = [_fit(speed, torque, own) for own in tried]
+    fits = [fit for fit in fits if not fit.stribeck_speed or min(fit.coulomb, fit.stribeck) > 0.0]
+    squares = [float(np.sum((fit.fitted - torque) ** 2)) for fit in fits]
+    scatter = min(squares) / max(1, len(speed) - STRIBECK_PARAMETERS)
+    noise = max(float(np.mean(np.square(error))), FRICTION.resolution**2, scatter)
+    penalty = 2.0 * (math.log(len(speed)) + math.log(len(tried)))
+    criterion = np.array(squares) / noise + [penalty * bool(fit.stribeck_speed) for fit in fits]
+    weight = np.exp((criterion.min() - criterion) / 2.0)
+    values = np.array([(fit.coulomb, fit.viscous, fit.stribeck) for fit in fits])
+    best = int(np.argmin(criterion))
+    variance = noise * np.square([fit.error for fit in fits]) + (values - values[best]) ** 2
+    errors = np.sqrt(weight @ variance / weight.sum())
+    return fits[best]._replace(error=tuple(errors.tolist()))
 
 
-def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float = 0.0) -> FrictionCurve:
-    """Return the fit with this Stribeck speed, 0 for a fit without Stribeck friction."""
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float) -> FrictionCurve:
+    """Return the fit with this Stribeck speed, 0 for one without Stribeck friction; errors for noise of 1 Nm."""
     falling = np.exp(-((speed / stribeck_speed) ** 2)) if stribeck_speed else np.zeros_like(speed)
     matrix = np.stack((np.ones_like(speed), speed, falling), axis=1)
-    values, _, rank, _ = np.linalg.lstsq(matrix, torque, rcond=None)
-    fitted = matrix @ values
-    scatter = float(np.sum((fitted - torque) ** 2)) / max(1, len(speed) - int(rank))
-    errors = np.sqrt(max(scatter, FRICTION.resolution**2) * np.diag(np.linalg.pinv(matrix.T @ matrix)))
+    inverse = np.linalg.pinv(matrix)
+    values, errors = inverse @ torque, np.sqrt(np.square(inverse).sum(axis=1))
     coulomb, viscous, stribeck = values.tolist()
-    return FrictionCurve(speed, torque, fitted, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist()))
+    return FrictionCurve(
+        speed, torque, matrix @ values, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist())
+    )

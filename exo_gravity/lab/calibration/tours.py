@@ -216,7 +216,8 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
-    curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
+    friction, spread = (np.array([one[field] for one in observations]).T for field in (3, 4))
+    curves = tuple(map(fit_friction, speed.T, friction, spread))
     changes, refusals = [], []
     for name, fit in zip(arm.joint_names, curves, strict=True):
         coulomb, viscous, stribeck = fit.error
