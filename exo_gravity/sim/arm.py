@@ -86,6 +86,8 @@ class JointConfig:
     #: On top at standstill; it fades with speed v as exp(-(v / stribeck_speed)^2).
     stribeck_friction: Sequence[float] = owned(_ZEROS, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
     stribeck_speed: Sequence[float] = owned((0.05,) * JOINT_COUNT, "speed at which it fades", (0.001, 10.0), "rad/s")
+    #: Of the torque that the motor's gear carries.
+    load_friction: Sequence[float] = owned(_ZEROS, "share of the gear's torque that is friction", (0.0, 0.5))
     #: Cables and hoses across the joints.
     spring_stiffness: Sequence[float] = owned(_ZEROS, "springs across the joints", (0.0, MAX_STIFFNESS), "Nm/rad")
     spring_rest: Sequence[float] = owned(_ZEROS, "angle at which they are slack", (-MAX_REST, MAX_REST), "rad")
@@ -169,9 +171,9 @@ class SimulatedArm:
     def __init__(self, config: JointConfig | None = None) -> None:
         self.config = config or ArmConfig()
         self._load(NO_PAYLOAD)
-        self._coulomb, self._stribeck, self._speed = map(
-            np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
-        )
+        own = self.config
+        columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
+        self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
 
@@ -227,15 +229,22 @@ class SimulatedArm:
         self._turns = any(angular_velocity) or any(angular_acceleration)
         self._turning_data.qvel[:3], self._turning_data.qacc[:3] = angular_velocity, angular_acceleration
 
-    def step(self, torque: Sequence[float], count: int = 1) -> None:
-        """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP."""
+    def step(self, torque: Sequence[float], count: int = 1, of_motors: Sequence[float] | None = None) -> None:
+        """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP.
+
+        of_motors: (n,) Nm, the part that gears carry; None: all of it.
+        """
         self._torque[:] = torque
+        constant = self._coulomb
+        if self._load_share.any():
+            constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
+            self.model.dof_frictionloss[:] = constant
         if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
             return
         for _ in range(count):
             fading = np.exp(-np.square(self._velocity / self._speed))
-            self.model.dof_frictionloss[:] = self._coulomb + self._stribeck * fading
+            self.model.dof_frictionloss[:] = constant + self._stribeck * fading
             mujoco.mj_step1(self.model, self.data)
             if self._turns:
                 self._torque[:] = torque + self.data.qfrc_bias - self._turning_bias()

@@ -16,7 +16,8 @@ Over its speed, a joint's friction is Coulomb, viscous and Stribeck:
 
     F(v) = coulomb + viscous v + stribeck exp(-(v / v_s)^2)          B. Armstrong-Helouvry et al., Automatica 30 (1994)
 
-For a given Stribeck speed v_s this is linear in the other three, so v_s is searched on a grid.
+and a share of the torque that the gear carries. For a given Stribeck speed v_s this is linear in the others, so v_s is
+searched on a grid.
 """
 
 import math
@@ -73,7 +74,6 @@ ACCEPTED = Acceptance()
 
 
 STRIBECK_SPEEDS = np.geomspace(0.01, 0.1, 20)  # rad/s; a slower fall is not told from viscous friction below 0.3 rad/s
-STRIBECK_PARAMETERS = 4  # Coulomb, viscous, Stribeck, and its speed
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,7 @@ class FrictionFit:
     """How friction is fitted over the speed."""
 
     least_ratio: float = 2.0  #: of the fastest to the slowest speed
+    least_load: float = 0.5  #: Nm between the least and the most that a gear carried, from which its part can show
     resolution: float = 0.003  #: Nm: least standard error of a friction that was measured once
 
 
@@ -230,25 +231,29 @@ def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, r
 
 
 class FrictionCurve(NamedTuple):
-    """Friction of a joint over its speed."""
+    """Friction of a joint over its speed, and over the torque that its gear carries."""
 
     speed: np.ndarray  #: (n,) rad/s
     torque: np.ndarray  #: (n,) Nm, measured
+    carried: np.ndarray  #: (n,) Nm that the gear carried
     fitted: np.ndarray  #: (n,) Nm
     coulomb: float  #: Nm
     viscous: float  #: Nm s/rad
     stribeck: float  #: Nm, 0 if the data show none
+    load: float  #: share of what is carried, 0 if the data show none
     stribeck_speed: float  #: rad/s, 0 without Stribeck friction
-    error: tuple[float, ...]  #: (3,), standard errors of coulomb, viscous and stribeck, with that of the choice
+    error: tuple[float, ...]  #: (4,), standard errors of coulomb, viscous, stribeck and load, with that of the choice
 
 
-def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray) -> FrictionCurve:
+def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray, carried: np.ndarray) -> FrictionCurve:
     """Return the friction that fits `torque` (n,) in Nm at `speed` (n,) rad/s, with standard errors `error` (n,) in Nm.
 
-    A Stribeck part is kept if it lowers the sum of squares by more than the extended criterion of J. Chen and Z. Chen,
-    Biometrika 95 (2008), permits for its two parameters and the Stribeck speeds that were tried. None is kept that
-    leaves no Coulomb friction. The errors include the choice: every fit counts with its weight by the criterion
-    (S. Buckland et al., Biometrics 53 (1997)).
+    carried: (n,) Nm that the gear carried meanwhile.
+
+    A Stribeck part, and one that grows with what is carried, are kept if they lower the sum of squares by more than the
+    extended criterion of J. Chen and Z. Chen, Biometrika 95 (2008), permits for their parameters and the fits that were
+    tried. None is kept that is negative, or leaves no Coulomb friction. The errors include the choice: every fit counts
+    with its weight by the criterion (S. Buckland et al., Biometrics 53 (1997)).
 
     Raises DataError for fewer than 3 speeds, or less than a factor of 2 between them.
     """
@@ -260,29 +265,28 @@ def fit_friction(speed: np.ndarray, torque: np.ndarray, error: np.ndarray) -> Fr
         raise DataError(
             f"friction was measured {measured}, the fastest must be {FRICTION.least_ratio:g} times the slowest"
         )
-    tried = [0.0, *(STRIBECK_SPEEDS.tolist() if speeds > 3 else ())]
-    fits = [_fit(speed, torque, own) for own in tried]
-    fits = [fit for fit in fits if not fit.stribeck_speed or min(fit.coulomb, fit.stribeck) > 0.0]
-    squares = [float(np.sum((fit.fitted - torque) ** 2)) for fit in fits]
-    scatter = min(squares) / max(1, len(speed) - STRIBECK_PARAMETERS)
+    falls = [0.0, *(STRIBECK_SPEEDS.tolist() if speeds > 3 else ())]
+    loads = [np.zeros_like(speed), *([np.abs(carried)] if np.ptp(np.abs(carried)) > FRICTION.least_load else ())]
+    fits = [_fit(speed, torque, fall, load) for load in loads for fall in falls]
+    # A Stribeck part has two parameters.
+    extra = np.array([2 * bool(fit.stribeck_speed) + bool(fit.carried.any()) for fit in fits])
+    values = np.array([(fit.coulomb, fit.viscous, fit.stribeck, fit.load) for fit in fits])
+    squares = np.array([np.sum((fit.fitted - torque) ** 2) for fit in fits])
+    scatter = float(np.min(squares / np.maximum(1, len(speed) - 2 - extra)))
     noise = max(float(np.mean(np.square(error))), FRICTION.resolution**2, scatter)
-    penalty = 2.0 * (math.log(len(speed)) + math.log(len(tried)))
-    criterion = np.array(squares) / noise + [penalty * bool(fit.stribeck_speed) for fit in fits]
-    weight = np.exp((criterion.min() - criterion) / 2.0)
-    values = np.array([(fit.coulomb, fit.viscous, fit.stribeck) for fit in fits])
-    best = int(np.argmin(criterion))
+    criterion = squares / noise + extra * math.log(len(speed)) + 2.0 * math.log(len(fits)) * (extra > 0)
+    criterion[(extra > 0) & (values[:, [0, 2, 3]] < 0.0).any(axis=1)] = np.inf
+    weight, best = np.exp((criterion.min() - criterion) / 2.0), int(np.argmin(criterion))
     variance = noise * np.square([fit.error for fit in fits]) + (values - values[best]) ** 2
     errors = np.sqrt(weight @ variance / weight.sum())
-    return fits[best]._replace(error=tuple(errors.tolist()))
+    return fits[best]._replace(carried=np.abs(carried), error=tuple(errors.tolist()))
 
 
-def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float) -> FrictionCurve:
-    """Return the fit with this Stribeck speed, 0 for one without Stribeck friction; errors for noise of 1 Nm."""
+def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, load: np.ndarray) -> FrictionCurve:
+    """Return the fit with this Stribeck speed and `load`, 0 for one without it; errors for noise of 1 Nm."""
     falling = np.exp(-((speed / stribeck_speed) ** 2)) if stribeck_speed else np.zeros_like(speed)
-    matrix = np.stack((np.ones_like(speed), speed, falling), axis=1)
+    matrix = np.stack((np.ones_like(speed), speed, falling, load), axis=1)
     inverse = np.linalg.pinv(matrix)
-    values, errors = inverse @ torque, np.sqrt(np.square(inverse).sum(axis=1))
-    coulomb, viscous, stribeck = values.tolist()
-    return FrictionCurve(
-        speed, torque, matrix @ values, coulomb, viscous, stribeck, stribeck_speed, tuple(errors.tolist())
-    )
+    is_used = matrix.any(axis=0)
+    values, errors = is_used * (inverse @ torque), is_used * np.sqrt(np.square(inverse).sum(axis=1))
+    return FrictionCurve(speed, torque, load, matrix @ values, *values.tolist(), stribeck_speed, tuple(errors.tolist()))

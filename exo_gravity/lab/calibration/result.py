@@ -255,12 +255,13 @@ def torque_figure(found: Identified, arm: ConfiguredArm, poses: Sequence[Observa
 
 
 def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
-    """Return the friction of each joint over its speed, as measured and as fitted."""
+    """Return the friction of each joint over its speed, measured and fitted, less what grows with the torque."""
     figure = Figure(figsize=(FIGURE_WIDTH, 3.2), layout="constrained")
     for joint, axis in enumerate(figure.subplots(1, 4, sharey=True)):
         curve, order = curves[joint], np.argsort(curves[joint].speed)
-        axis.plot(curve.speed, curve.torque, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
-        axis.plot(curve.speed[order], curve.fitted[order], color=INK, lw=1.0, label="fitted")
+        of_load = curve.load * curve.carried
+        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
+        axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
         _finish(axis, joint, labels[joint])

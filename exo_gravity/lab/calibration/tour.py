@@ -31,6 +31,7 @@ from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_s
 
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick
+RAISED = 4  # chosen poses of a tour for friction: they show what depends on the torque
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 # What stops a tour.
@@ -256,7 +257,7 @@ CALIBRATOR = (
     Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
     *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
-    Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
+    Param("tour.friction", False, "sweep the hanging arm at several speeds, then a few chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
 )
@@ -268,6 +269,7 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load = values["tour.load_mass"], values["tour.load_lever"]
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
-    count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
+    given = friction_stations(limits) if values["tour.friction"] else ()
+    count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given)
     return Tour(limits, guess, itinerary, values["rate"], load)

@@ -216,14 +216,16 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
-    friction, spread = (np.array([one[field] for one in observations]).T for field in (3, 4))
-    curves = tuple(map(fit_friction, speed.T, friction, spread))
+    effort, friction, spread = (np.array([one[field] for one in observations]).T for field in (2, 3, 4))
+    curves = tuple(map(fit_friction, speed.T, friction, spread, effort))
     changes, refusals = [], []
     for name, fit in zip(arm.joint_names, curves, strict=True):
-        coulomb, viscous, stribeck = fit.error
+        coulomb, viscous, stribeck, load = fit.error
         text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
         more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
-        note = f"friction of {name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}"
+        more = more if fit.stribeck else "no Stribeck friction"
+        share = f"{fit.load:.3f} +- {load:.3f} of what it carries" if fit.load else "none that grows with the torque"
+        note = f"friction of {name}: {text}, {more}, {share}"
         changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
         if fit.coulomb <= 0.0:
             refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")

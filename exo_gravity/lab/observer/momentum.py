@@ -78,7 +78,7 @@ class MomentumObserver:
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
         self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
-        self._viscous = for_joints(friction.viscous, count)
+        self._viscous, self._load = for_joints(friction.viscous, count), for_joints(friction.load, count)
         matrix = self._links.matrix(for_joints(tuning.reference, count, max))
         self._code = [2.0 * tuning.bandwidth * tuning.velocity_code * math.hypot(*row) for row in matrix.tolist()]
         self._time = -math.inf
@@ -99,7 +99,7 @@ class MomentumObserver:
         columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
-        rubbing, friction = self._friction(velocity)
+        rubbing, friction = self._friction(velocity, effort)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
         held = tuple(map(operator.add, gravity, self._spring.torque(theta))) if self._spring.on else gravity
         unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
@@ -140,11 +140,12 @@ class MomentumObserver:
         ]
         return WearerEstimate(tuple(map(operator.add, once, lag)), tuple(deviation), worn)
 
-    def _friction(self, velocity: Sequence[float]) -> tuple[list[float], list[float]]:
+    def _friction(self, velocity: Sequence[float], effort: Sequence[float]) -> tuple[list[float], list[float]]:
         """Return the joints' friction (n,) in Nm, against the motion, and its standard deviation."""
         torque, deviation = [], []
-        for v, coulomb, viscous in zip(velocity, self._coulomb, self._viscous, strict=True):
-            moving = sliding(v)
+        columns = zip(velocity, effort, self._coulomb, self._viscous, self._load, strict=True)
+        for v, carried, constant, viscous, load in columns:
+            moving, coulomb = sliding(v), constant + load * abs(carried)
             whole = moving * (coulomb + viscous * abs(v))
             torque.append(-math.copysign(whole, v) if self._is_known else 0.0)
             unsure = self._tuning.friction_share * whole if self._is_known else whole
