@@ -210,9 +210,8 @@ class Tour:
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         weight, lever = self._load
-        warmth = tuple(self.temperature)
-        known = {"load_mass": weight, "load_lever": lever, "speed": station.speed, "temperature": warmth}
-        self.measured.append(seen._replace(effort=effort, **known))
+        seen = seen._replace(effort=effort, load_mass=weight, load_lever=lever)
+        self.measured.append(seen._replace(speed=station.speed, temperature=tuple(self.temperature)))
         before = self._guess.torque(theta.tolist())
         self._guess.learn(theta, effort, seen.spread)
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
