@@ -142,6 +142,10 @@ class JointMotor:
             return self.torque_scale
         return scale_at(self.torque_scale, self.scale_slope, self.scale_temperature, temperature)
 
+    def warmed(self, temperature: float | None) -> float:
+        """Return by which share the torque per command differs at `temperature` degC from `torque_scale`."""
+        return self.scale_at(temperature) / self.torque_scale - 1.0
+
     def command(
         self,
         effort: float,
