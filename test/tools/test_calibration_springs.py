@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,13 @@ from bench.calibration.random_device import LENGTH, Device
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import Settings, robot_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.live import observations_in
 from exo_gravity.lab.calibration.poses import Itinerary
-from exo_gravity.lab.calibration.tours import moments_from
+from exo_gravity.lab.calibration.tours import checked, moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm
@@ -128,6 +129,21 @@ def test_a_file_with_slopes_keeps_its_torque_at_the_temperature_of_the_tour() ->
     ratio = np.divide(value(sloped, "torque_scale"), value(plain, "torque_scale"))
     np.testing.assert_allclose(ratio, 1.0 - 0.001 * 20.0, atol=2e-4)
     np.testing.assert_allclose(value(sloped, "torque_scale_slope"), -0.001 / 0.98, atol=1e-5)
+
+
+def test_a_check_says_which_joint_has_become_weaker_and_by_how_much() -> None:
+    calibrated = moments_from(ARM, warmed(Device(9), 25.0, 0.0))
+    values = {**ARM.compensator, **{c.name: c.value for c in calibrated.changes if c.node.endswith("compensator")}}
+    bridge = {**ARM.can_bridge, **{c.name: c.value for c in calibrated.changes if c.node.endswith("can_bridge")}}
+    arm = replace(ARM, compensator=values, can_bridge=bridge, robot=robot_of(values))
+    # By the new file, a command of 1 Nm is `torque_scale` Nm of the old file's commands.
+    scale = np.array(bridge["torque_scale"])
+    same = [one._replace(effort=one.effort * scale) for one in warmed(Device(9), 25.0, 0.0)[2:5]]
+    assert checked(arm, same).refusals == ()
+    weak = [one._replace(effort=one.effort / (1.0, 1.0, 0.95, 1.0), temperature=(45.0,) * 4) for one in same]
+    (refusal,) = checked(arm, weak).refusals
+    found = re.match(r"right_shoulder_flexion: ([\d.]+) \+- [\d.]+ % less torque .* 25 degC, its motor has 45", refusal)
+    assert found is not None and abs(float(found[1]) - 5.0) < 1.5
 
 
 def test_a_record_of_an_earlier_tour_is_read_and_another_file_is_refused(tmp_path) -> None:

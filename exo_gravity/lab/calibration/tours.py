@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
+"""calibrate gravity, scale, friction, wearer and check: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
 is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: two
@@ -19,15 +19,15 @@ from exo_gravity.core.arm.arm import ModelError, moments_along
 from exo_gravity.core.arm.gravity import MOMENTS, gravity_torque, load_moments, moments_of, regressor
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
+from exo_gravity.core.compensation.settings import joint_spring_of, settings_of, wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import COVER, JOINT_COUNT
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
-from exo_gravity.lab.calibration.pose_fit import columns
+from exo_gravity.lab.calibration.pose_fit import columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -53,6 +53,17 @@ class WearerTour:
 
 
 WEARER = WearerTour()
+
+
+@dataclass(frozen=True)
+class CheckTour:
+    """The tour that checks a calibration."""
+
+    poses: int = 3  #: the hanging arm and two others
+    widest: float = 10.0  #: %, of the band of a joint that is judged
+
+
+CHECK = CheckTour()
 
 
 WORN = ("upper arm", "forearm and hand")  # on links 3 and 4
@@ -206,6 +217,35 @@ def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
 
 def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
+
+
+def calibrate_check(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Compare the torque that a few poses need with the file's. Raises ParameterError."""
+    return checked(arm, _observations(options, arm, say, {"tour.poses": CHECK.poses}))
+
+
+def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
+
+    A joint that differs by more than the band of `model_error.torque` is a refusal.
+    """
+    held, effort = np.array([_held(arm, one) for one in observations]), columns(observations)[2]
+    error = np.array(settings_of({**arm.compensator, "law": "exact"}).model_error.torque)
+    size = np.sqrt(np.mean(held**2, axis=0))
+    share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
+    band = 100.0 * COVER * error / np.maximum(size, 1e-9)
+    now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
+    lines, refusals = [], []
+    for n, name in enumerate(arm.joint_names):
+        if band[n] > CHECK.widest:
+            lines.append(f"{name}: these poses show too little of its torque: {held[:, n].round(2).tolist()} Nm")
+            continue
+        less = 100.0 * (1.0 - 1.0 / share[n])
+        warmth = f", its motor has {now[n]:.0f} degC" if math.isfinite(now[n]) else ""
+        what = f"{abs(less):.1f} +- {band[n]:.1f} % {'less' if less > 0.0 else 'more'} torque"
+        sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
+        (refusals if abs(less) > band[n] else lines).append(sentence)
+    return CalibrationResult((), tuple(lines), tuple(refusals), arm, tuple(observations))
 
 
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
