@@ -323,3 +323,22 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
             assert estimate.weight == pytest.approx(carried, abs=1e-9)
     assert max(speeds[100:]) > 1.0
     assert np.abs(errors[100:]).max() < 0.05
+
+
+def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
+    speed, load = (0.3, -0.3, 0.3, 0.3), (0.08,) * 4
+    needed = gravity_torque(WHOLE, POSE, TILT.direction)
+    # e = g + sign(v) (c + viscous |v| + load |e|), solved for e
+    rubbing = np.multiply(np.sign(speed), np.add(COULOMB, np.multiply(VISCOUS, np.abs(speed))))
+    effort = needed + rubbing
+    for _ in range(50):
+        effort = needed + rubbing + np.multiply(np.sign(speed), np.multiply(load, np.abs(effort)))
+    estimates = []
+    for share in (STILL, load):
+        terms = TermSettings(friction=Friction(0.0, COULOMB, VISCOUS, share))
+        observer = MomentumObserver(replace(SETTINGS, terms=terms))
+        for n in range(100):
+            estimate = observer.update(n * PERIOD, (POSE, speed, effort), TILT)
+        estimates.append(np.abs(estimate.torque).max())
+    blind, aware = estimates
+    assert blind > 0.5 and aware < 0.1
