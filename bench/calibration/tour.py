@@ -82,14 +82,14 @@ def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -
     bridge = node_values(content, f"{namespace}/can_bridge", CAN_BRIDGE)
     simulator = node_values(content, f"{namespace}/simulator", SIMULATOR)
     device = device_of(simulator)
-    _let_hang(device)
+    let_hang(device)
     imu = SimulatedImu(imu_of(simulator))
     tilt = measured_tilt(device.pitch, device.roll, imu, content["/imu"]["rotation_trunk_from_imu"])
     side = values["side"]
     return Player(tour_of(values), device, motors_of(bridge), limits_of(bridge), bridge["rate"], Tilt.of(side, *tilt))
 
 
-def _let_hang(device: SimulatedDevice) -> None:
+def let_hang(device: SimulatedDevice) -> None:
     """Let the arm sink to where it hangs, as by hand; the clock of the device goes on."""
     damping = device.arm.model.dof_damping.copy()
     device.arm.model.dof_damping[:] = HANDS

@@ -15,6 +15,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
 from exo_gravity.lab.budget import (
     JointBudget,
@@ -68,8 +69,8 @@ def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_ti
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
         load = wearer.on_links(robot.length)
-        torques = motor_torques(motors, configured.can_bridge["torque_scale"])
-        joints = budget(robot, load, support, bounds, *torques)
+        torques = motor_torques(configured.can_bridge)
+        joints = budget(robot, load, joint_spring_of(configured.compensator), support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
     return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
 

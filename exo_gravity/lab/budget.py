@@ -10,16 +10,21 @@ these and improves one coordinate after another until nothing gets worse.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.wearer import Tissue
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.joint_motor import scale_at
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
+from exo_gravity.core.safety.limits import HEAT
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
 
@@ -37,11 +42,17 @@ def motor_for(torque: float) -> str | None:
     return min(strong, key=lambda spec: spec.rated_torque).name if strong else None
 
 
-def motor_torques(motors: Sequence[str], torque_scale: Vector) -> np.ndarray:
-    """Return rated and peak torque (2, 4) in Nm of `motors` whose real torque is `torque_scale` times the command."""
+def motor_torques(bridge: Mapping[str, Any]) -> np.ndarray:
+    """Return rated and peak torque (2, 4) in Nm of the motors of `can_bridge`'s parameter values.
+
+    They are as warm as they may be with all of their torque. Raises ParameterError.
+    """
+    names = ("torque_scale", "torque_scale_slope", "torque_scale_temperature")
+    columns = zip(*(bridge[name] for name in names), strict=True)
+    weakest = [min(motor[0], scale_at(*motor, HEAT.most - HEAT.span)) for motor in columns]
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
-    scale = np.minimum(four_floats("torque_scale", torque_scale, 0.2, 2.0), 1.0)
-    torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in motors]
+    scale = np.minimum(four_floats("torque_scale", weakest, 0.1, 2.0), 1.0)
+    torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in bridge["motor"]]
     return np.asarray(scale * np.transpose(torques))
 
 
@@ -105,6 +116,7 @@ def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
 def budget(
     robot: ArmModel,
     load: tuple[Vector, Vector],
+    spring: JointSpring,
     support: float,
     bounds: np.ndarray,
     rated: Vector,
@@ -112,25 +124,33 @@ def budget(
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
-    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. bounds:
-    of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if the load does not fit the
-    robot.
+    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. spring:
+    the device's own. bounds: of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if
+    the load does not fit the robot.
     """
-    return budget_worn(robot, robot.with_wearer(*load), support, bounds, rated, peak)
+    return budget_worn(robot, robot.with_wearer(*load), (spring, Tissue()), support, bounds, rated, peak)
 
 
 def budget_worn(
-    robot: ArmModel, full: ArmModel, support: float, bounds: np.ndarray, rated: Vector, peak: Vector
+    robot: ArmModel,
+    full: ArmModel,
+    springs: tuple[JointSpring, Tissue],
+    support: float,
+    bounds: np.ndarray,
+    rated: Vector,
+    peak: Vector,
 ) -> tuple[JointBudget, ...]:
-    """Return the same where `full` is the robot with the wearer's whole arm, without the tissue of their joints."""
+    """Return the same where `full` is the robot with the wearer's whole arm. springs: the device's and the wearer's."""
+    spring, tissue = springs
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the torques (n, 4) in Nm of the robot, and what the wearer's whole arm adds, at points (n, 6)."""
+        """Return the torques (n, 4) in Nm of robot and springs, and what the wearer's arm adds; points: (n, 6)."""
         chunks = []
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        return own, with_all - own
+        theta = points[:, :JOINT_COUNT]
+        return own + spring.torques(theta), with_all - own + tissue.torques(theta)
 
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
     starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first

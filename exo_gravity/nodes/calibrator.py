@@ -24,7 +24,7 @@ from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
-from exo_gravity.core.vocabulary import NodeState
+from exo_gravity.core.vocabulary import UNKNOWN, NodeState
 from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare
@@ -117,6 +117,8 @@ class CalibratorNode(Node):
                 state, has_fault = values.get("state", ""), values.get("fault", "none") != "none"
                 with self._lock:
                     self._bridge_state, self._bridge_message = state, status.message
+                readings = [values.get(f"{name} temperature (degC)", UNKNOWN) for name in self._names]
+                self._tour.temperature = () if UNKNOWN in readings else tuple(map(float, readings))
                 has_left = self._began and not self._tour.done and state != State.ACTIVE.value
                 if (has_fault or has_left) and not self._trouble and not self._tour.trouble:
                     self._trouble = status.message if has_fault else f"the bridge stopped carrying: {state}"

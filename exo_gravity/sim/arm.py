@@ -29,6 +29,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
 from exo_gravity.core.arm.gravity import MAX_OFFSET
+from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.arm.kinematics import ROTORS
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
@@ -89,6 +90,11 @@ class JointConfig:
     #: On top at standstill; it fades with speed v as exp(-(v / stribeck_speed)^2).
     stribeck_friction: Sequence[float] = owned(_ZEROS, "friction at standstill beyond Coulomb's", (0.0, 10.0), "Nm")
     stribeck_speed: Sequence[float] = owned((0.05,) * JOINT_COUNT, "speed at which it fades", (0.001, 10.0), "rad/s")
+    #: Of the torque that the motor's gear carries.
+    load_friction: Sequence[float] = owned(_ZEROS, "share of the gear's torque that is friction", (0.0, 0.5))
+    #: Cables and hoses across the joints.
+    spring_stiffness: Sequence[float] = owned(_ZEROS, "springs across the joints", (0.0, MAX_STIFFNESS), "Nm/rad")
+    spring_rest: Sequence[float] = owned(_ZEROS, "angle at which they are slack", (-MAX_REST, MAX_REST), "rad")
     #: The paper's motor mounts turn 190 degrees.
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
@@ -182,9 +188,9 @@ class SimulatedArm:
     def __init__(self, config: JointConfig | None = None) -> None:
         self.config = config or ArmConfig()
         self._load(NO_PAYLOAD)
-        self._coulomb, self._stribeck, self._speed = map(
-            np.array, (self.config.coulomb_friction, self.config.stribeck_friction, self.config.stribeck_speed)
-        )
+        own = self.config
+        columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
+        self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
 
@@ -240,15 +246,22 @@ class SimulatedArm:
         self._turns = any(angular_velocity) or any(angular_acceleration)
         self._turning_data.qvel[:3], self._turning_data.qacc[:3] = angular_velocity, angular_acceleration
 
-    def step(self, torque: Sequence[float], count: int = 1) -> None:
-        """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP."""
+    def step(self, torque: Sequence[float], count: int = 1, of_motors: Sequence[float] | None = None) -> None:
+        """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP.
+
+        of_motors: (n,) Nm, the part that gears carry; None: all of it.
+        """
         self._torque[:] = torque
+        constant = self._coulomb
+        if self._load_share.any():
+            constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
+            self.model.dof_frictionloss[:] = constant
         if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
             return
         for _ in range(count):
             fading = np.exp(-np.square(self._velocity / self._speed))
-            self.model.dof_frictionloss[:] = self._coulomb + self._stribeck * fading
+            self.model.dof_frictionloss[:] = constant + self._stribeck * fading
             mujoco.mj_step1(self.model, self.data)
             if self._turns:
                 self._torque[:] = torque + self.data.qfrc_bias - self._turning_bias()
@@ -282,6 +295,7 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
               <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
+                stiffness="{config.spring_stiffness[n]}" springref="{config.spring_rest[n]}"
                 frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
                 range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>
               {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}

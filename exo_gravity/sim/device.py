@@ -249,7 +249,7 @@ class SimulatedDevice:
             damping, on = zip(*((motor.damping, motor.entered) for motor in self.motors), strict=True)
             step = -1 if self.wearer.step is None else self.wearer.step
             self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
-        self.arm.step(list(map(operator.add, torque, given)), count)
+        self.arm.step(list(map(operator.add, torque, given)), count, torque)
         self._steps += count
 
 

@@ -36,6 +36,9 @@ ARM_FIELDS = {
     "viscous_friction": "friction.viscous",
     "stribeck_friction": "friction.stribeck",
     "stribeck_speed": "friction.stribeck_speed",
+    "load_friction": "friction.load",
+    "spring_stiffness": "joint_spring.stiffness",
+    "spring_rest": "joint_spring.rest",
     "position_min": "stop.min",
     "position_max": "stop.max",
 }

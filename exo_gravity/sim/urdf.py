@@ -93,6 +93,8 @@ class UrdfConfig(JointConfig):
         model.dof_damping[dofs] = self.viscous_friction
         model.dof_frictionloss[dofs] = self.coulomb_friction
         model.dof_solref[dofs], model.dof_solimp[dofs, : len(FRICTION.impedance)] = FRICTION
+        model.jnt_stiffness[joints] = self.spring_stiffness
+        model.qpos_spring[model.nq - count :] = self.spring_rest
         model.jnt_limited[joints] = True
         model.jnt_range[joints] = np.transpose((self.position_min, self.position_max))
         model.jnt_solref[joints], model.jnt_solimp[joints, : len(STOP.impedance)] = STOP

@@ -33,6 +33,7 @@ COMMANDS = {
     "friction": ("tours", "friction of each joint, from slow sweeps"),
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
     "wearer": ("tours", "the moments of the wearer's relaxed arm"),
+    "check": ("tours", "nothing: whether a few poses still need the torque of the last calibration"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
     ACCEPTANCE: ("", "nothing: a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
 }
@@ -41,7 +42,7 @@ MAX_POSES = 12
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
-    parser.set_defaults(bag=None, rests=None)
+    parser.set_defaults(bag=None, rests=None, earlier=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
@@ -67,6 +68,12 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         if name == "wearer":
             carried = "share of their arm that the wearer may have held throughout (0.2); 0 where EMG was silent"
             option("--carried", type=float, metavar="SHARE", help=carried)
+        if name in ("gravity", "scale"):
+            option(
+                "--earlier", type=Path, metavar="TOUR.jsonl",
+                help="record of an earlier tour of this arm by the same file, its motors colder or warmer: "
+                "shows how torque_scale depends on the temperature",
+            )  # fmt: skip
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
@@ -114,7 +121,7 @@ def _run(options: argparse.Namespace) -> int:
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
     for path in (options.output, options.record, page):
         check_output(path)
-    for path in (options.bag, options.rests):
+    for path in (options.bag, options.rests, options.earlier):
         if path is not None and not path.exists():
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()

@@ -9,8 +9,11 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.lab.budget import (
     budget,
     motor_for,
@@ -24,12 +27,13 @@ LINKS = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LINKS, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 LOAD = Wearer(75.0).on_links(LINKS)
 LOW, HIGH = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
+BUS = {"can.interface": "virtual", "can.channel": "budget"}
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)
 
 
 @functools.cache
 def needs(support=1.0, tilt=20.0, rated=RATED, peak=PEAK, robot=ROBOT):
-    return budget(robot, LOAD, support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak)
+    return budget(robot, LOAD, JointSpring(), support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak)
 
 
 @pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
@@ -97,7 +101,10 @@ def test_at_the_largest_support_the_joint_needs_exactly_its_rated_torque():
 def test_an_arm_that_bends_the_other_way_gets_the_same_support():
     flexion = (-1.65, -0.17, 0.3, -0.17), (1.65, 0.5, 2.53, 3.14)  # gravity always pulls joint 3 in the same direction
     other_way = tuple(-angle for angle in flexion[1]), tuple(-angle for angle in flexion[0])
-    one, other = (budget(ROBOT, LOAD, 1.0, workspace(*limits, 0.1), RATED, PEAK)[2] for limits in (flexion, other_way))
+    one, other = (
+        budget(ROBOT, LOAD, JointSpring(), 1.0, workspace(*limits, 0.1), RATED, PEAK)[2]
+        for limits in (flexion, other_way)
+    )
     assert other.support == pytest.approx(one.support, abs=2e-3)
 
 
@@ -108,6 +115,15 @@ def test_strong_enough_motors_support_the_whole_arm():
 def test_there_is_no_support_if_the_robot_alone_needs_more_than_rated_torque():
     assert needs(rated=(3, 3.7, 3, 3))[1].support is None
     assert needs(rated=(3, 3.8, 3, 3))[1].support == pytest.approx(0.0, abs=0.005)
+
+
+def test_the_devices_own_springs_count():
+    tensed = JointSpring((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -1.0))
+    bounds = workspace(LOW, HIGH, 0.0)
+    plain, sprung = (budget(ROBOT, LOAD, one, 1.0, bounds, RATED, PEAK)[3] for one in (JointSpring(), tensed))
+    points = np.random.default_rng(2).uniform(LOW, HIGH, (20_000, 4))
+    torque = gravity_torque(ROBOT.with_wearer(*LOAD), points)[:, 3] + 0.5 * (points[:, 3] + 1.0)
+    assert plain.torque < np.abs(torque).max() <= sprung.torque + 2e-3
 
 
 def test_motor_for_returns_the_smallest_motor_that_covers_the_torque():
@@ -125,5 +141,11 @@ def test_overload_names_each_overloaded_joint_and_the_support_that_fits():
 
 
 def test_a_torque_scale_below_1_reduces_the_motors_torque_and_one_above_1_does_not_raise_it():
-    rated, peak = motor_torques(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), (1.0, 0.5, 1.5, 1.0))
+    bridge = values_of(CAN_BRIDGE, {**BUS, "torque_scale": [1.0, 0.5, 1.5, 1.0]})
+    rated, peak = motor_torques(bridge)
     assert rated.tolist() == [3.0, 4.5, 3.0, 3.0] and peak.tolist() == [9.0, 9.0, 9.0, 9.0]
+
+
+def test_a_motor_that_weakens_when_warm_is_counted_as_warm():
+    rated, _ = motor_torques(values_of(CAN_BRIDGE, {**BUS, "torque_scale_slope": [-0.001, 0.0, 0.001, -0.001]}))
+    assert rated == pytest.approx([3.0 * (1.0 - 0.045), 9.0, 3.0, 3.0 * (1.0 - 0.045)])

@@ -111,7 +111,9 @@ def test_a_refusal_is_on_the_page_without_new_values(found: CalibrationResult) -
 
 def test_friction_is_drawn_over_speed_and_a_result_without_poses_is_its_values_alone() -> None:
     speed = np.array((0.3, 0.05, 0.1))
-    curves = [fit_friction(speed, 0.1 + 0.02 * speed) for _ in range(4)]
+    curves = [
+        fit_friction(speed, 0.1 + 0.02 * speed, np.full(len(speed), 0.002), np.zeros_like(speed)) for _ in range(4)
+    ]
     comment = Change("/right/can_bridge", "", 0, "friction of the elbow")  # in the file alone
     found = CalibrationResult((comment,), (), (), configured_arm(), curves=tuple(curves))
     page = page_of(found, "friction", "old.yaml", DAY)

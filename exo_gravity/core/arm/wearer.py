@@ -88,6 +88,11 @@ class Tissue:
         springs = zip(self.joint_stiffness, self.joint_rest, theta, strict=True)
         return tuple([k * max(-TISSUE_REACH, min(TISSUE_REACH, angle - rest)) for k, rest, angle in springs])
 
+    def torques(self, theta: np.ndarray) -> np.ndarray:
+        """Return the same for poses (m, n) in rad: (m, n) Nm."""
+        way = np.clip(theta - np.array(self.joint_rest), -TISSUE_REACH, TISSUE_REACH)
+        return np.asarray(np.array(self.joint_stiffness) * way)
+
 
 @dataclass(frozen=True)
 class Wearer:

@@ -2,6 +2,7 @@
 """The settings of the compensator, checked against each other, and the parameters that describe them."""
 
 import itertools
+import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,6 +26,7 @@ from exo_gravity.core.arm.arm import (
 )
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Tissue, Wearer, load_by_moments
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
@@ -107,6 +109,7 @@ class Settings:
     anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
     terms: TermSettings = field(default_factory=TermSettings)
     model_error: ModelError = field(default_factory=ModelError)  #: for the bands of what is estimated
+    joint_spring: JointSpring = field(default_factory=JointSpring)  #: the device's own; every law gets it
     robot_by_mass: Arm | None = None  #: the robot by its masses, for `terms`; None: `robot`
     payload_mass: float = 0.0  #: kg in the hand
     payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in the frame of the hand
@@ -124,6 +127,9 @@ class Settings:
         check_owned(self, len(self.robot.scale))
         for name in ("wearer_mass", "wearer_cog"):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
+        if self.joint_spring.on and len(self.joint_spring.stiffness) != len(self.robot.scale):
+            expected = f"{len(self.robot.scale)} numbers"
+            raise ParameterError("joint_spring.stiffness", list(self.joint_spring.stiffness), expected)
         for name in ("wearer_first_moment", "wearer_off_axis"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if any(self.tissue.joint_stiffness) and len(self.tissue.joint_stiffness) != len(self.robot.scale):
@@ -189,12 +195,14 @@ class Settings:
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; exact: by the exact law in any case.
 
-        In zero_g with `support` of the wearer's tissue. And why the chosen law does not apply here, or ''. Then the
-        exact law replaces it.
+        The joints' own springs are included, in zero_g also `support` of the wearer's tissue. And why the chosen law
+        does not apply here, or ''. Then the exact law replaces it.
         """
         reason = self.chosen.outside(theta, tilt)
         law = self.exact if exact or reason else self.chosen
         torque = law.torque(theta, tilt)
+        if self.joint_spring.on:
+            torque = tuple(map(operator.add, torque, self.joint_spring.torque(theta)))
         if self.mode == "zero_g" and any(self.tissue.joint_stiffness):
             share = self.support_now
             torque = tuple([tau + share * own for tau, own in zip(torque, self.tissue.torque(theta), strict=True)])
@@ -240,6 +248,7 @@ COMPENSATOR = (
     param_of(Settings, "shoulder_from_imu"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
+    *(replace(param, name=f"joint_spring.{param.name}") for param in params_of(JointSpring)),
     *term_parameters(),
     *REAL_TIME_PARAMETERS,
 )
@@ -342,12 +351,19 @@ def _settings_of(
         use_imu=values["use_imu"],
         terms=term_settings_of(values),
         model_error=ModelError(*sized),
+        joint_spring=joint_spring_of(values),
         tissue=tissue_of(values),
         payload_mass=values["payload.mass"],
         payload_cog=tuple(values["payload.cog"]),
         **{param.name: values[param.name] for param in params_of(Settings)},
         **own,
     )
+
+
+def joint_spring_of(values: Mapping[str, Any]) -> JointSpring:
+    """Return the device's own springs that parameter values describe, or raise ParameterError."""
+    with named("joint_spring."):
+        return JointSpring(values["joint_spring.stiffness"], values["joint_spring.rest"])
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:

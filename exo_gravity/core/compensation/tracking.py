@@ -71,6 +71,7 @@ class Observation(NamedTuple):
     load_mass: float = 0.0  #: kg, a weight on link 4; 0 for none
     load_lever: float = 0.0  #: m, its distance from the elbow
     speed: float | Vector = 0.0  #: rad/s at which the joints passed the pose, one for all or (n,)
+    temperature: Vector = ()  #: (n,) degC of the motors; () if not known
 
 
 class Sweep(NamedTuple):

@@ -24,6 +24,12 @@ from exo_gravity.core.vocabulary import Source
 MAX_CAN_ID = 126
 MAX_MASTER_ID = 0x7FE
 TORQUE_SCALE_BOUNDS = (0.2, 2.0)
+# 1/K: the remanence of a neodymium magnet falls by about 0.0012 of itself per kelvin, of a ferrite by 0.002, and with
+# it the torque per ampere.
+SCALE_SLOPE_BOUNDS = (-0.003, 0.003)
+SCALE_TEMPERATURE = 25.0  # degC at which torque_scale is true, unless it was measured warm or cold
+SCALE_TEMPERATURE_BOUNDS = (-40.0, 150.0)  # degC
+LARGEST_WARMING = 60.0  # K from there that torque follows: a sensor without connection reads far beyond
 # rad: 12.5 in the manual, 12.56 or 12.566 in firmware. Another one is a mistake that would scale every angle.
 POSITION_RANGE_BOUNDS = (12.4, 12.6)
 # By which factor a wire range of speed or torque may differ from the motor's usual one: firmware was met with 0.45 of
@@ -78,6 +84,8 @@ class JointMotor:
     wire_format: WireFormat = MIT  #: of the motor's board
     timeout: float = 0.0  #: s without a command after which the firmware lets go; 0: never
     master_id: int = 0  #: arbitration ID of replies, where it can be chosen; 0: the usual one
+    scale_slope: float = 0.0  #: 1/K, share by which `torque_scale` changes with the motor's temperature
+    scale_temperature: float = SCALE_TEMPERATURE  #: degC at which `torque_scale` is true
     command_id: int = field(init=False)  #: the arbitration ID of commands
     reply_id: int = field(init=False)  #: the arbitration ID of replies or status frames
     settings: Sequence[Setting] = field(init=False)  #: that the board must have
@@ -105,6 +113,8 @@ class JointMotor:
         if not abs(self.zero) <= limit:
             raise ParameterError("zero", self.zero, f"from {-limit:.2f} to {limit:.2f} rad, or the angle would wrap")
         one_float("torque_scale", self.torque_scale, *TORQUE_SCALE_BOUNDS)
+        one_float("torque_scale_slope", self.scale_slope, *SCALE_SLOPE_BOUNDS, "1/K")
+        one_float("torque_scale_temperature", self.scale_temperature, *SCALE_TEMPERATURE_BOUNDS, "degC")
         shortest, longest = TIMEOUT_BOUNDS
         spec, board = self.spec, self.wire_format
         if (self.timeout or board.needs_timeout) and not shortest <= self.timeout <= longest:
@@ -126,22 +136,40 @@ class JointMotor:
             object.__setattr__(self, name, value)
         object.__setattr__(self, "idle", (self.command_id, self.command(0.0, 0.0)))
 
-    def command(self, effort: float, damping: float, stiffness: float = 0.0, position: float = 0.0) -> bytes:
+    def scale_at(self, temperature: float | None) -> float:
+        """Return the real torque per commanded torque of a motor at `temperature` degC, None if that is not known."""
+        if not self.scale_slope or temperature is None:
+            return self.torque_scale
+        return scale_at(self.torque_scale, self.scale_slope, self.scale_temperature, temperature)
+
+    def warmed(self, temperature: float | None) -> float:
+        """Return by which share the torque per command differs at `temperature` degC from `torque_scale`."""
+        return self.scale_at(temperature) / self.torque_scale - 1.0
+
+    def command(
+        self,
+        effort: float,
+        damping: float,
+        stiffness: float = 0.0,
+        position: float = 0.0,
+        temperature: float | None = None,
+    ) -> bytes:
         """Return the data of a command: a joint `effort` in Nm and `damping` in Nm s/rad, clamped to the wire format.
 
         With a `stiffness` in Nm/rad, the motor also pulls the joint to `position` in rad.
+        temperature: of the motor in degC, None if it is not known.
 
         Raises ParameterError on NaN or infinity.
         """
-        spec = self.spec
-        torque = self.direction * effort / self.torque_scale
-        kd = min(damping / self.torque_scale, spec.kd_max)
+        spec, scale = self.spec, self.scale_at(temperature)
+        torque = self.direction * effort / scale
+        kd = min(damping / scale, spec.kd_max)
         if kd:  # no code is exactly 0 rad/s: the nearest one would push with kd times its velocity
             torque -= kd * spec.standstill
         most = spec.torque_range
         if not -most <= torque <= most and math.isfinite(torque):
             torque = math.copysign(most, torque)
-        kp = stiffness / self.torque_scale
+        kp = stiffness / scale
         return self.wire_format.pack_command(spec, self.motor_position(position) if kp else 0.0, 0.0, kp, kd, torque)
 
     def sample(self, data: bytes | bytearray, time: float) -> JointSample:
@@ -149,7 +177,7 @@ class JointMotor:
         board = self.wire_format
         _, position, velocity, torque, temperature, error = board.unpack_reply(self.spec, self.can_id, data)
         sign = self.direction
-        effort = sign * torque * self.torque_scale
+        effort = sign * torque * self.scale_at(temperature)
         trouble = board.error_text(error) if error else ""
         if error in board.let_go:
             error = 0
@@ -159,6 +187,12 @@ class JointMotor:
     def motor_position(self, joint_position: float) -> float:
         """Return the motor angle in rad for a joint angle in rad."""
         return self.direction * joint_position + self.zero
+
+
+def scale_at(scale: float, slope: float, reference: float, temperature: float) -> float:
+    """Return the torque scale at `temperature` degC of a motor that has `scale` at `reference` degC; slope: 1/K."""
+    warming = max(-LARGEST_WARMING, min(LARGEST_WARMING, temperature - reference))
+    return scale * (1.0 + slope * warming)
 
 
 LARGEST_ZERO = POSITION_RANGE_BOUNDS[1]  # rad; `JointMotor` has the limit of each motor
@@ -177,6 +211,10 @@ MOTOR_PARAMETERS = (
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
           fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
+    Param("torque_scale_slope", [0.0] * 4, "share by which torque_scale changes per kelvin of the motor's temperature, "
+          "about -0.001 of a neodymium magnet; 0: it does not, or is not known", SCALE_SLOPE_BOUNDS, "1/K", fixed=True),
+    Param("torque_scale_temperature", [SCALE_TEMPERATURE] * 4, "motor temperature at which torque_scale is true",
+          SCALE_TEMPERATURE_BOUNDS, "degC", fixed=True),
     Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit_v3 for V3 boards of AK motors, mit for "
           "others", choices=FORMATS, fixed=True),
     Param("master_id", [0] * 4, "CAN ID of a Damiao motor's replies; 0: its can_id + 16", (0, MAX_MASTER_ID),
@@ -274,7 +312,8 @@ def _motor_of(given: Mapping[str, Any]) -> JointMotor:
     names = "position_range", "velocity_range", "torque_range", "torque_per_ampere"
     spec = replace(usual, **{name: given[name] for name in names if given[name]})
     mounting = given["can_id"], given["direction"], given["zero"], given["torque_scale"]
-    return JointMotor(spec, *mounting, board, given["motor_timeout"], given["master_id"])
+    warmth = given["torque_scale_slope"], given["torque_scale_temperature"]
+    return JointMotor(spec, *mounting, board, given["motor_timeout"], given["master_id"], *warmth)
 
 
 class FrameBits(NamedTuple):

@@ -125,7 +125,7 @@ class Limits:
     largest_addition: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
         "torque that efforts may add to gravity compensation when `largest_moment` is given: the sum of the bounds of "
-        "assistance and terms in use, `inertial`, a calibration",
+        "assistance and terms in use, `inertial`, a calibration, and the torque of `joint_spring`",
         (0.0, 10.0),
         "Nm",
     )

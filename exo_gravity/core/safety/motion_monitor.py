@@ -5,7 +5,7 @@ It shares no code and no masses with the compensator. Its own ground is `largest
 first moments of the arm, robot plus wearer, about joints 1 to 4, each along its link (M4 = m4 d4, M3 = m3 d3 + m4 l3,
 and so on). Any load from none to these, in the arm's pose and at the trunk's tilt, gives a range of torques for each
 joint, which `largest_addition` widens both ways: what assistance, springs, friction and inertia terms or a calibration
-may add. What is asked for outside that range, beyond a margin, is unexplained.
+may add, and what the joints' own springs need. What is asked for outside that range, beyond a margin, is unexplained.
 
 Unexplained torque is summed over time, with both signs as positive, and forgotten over `memory`. The sum is an impulse:
 it bounds the speed that the motors cause and gravity does not, whatever the wearer does meanwhile. A joint of a link

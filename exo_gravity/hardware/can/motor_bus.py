@@ -42,6 +42,7 @@ from exo_gravity.core.motors.frames import (
     WireFormat,
 )
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, awaited
@@ -56,6 +57,7 @@ CONTEST_TIME = 0.5  # s after a foreign command in which another one is expected
 HOLD_STIFFNESS = 60.0  # Nm/rad by which a contested motor holds its joint: the motor applies it without our delay,
 HOLD_REACH = 0.15  # rad at most from where the joint is,
 HOLD_SPEED = 0.3  # rad/s with which the held position follows the joint,
+WARMING = 1.0  # K/s by which the torque follows a motor's temperature at most: no reading makes it step
 HOLD_STEP = 0.01  # s of this motion at most for each reply: after a stall of the loop the torque must not step
 FOREIGN_COMMAND = "foreign command"
 AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus is not open
@@ -108,6 +110,7 @@ class MotorBus:
         self._corrected = [-math.inf] * count  # s
         self._contested = [-math.inf] * count  # s of the last foreign command to the motor
         self._held = [math.nan] * count  # rad
+        self._warmth: list[float | None] = [None] * count  # degC, of motors whose torque depends on it
         self._note = note
         self._answered: set[int] = set()
         self._requests = [Requests() for _ in motors]
@@ -281,12 +284,20 @@ class MotorBus:
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
+        self._follow_temperature(joint, sample)
         self._answered.add(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
             self._follow(joint, sample)
         else:
             self._held[joint] = sample.position
         self.samples[joint] = sample
+
+    def _follow_temperature(self, joint: int, sample: JointSample) -> None:
+        """Let the temperature that a motor's commands count with follow its reading, without a step."""
+        if self._motors[joint].scale_slope and sample.temperature is not None:
+            last, most = self._warmth[joint], WARMING * max(0.0, sample.time - self.samples[joint].time)
+            reading = float(sample.temperature)
+            self._warmth[joint] = reading if last is None else limited(reading, last, most)
 
     def _commanded(self, port: CanPort, can_id: int) -> list[int]:
         """Return the joints of the motors that obey a command to this ID."""
@@ -314,10 +325,10 @@ class MotorBus:
         if now - self._contested[joint] < CONTEST_TIME and (hold := self._hold(joint, now)):
             damping = max(DAMPING, damping)
             if not math.isnan(self._held[joint]):
-                data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint])
+                data = motor.command(effort, damping, hold * HOLD_STIFFNESS, self._held[joint], self._warmth[joint])
                 if data[0] not in self._joint_of:  # or its echo would look like a reply
                     return motor.command_id, data
-        return motor.command_id, motor.command(effort, damping)
+        return motor.command_id, motor.command(effort, damping, temperature=self._warmth[joint])
 
     def _oppose(self, joint: int, foreign: bytes) -> None:
         """Answer a foreign command with our last one, under the motor's full damping; hold the joint meanwhile."""

@@ -8,11 +8,16 @@ an IMU is mounted, and a stand placed, to no better than a degree. The commanded
 scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns
 that the poses do not show: those whose standard error exceeds `NATURAL`.
 
+Further unknowns, the extras, are 0 unless the poses ask for them: a spring across each joint in Nm/rad (where it is
+slack is part of the offset), and the slope of each scale over the motor's temperature. `asked_for` decides by an
+information criterion, so that an arm without springs loses no exactness to them.
+
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,12 +35,17 @@ ANGLE = slice(16, 19)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 
 ALONG, ACROSS = [2, 3, 3], [6, 7, 5]  # indices of these moments
 TILT = slice(19, 22)  # rotation vector of gravity in the base frame
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
-COUNT = 22
-# kg m, logarithm, Nm, rad, rad: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = np.repeat((0.1, 0.3, 0.3, 0.3, 0.1), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 3, 3))
+SPRING = slice(22, 26)  # Nm/rad
+SLOPE = slice(26, 30)  # 1/K, of the torque scale over the motor's temperature
+EXTRAS = tuple(range(SPRING.start, SLOPE.stop))
+COUNT = 30
+# kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K: a combination of unknowns that may be wrong by this much is not known.
+NATURAL = np.repeat(
+    (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 3, 3, JOINT_COUNT, JOINT_COUNT)
+)
 # kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
 TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
-START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(18)))  # of the search
+START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(COUNT - JOINT_COUNT)))  # of the search
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,8 @@ class Fit:
     #: Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
     least_outlier: float = 0.03
     share_of_peak: float = 0.01  #: of the effort, likewise
+    least_warming: float = 5.0  #: K between the coldest and the warmest pose, from which a slope can show
+    hidden: float = 0.1  #: share of an unknown, in combinations that are not known, from which it is not known itself
 
 
 FIT = Fit()
@@ -72,16 +84,26 @@ class Rows(NamedTuple):
     """What is fitted, for n poses."""
 
     along: np.ndarray  #: (n, 4, 8, 3) Nm per kg m, the torque with gravity along each axis of the base frame
+    theta: np.ndarray  #: (n, 4) rad
+    warmth: np.ndarray  #: (n, 4) K of the motors, beyond the mean of their poses; 0 where it is not known
     direction: np.ndarray  #: (n, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (n, 8) kg m, moments of the weight
     effort: np.ndarray  #: (n, 4) Nm
     sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
-    #: (k, 22), linear combinations of the unknowns that are 0, divided by their standard errors
+    #: (k, COUNT), linear combinations of the unknowns that are 0, divided by their standard errors
     anchor: np.ndarray = np.zeros((0, COUNT))
 
     def only(self, keep: np.ndarray) -> "Rows":
         """Return the poses that `keep` (n,) selects."""
         return Rows._make([*(column[keep] for column in self[:-1]), self.anchor])
+
+    def holding(self, indices: Sequence[int]) -> "Rows":
+        """Return the rows with these unknowns held at 0."""
+        return self._replace(anchor=np.vstack((self.anchor, np.eye(COUNT)[list(indices)] / EXACT)))
+
+    def with_extras(self, free: Sequence[int]) -> "Rows":
+        """Return the rows with all of EXTRAS but the `free` ones held at 0."""
+        return self.holding([index for index in EXTRAS if index not in free])
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (n, 4) in Nm."""
@@ -90,10 +112,11 @@ class Rows(NamedTuple):
         moments = unknowns[MOMENT] + self.load @ turn
         direction = self.direction + self.direction @ (unknowns[TILT] @ TURN)
         torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
-        return np.asarray(torque * np.exp(-unknowns[SCALE]) + unknowns[OFFSET])
+        torque = torque + unknowns[SPRING] * self.theta
+        return np.asarray(torque * np.exp(-unknowns[SCALE]) / (1.0 + unknowns[SLOPE] * self.warmth) + unknowns[OFFSET])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, 22), exact to rounding by complex steps."""
+        """Return the derivative of `predicted` by the unknowns, (n, 4, COUNT), exact to rounding by complex steps."""
         steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(COUNT))
         return np.stack(list(steps), axis=-1) / TINY
 
@@ -101,15 +124,15 @@ class Rows(NamedTuple):
 class Solution(NamedTuple):
     """The fit of `Rows`."""
 
-    unknowns: np.ndarray  #: (22,)
-    covariance: np.ndarray  #: (22, 22) of what is known
-    hidden: np.ndarray  #: (22,), share 0..1 of each unknown that is not known
+    unknowns: np.ndarray  #: (COUNT,)
+    covariance: np.ndarray  #: (COUNT, COUNT) of what is known
+    hidden: np.ndarray  #: (COUNT,), share 0..1 of each unknown that is not known
     singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
     residual: np.ndarray  #: (n, 4) Nm
     left: np.ndarray  #: (n, 4), part of each residual's variance that the fit leaves, 0..1
     freedom: np.ndarray  #: (4,), degrees of freedom of each joint's residuals
     hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
-    inverse: np.ndarray  #: (22, 4 n + k), change of the unknowns with each effort and condition, divided by its error
+    inverse: np.ndarray  #: (COUNT, 4 n + k), change of the unknowns with each effort and condition, by its error
 
 
 def rows_of(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
@@ -124,7 +147,17 @@ def rows_of(observations: Sequence[Observation], length: Vector, gravity: float)
     product = np.eye(COUNT)[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
     product *= not np.any(load)
     anchor = np.vstack((np.eye(COUNT)[ANGLE] / FIT.beside_error, np.eye(COUNT)[TILT] / FIT.tilt_error, product / EXACT))
-    return Rows(along_axes(theta, gravity), direction, load, effort, np.hypot(spread, FIT.least_spread), anchor)
+    along, sigma = along_axes(theta, gravity), np.hypot(spread, FIT.least_spread)
+    temperature = temperatures(observations)
+    warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
+    return Rows(along, theta, warmth, direction, load, effort, sigma, anchor)
+
+
+def temperatures(observations: Sequence[Observation]) -> np.ndarray:
+    """Return the motors' temperatures (n, 4) in degC, NaN where one is not known."""
+    unknown = np.full(JOINT_COUNT, np.nan)
+    given = [one.temperature if len(one.temperature) else unknown for one in observations]
+    return np.array(given, dtype=float)
 
 
 def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
@@ -138,7 +171,7 @@ def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
 
 
 def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.0) -> Solution:
-    """Return the least-squares solution from `start` (22,); weight: (n, 4) of the squared residuals."""
+    """Return the least-squares solution from `start` (COUNT,); weight: (n, 4) of the squared residuals."""
     root = np.sqrt(weight) / rows.sigma
     unknowns = start
     for _ in range(FIT.steps):
@@ -194,13 +227,41 @@ def bounded(rows: Rows) -> tuple[Rows, Solution]:
     used, solution = final(rows)
     if solution.unknowns[0] >= 0.0:
         return used, solution
-    used, held = final(rows._replace(anchor=np.vstack((rows.anchor, np.eye(COUNT)[:1] / EXACT))))
+    used, held = final(rows.holding([0]))
     held.unknowns[0], held.covariance[0, 0] = 0.0, solution.covariance[0, 0]
     return used, held
 
 
+def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows, Solution]]) -> tuple[int, ...]:
+    """Return which of the extras `among` the poses ask for, as `fit` (`robust` or `final`) judges them.
+
+    Backwards: the one that explains least goes, until each one lowers the sum of squares by more than the extended
+    criterion of J. Chen and Z. Chen, Biometrika 95 (2008): ln of the number of efforts (Schwarz's), plus 2 ln of the
+    number of candidates. A spring that would push is none. None stays that hides another unknown.
+    """
+    left, penalty = list(among), math.log(rows.effort.size) + 2.0 * math.log(len(EXTRAS))
+    is_shown = fit(rows.with_extras(()))[1].hidden <= FIT.hidden if left else np.ones(COUNT, dtype=bool)
+    while left:
+        solution = fit(rows.with_extras(left))[1]
+        value, variance = solution.unknowns[left], np.diag(solution.covariance)[left]
+        pushes = (value < 0.0) & (np.array(left) < SPRING.stop)
+        gain = np.where(pushes | (solution.hidden[left] > FIT.hidden), 0.0, value**2 / np.maximum(variance, 1e-30))
+        least = int(np.argmin(gain))
+        if gain[least] > penalty and not np.any(is_shown & (solution.hidden > FIT.hidden)):
+            break
+        del left[least]
+    return tuple(left)
+
+
+def possible_extras(rows: Rows) -> tuple[int, ...]:
+    """Return the extras that the poses can show at all."""
+    warms = np.ptp(rows.warmth, axis=0) >= FIT.least_warming
+    slopes = [index for index, is_warm in zip(range(SLOPE.start, SLOPE.stop), warms.tolist(), strict=True) if is_warm]
+    return (*range(SPRING.start, SPRING.stop), *slopes)
+
+
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
-    """Return the covariance (22, 22) that the error `FIT.common_error` of each joint and weight causes."""
+    """Return the covariance (COUNT, COUNT) that the error `FIT.common_error` of each joint and weight causes."""
     torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
     loads, group = np.unique(rows.load, axis=0, return_inverse=True)
     shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)

@@ -252,7 +252,7 @@ def next_pose(
 
 
 def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
-    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (22,) are not known."""
+    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (COUNT,) are not known."""
     poses = np.radians(list(itertools.product(*GRID)))
     shown = _sensitivity(poses, direction, TYPICAL_MOMENTS, gravity) * NATURAL * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
@@ -260,10 +260,10 @@ def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
 
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
-    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, divided by their noise: (n, 4, 22)."""
+    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, by their noise: (n, 4, COUNT)."""
     unused = np.zeros((len(theta), JOINT_COUNT))  # what was measured
     down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
-    rows = Rows(along_axes(theta, gravity), down, no_load, unused, unused)
+    rows = Rows(along_axes(theta, gravity), theta, unused, down, no_load, unused, unused)
     unknowns = START.copy()
     unknowns[MOMENT] = moments
     noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))

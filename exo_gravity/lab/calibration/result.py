@@ -23,6 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.calibration.identification import FrictionCurve, Identified
@@ -168,15 +169,16 @@ def _comment(indent: str, note: str) -> str:
 def remainders(found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> tuple[np.ndarray, ...]:
     """Return measured minus predicted torque (n, 4) in Nm as commanded, and which of the poses (n,) were used.
 
-    Predicted by the old file; by the new one, which cannot hold the motors' constant offset; and by a result that was
-    found without that pose.
+    Predicted by the old file; by the new one, which holds a motor's constant offset only in a joint with a spring; and
+    by a result that was found without that pose.
     """
     theta, direction, measured, _ = columns(poses)
     loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
     rows = regressor(theta, direction, arm.robot.gravity)
-    old = measured - np.einsum("njk,nk->nj", rows, moments_of(arm.robot) + loads)
+    springs = joint_spring_of(arm.compensator).torques(theta)
+    old = measured - np.einsum("njk,nk->nj", rows, moments_of(arm.robot) + loads) - springs
     used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
-    return old, found.residual + found.offset, found.held_out + found.offset, used
+    return old, found.residual + found.left_offset, found.held_out + found.left_offset, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:
@@ -253,12 +255,13 @@ def torque_figure(found: Identified, arm: ConfiguredArm, poses: Sequence[Observa
 
 
 def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
-    """Return the friction of each joint over its speed, as measured and as fitted."""
+    """Return the friction of each joint over its speed, measured and fitted, less what grows with the torque."""
     figure = Figure(figsize=(FIGURE_WIDTH, 3.2), layout="constrained")
     for joint, axis in enumerate(figure.subplots(1, 4, sharey=True)):
         curve, order = curves[joint], np.argsort(curves[joint].speed)
-        axis.plot(curve.speed, curve.torque, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
-        axis.plot(curve.speed[order], curve.fitted[order], color=INK, lw=1.0, label="fitted")
+        of_load = curve.load * curve.carried
+        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
+        axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
         _finish(axis, joint, labels[joint])

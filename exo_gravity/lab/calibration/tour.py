@@ -31,6 +31,7 @@ from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_s
 
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick
+RAISED = 4  # chosen poses of a tour for friction: they show what depends on the torque
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 # What stops a tour.
@@ -52,6 +53,7 @@ class Tour:
 
     measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
     the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
+    temperature: (4,) degC of the motors, set by who knows it; () if it is not known.
     """
 
     def __init__(
@@ -62,6 +64,7 @@ class Tour:
         self.done = False
         self.progress = "choosing the first pose"
         self.elapsed = 0.0
+        self.temperature: Sequence[float] = ()
         self._limits, self._most = limits, np.array(limits.max_effort)
         self._guess, self._itinerary, self._load = guess, itinerary, load
         self._tracker = Tracker(rate, limits.max_effort)
@@ -207,7 +210,8 @@ class Tour:
                 self.trouble = f"{name}: {what}: the arm was touched, or the joint slips"
                 return
         weight, lever = self._load
-        self.measured.append(seen._replace(effort=effort, load_mass=weight, load_lever=lever, speed=station.speed))
+        seen = seen._replace(effort=effort, load_mass=weight, load_lever=lever)
+        self.measured.append(seen._replace(speed=station.speed, temperature=tuple(self.temperature)))
         before = self._guess.torque(theta.tolist())
         self._guess.learn(theta, effort, seen.spread)
         self._tracker.shift(np.subtract(self._guess.torque(theta.tolist()), before))
@@ -229,7 +233,8 @@ class TourController(SampleController):
         self._has_begun = False
 
     def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        position, velocity, _, _, _, times, *_ = zip(*samples, strict=True)
+        position, velocity, _, temperature, _, times, *_ = zip(*samples, strict=True)
+        self.tour.temperature = () if None in temperature else tuple(map(float, temperature))
         self._has_begun = self._has_begun or self._is_carried()
         if self._has_begun:
             effort = self.tour.step(now, position, velocity, self._tilt)
@@ -252,7 +257,7 @@ CALIBRATOR = (
     *(param for param in CAN_BRIDGE if param.name in BRIDGE),
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.again", 0, "number of the first poses that are visited again at the end", (0, 100), fixed=True),
-    Param("tour.friction", False, "sweep the hanging arm at several speeds, in place of chosen poses", fixed=True),
+    Param("tour.friction", False, "sweep the hanging arm at several speeds, then a few chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
 )
@@ -264,6 +269,7 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load = values["tour.load_mass"], values["tour.load_lever"]
     moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
     guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
-    count, given = (0, friction_stations(limits)) if values["tour.friction"] else (values["tour.poses"], ())
+    given = friction_stations(limits) if values["tour.friction"] else ()
+    count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
     return Tour(limits, guess, itinerary, values["rate"], load)

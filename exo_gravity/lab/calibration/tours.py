@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""calibrate gravity, scale, friction and wearer: what slow tours of the arm show, live or from a recording.
+"""calibrate gravity, scale, friction, wearer and check: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
 is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: the
@@ -16,16 +16,17 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, moments_along
 from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
-from exo_gravity.core.compensation.settings import wearer_of
+from exo_gravity.core.compensation.settings import joint_spring_of, settings_of, wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS
+from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
 from exo_gravity.core.numbers import COVER, JOINT_COUNT, one_float
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
-from exo_gravity.lab.calibration.live import Say, tour_parameters
-from exo_gravity.lab.calibration.pose_fit import columns
+from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
+from exo_gravity.lab.calibration.pose_fit import columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -60,12 +61,24 @@ class WearerTour:
 WEARER = WearerTour()
 
 
+@dataclass(frozen=True)
+class CheckTour:
+    """The tour that checks a calibration."""
+
+    poses: int = 3  #: the hanging arm and two others
+    widest: float = 10.0  #: %, of the band of a joint that is judged
+
+
+CHECK = CheckTour()
+
+
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
 def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
-    return moments_from(arm, _observations(options, arm, say, {"tour.poses": options.poses}))
+    earlier = observations_in(options.earlier) if options.earlier else []
+    return moments_from(arm, earlier + _observations(options, arm, say, {"tour.poses": options.poses}))
 
 
 def _observations(
@@ -91,16 +104,23 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
     load_moments(arm.robot.length.tolist(), mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
+    earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
     bare = _observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
-        bare = [one._replace(effort=gravity_torque(arm.robot, one.theta, one.direction)) for one in bare]
+        bare = [one._replace(effort=_held(arm, one)) for one in bare]
     else:
         hang = f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = _observations(options, arm, say, changes, hang)
-    return moments_from(arm, bare + weighed)
+    return moments_from(arm, earlier + bare + weighed)
+
+
+def _held(arm: ConfiguredArm, pose: Observation) -> np.ndarray:
+    """Return the torque (4,) in Nm that the file's arm needs in a pose."""
+    springs = joint_spring_of(arm.compensator).torques(np.asarray(pose.theta))
+    return np.asarray(gravity_torque(arm.robot, pose.theta, pose.direction) + springs)
 
 
 def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
@@ -108,7 +128,7 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
     robot, (low, high) = arm.robot, TORQUE_SCALE_BOUNDS
     found = identify(observations, robot.length, robot.gravity)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
-    scale = np.round(factor * arm.can_bridge["torque_scale"], 4).tolist()
+    scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
         f"{name}: torque_scale = {value:g}: must be from {low:g} to {high:g}: check torque_range of its firmware"
         for name, value in zip(arm.joint_names, scale, strict=True)
@@ -119,6 +139,14 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
     changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
+
+
+def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
+    """Return the file's torque scales (4,) at the temperatures of the poses."""
+    bridge = arm.can_bridge
+    columns = (bridge[name] for name in ("torque_scale", "torque_scale_slope", "torque_scale_temperature"))
+    motors = zip(*columns, found.temperature.tolist(), strict=True)
+    return np.array([scale_at(*motor) if math.isfinite(motor[-1]) else motor[0] for motor in motors])
 
 
 def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple[Change, ...]:
@@ -133,9 +161,11 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
         changes.append(Change(node, name, moments[part], note))
     changes += [
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
+        *_temperature_changes(arm, found),
+        *_spring_changes(arm, found),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
-        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0)) * found.scale
+        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2) * found.scale
         changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
     if not found.relative:
         known = np.isfinite(found.scale_error)
@@ -146,6 +176,37 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
         changes.append(Change(node, "gain", [1.0] * 4, "now part of the moments and of torque_scale"))
     return tuple(changes)
+
+
+def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+    """Yield at which temperatures the torque scales are true, and their slopes."""
+    node, bridge = f"{arm.namespace}/can_bridge", arm.can_bridge
+    if not np.all(np.isfinite(found.temperature)):
+        return
+    yield Change(node, "torque_scale_temperature", found.temperature.round(1).tolist(), "degC, mean of the tours")
+    given = np.array(bridge["torque_scale_slope"])
+    if np.any(given) or np.any(found.slope):
+        slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.slope
+        note = f"1/K, +-{_row(found.slope_error)}; 0: the poses show none, the file's is kept"
+        yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
+
+
+def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+    """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
+    node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
+    if not (np.any(found.stiffness) or before.on):
+        return
+    new = JointSpring(found.stiffness.round(4).tolist(), found.rest.round(4).tolist())
+    note = f"Nm/rad, +-{_row(found.stiffness_error)}; 0: the poses show none"
+    yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
+    yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
+    bridge = arm.can_bridge
+    if any(bridge["largest_moment"]):
+        low, high = arm.low.tolist(), arm.high.tolist()
+        own = np.subtract(bridge["largest_addition"], before.largest(low, high))
+        addition = np.ceil(100.0 * (np.maximum(own, 0.0) + new.largest(low, high)) - 1e-6) / 100.0
+        note = "Nm, with the largest torque of the joints' own springs"
+        yield Change(f"{arm.namespace}/can_bridge", "largest_addition", addition.tolist(), note)
 
 
 def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
@@ -163,6 +224,35 @@ def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
 
 
+def calibrate_check(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+    """Compare the torque that a few poses need with the file's. Raises ParameterError."""
+    return checked(arm, _observations(options, arm, say, {"tour.poses": CHECK.poses}))
+
+
+def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+    """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
+
+    A joint that differs by more than the band of `model_error.torque` is a refusal.
+    """
+    held, effort = np.array([_held(arm, one) for one in observations]), columns(observations)[2]
+    error = np.array(settings_of({**arm.compensator, "law": "exact"}).model_error.torque)
+    size = np.sqrt(np.mean(held**2, axis=0))
+    share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
+    band = 100.0 * COVER * error / np.maximum(size, 1e-9)
+    now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
+    lines, refusals = [], []
+    for n, name in enumerate(arm.joint_names):
+        if band[n] > CHECK.widest:
+            lines.append(f"{name}: these poses show too little of its torque: {held[:, n].round(2).tolist()} Nm")
+            continue
+        less = 100.0 * (1.0 - 1.0 / share[n])
+        warmth = f", its motor has {now[n]:.0f} degC" if math.isfinite(now[n]) else ""
+        what = f"{abs(less):.1f} +- {band[n]:.1f} % {'less' if less > 0.0 else 'more'} torque"
+        sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
+        (refusals if abs(less) > band[n] else lines).append(sentence)
+    return CalibrationResult((), tuple(lines), tuple(refusals), arm, tuple(observations))
+
+
 def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     return friction_from(arm, _observations(options, arm, say, {"tour.friction": True}))
@@ -171,13 +261,16 @@ def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say
 def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
-    curves = tuple(map(fit_friction, speed.T, np.array([one.friction for one in observations]).T))
+    effort, friction, spread = (np.array([one[field] for one in observations]).T for field in (2, 3, 4))
+    curves = tuple(map(fit_friction, speed.T, friction, spread, effort))
     changes, refusals = [], []
     for name, fit in zip(arm.joint_names, curves, strict=True):
-        coulomb, viscous, stribeck = fit.error
+        coulomb, viscous, stribeck, load = fit.error
         text = f"Coulomb {fit.coulomb:.3f} +- {coulomb:.3f} Nm, viscous {fit.viscous:.3f} +- {viscous:.3f} Nm s/rad"
         more = f"Stribeck {fit.stribeck:.3f} +- {stribeck:.3f} Nm below {fit.stribeck_speed:.2f} rad/s"
-        note = f"friction of {name}: {text}, {more if fit.stribeck else 'no Stribeck friction'}"
+        more = more if fit.stribeck else "no Stribeck friction"
+        share = f"{fit.load:.3f} +- {load:.3f} of what it carries" if fit.load else "none that grows with the torque"
+        note = f"friction of {name}: {text}, {more}, {share}"
         changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
         if fit.coulomb <= 0.0:
             refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
@@ -207,7 +300,7 @@ def wearer_from(
     length, table = arm.robot.length, _wearer(arm, tabled=True)
     theta, direction, effort, spread = columns(observations)
     rows = regressor(theta, direction, arm.robot.gravity)
-    torque = effort - rows @ moments_of(arm.robot)
+    torque = effort - rows @ moments_of(arm.robot) - joint_spring_of(arm.compensator).torques(theta)
     again, change = unrest(theta, torque)
     if len(observations) - again < WEARER.least_poses:
         measured = f"{len(observations) - again} different poses were measured"
@@ -286,7 +379,8 @@ def _bridge_line(arm: ConfiguredArm, moments: np.ndarray, fit: WearerFit) -> str
     along, (w, z, y3, y4) = moments[:JOINT_COUNT], np.abs(moments[JOINT_COUNT:])
     beside = arm.robot.gravity * np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
     way = np.maximum(np.abs(arm.low - fit.rest), np.abs(arm.high - fit.rest))
-    added = beside + fit.stiffness * np.minimum(way, TISSUE_REACH)
+    device = joint_spring_of(arm.compensator).largest(arm.low.tolist(), arm.high.tolist())
+    added = beside + device + fit.stiffness * np.minimum(way, TISSUE_REACH)
     values = ", ".join(f"{math.ceil(100.0 * moment) / 100.0:g}" for moment in along)
     more = ", ".join(f"{math.ceil(10.0 * torque) / 10.0:g}" for torque in added)
     return (

@@ -5,10 +5,10 @@ A. De Luca and R. Mattone, ICRA 2005. With the momentum p = M v, the motors' tor
 
     p' = tau + f + C^T v - g + wearer        residual r = p's share that tau + f + C^T v - g does not explain,
 
-behind a low-pass of `bandwidth`: no acceleration is needed. M, C, g are those of the robot plus the wearer's whole
-passive arm, g with the tissue of their relaxed joints as far as it is known: so the residual is what their muscles add.
-Without a wearer in the settings the weight of their arm is part of it. One low-pass h lags; the estimate is 2 r - h r,
-which a torque that changes steadily passes without lag.
+behind a low-pass of `bandwidth`: no acceleration is needed. f is friction and the device's own springs. M, C, g are
+those of the robot plus the wearer's whole passive arm, g with the tissue of their relaxed joints as far as it is known:
+so the residual is what their muscles add. Without a wearer in the settings the weight of their arm is part of it. One
+low-pass h lags; the estimate is 2 r - h r, which a torque that changes steadily passes without lag.
 
 The standard deviation is the root of the summed squares of all known errors. Not all of them are random: an error of
 the model stays the same for as long as a pose is held.
@@ -78,10 +78,11 @@ class MomentumObserver:
         self._wearer, self._tissue = s.worn(s.robot.massless(s.loaded.gravity)), s.tissue
         self._has_tissue = any(s.tissue.joint_stiffness)
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
+        self._spring = s.joint_spring
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
         self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
-        self._viscous = for_joints(friction.viscous, count)
+        self._viscous, self._load = for_joints(friction.viscous, count), for_joints(friction.load, count)
         matrix = self._links.matrix(for_joints(tuning.reference, count, max))
         self._code = [2.0 * tuning.bandwidth * tuning.velocity_code * math.hypot(*row) for row in matrix.tolist()]
         self._time = -math.inf
@@ -108,9 +109,11 @@ class MomentumObserver:
         columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])
         gravity = [sum(map(operator.mul, felt, column)) for column in zip(*columns, strict=True)]
-        rubbing, friction = self._friction(velocity)
+        rubbing, friction = self._friction(velocity, effort)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
-        held = tuple(map(operator.add, gravity, self._tissue.torque(theta))) if self._has_tissue else gravity
+        held = tuple(map(operator.add, gravity, self._spring.torque(theta))) if self._spring.on else gravity
+        if self._has_tissue:
+            held = tuple(map(operator.add, held, self._tissue.torque(theta)))
         unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
         dt, self._time = now - self._time, now
         if 0.0 < dt <= tuning.max_gap:
@@ -151,11 +154,12 @@ class MomentumObserver:
         deviation = [math.hypot(own, self._error.wearer * w) for own, w in zip(independent, worn, strict=True)]
         return WearerEstimate(tuple(map(operator.add, once, lag)), tuple(deviation), worn, tuple(independent))
 
-    def _friction(self, velocity: Sequence[float]) -> tuple[list[float], list[float]]:
+    def _friction(self, velocity: Sequence[float], effort: Sequence[float]) -> tuple[list[float], list[float]]:
         """Return the joints' friction (n,) in Nm, against the motion, and its standard deviation."""
         torque, deviation = [], []
-        for v, coulomb, viscous in zip(velocity, self._coulomb, self._viscous, strict=True):
-            moving = sliding(v)
+        columns = zip(velocity, effort, self._coulomb, self._viscous, self._load, strict=True)
+        for v, carried, constant, viscous, load in columns:
+            moving, coulomb = sliding(v), constant + load * abs(carried)
             whole = moving * (coulomb + viscous * abs(v))
             torque.append(-math.copysign(whole, v) if self._is_known else 0.0)
             unsure = self._tuning.friction_share * whole if self._is_known else whole

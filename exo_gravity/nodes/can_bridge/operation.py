@@ -267,6 +267,7 @@ class BridgeReport:
         self._traffic = traffic
         self._rate = Rate()
         self._slow = SLOW / arm.period  # Hz
+        self._warmed = [motor.warmed for motor in arm.motors]
         self._motors = MotorLoad([motor.rated_effort for motor in arm.motors])
         names = zip(self._names, arm.motors, strict=True)
         self._without_timeout = words(*[name for name, motor in names if not motor.timeout])
@@ -324,8 +325,11 @@ class BridgeReport:
             "refused message": refusal.word,
             "refused message text": refusal,
         }
-        for name, joint, (power, rms, share) in zip(self._names, samples, loads, strict=True):
-            values[f"{name} temperature (degC)"] = UNKNOWN if joint.temperature is None else joint.temperature
+        for name, joint, warmed, (power, rms, share) in zip(self._names, samples, self._warmed, loads, strict=True):
+            is_told = joint.temperature is not None
+            values[f"{name} temperature (degC)"] = joint.temperature if is_told else UNKNOWN
+            change = row([100.0 * warmed(joint.temperature)], 1) if is_told else UNKNOWN
+            values[f"{name} torque by temperature (%)"] = change
             values[f"{name} torque (Nm)"] = row([joint.effort], 2)
             values[f"{name} power (W)"] = row([power], 1)
             values[f"{name} RMS torque (Nm)"] = row([rms], 2)

@@ -12,6 +12,8 @@ from typing import Any
 from rclpy.node import Node
 
 from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.wearer import Tissue
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
@@ -20,9 +22,11 @@ from exo_gravity.lab.budget import USUAL_TILT, budget_worn, largest_support, mot
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 WITHIN = "within rated torque everywhere"
-BRIDGE_PARAMETERS = {"motor", "torque_scale", "position_min", "position_max"}
-# robot, the same with the wearer's whole arm, support 0..1, largest tilt in rad
-Request = tuple[ArmModel, ArmModel, float, float]
+BRIDGE_PARAMETERS = {
+    "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
+}  # fmt: skip
+# robot, the same with the wearer's whole arm, springs of device and wearer, support 0..1, largest tilt in rad
+Request = tuple[ArmModel, ArmModel, tuple[JointSpring, Tissue], float, float]
 
 
 class BudgetWatch:
@@ -67,7 +71,7 @@ def request_of(s: Settings) -> Request:
     """Return what the motors must be able to hold with these settings."""
     support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
     tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return papers(s.loaded), papers(s.worn(s.loaded)), support, tilt
+    return papers(s.loaded), papers(s.worn(s.loaded)), (s.joint_spring, s.tissue), support, tilt
 
 
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
@@ -76,11 +80,11 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     names: of the joints (n,).
     bridge: its parameter values.
     """
-    robot, full, support, tilt = request
+    robot, full, springs, support, tilt = request
     try:
         bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
-        rated, peak = motor_torques(bridge["motor"], bridge["torque_scale"])
-        joints = budget_worn(robot, full, support, bounds, rated, peak)
+        rated, peak = motor_torques(bridge)
+        joints = budget_worn(robot, full, springs, support, bounds, rated, peak)
     except ParameterError as error:
         return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
     overloaded = overload(names, joints)

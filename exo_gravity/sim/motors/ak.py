@@ -127,7 +127,12 @@ class SimulatedMotor:
     @property
     def damping(self) -> float:
         """Damping in Nm s/rad that the motor applies to the joint."""
-        return self._command.kd * self.joint.torque_scale * self.strength if self.entered else 0.0
+        return self._command.kd * self._scale * self.strength if self.entered else 0.0
+
+    @property
+    def _scale(self) -> float:
+        """The torque that it gives at its temperature per commanded torque."""
+        return self.joint.scale_at(self.temperature)
 
     @property
     def steady(self) -> bool:
@@ -270,7 +275,7 @@ class SimulatedMotor:
         if command.kp:
             torque += command.kp * (command.position - joint.motor_position(position))
         peak = joint.spec.peak_torque
-        return joint.direction * clamp(torque * joint.torque_scale, peak) * self.strength
+        return joint.direction * clamp(torque * self._scale, peak) * self.strength
 
     def _state(self, position: float, velocity: float) -> bytes:
         """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
@@ -284,7 +289,7 @@ class SimulatedMotor:
     def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
         """Return angle, velocity and torque of the motor in rad, rad/s and Nm, within the ranges of the wire format."""
         joint, spec = self.joint, self.joint.spec
-        torque = joint.direction * self.torque(position, velocity) / (joint.torque_scale * self.strength)
+        torque = joint.direction * self.torque(position, velocity) / (self._scale * self.strength)
         if self.firmware.current_noise:
             torque *= self._random.gauss(1.0, self.firmware.current_noise)
         return (

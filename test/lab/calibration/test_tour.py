@@ -272,11 +272,28 @@ def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
 
 def test_friction_over_speed_is_fitted_with_and_without_stribeck():
     speed = np.array((0.02, 0.05, 0.1, 0.18, 0.3))
-    plain = fit_friction(speed, 0.2 + 0.05 * speed)
+    error = np.full(len(speed), 0.002)
+    plain = fit_friction(speed, 0.2 + 0.05 * speed, error, 0.0 * speed)
     assert plain.stribeck == 0.0
     np.testing.assert_allclose((plain.coulomb, plain.viscous), (0.2, 0.05), atol=1e-9)
-    fit = fit_friction(speed, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)))
+    fit = fit_friction(speed, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), error, 0.0 * speed)
     np.testing.assert_allclose(fit.fitted, 0.2 + 0.05 * speed + 0.1 * np.exp(-((speed / 0.05) ** 2)), atol=0.005)
     assert fit.coulomb == pytest.approx(0.2, abs=0.01)
     with pytest.raises(DataError, match="at 1 speeds"):
-        fit_friction(speed[:1], speed[:1])
+        fit_friction(speed[:1], speed[:1], error[:1], speed[:1])
+
+
+@pytest.mark.parametrize("noise", [0.004, 0.008])
+def test_no_stribeck_friction_is_made_of_noise_and_the_errors_cover_the_truth(noise):
+    speed = np.array((0.1, 0.02, 0.05, 0.1, 0.18, 0.3, 0.1, 0.1, 0.1, 0.1))
+    carried = np.array((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0, 2.0, 4.0))
+    true, fits, rng = 0.2 + 0.05 * speed, [], np.random.default_rng(4)
+    for _ in range(300):
+        measured = true + rng.normal(0.0, noise, len(speed))
+        fits.append(fit_friction(speed, measured, np.full(len(speed), noise), carried))
+    assert np.mean([fit.stribeck > 0.0 or fit.load > 0.0 for fit in fits]) < 0.01
+    assert min(fit.coulomb for fit in fits) > 0.15
+    covered = np.mean([abs(fit.coulomb - 0.2) < 2.0 * fit.error[0] for fit in fits])
+    assert covered > 0.93
+    loaded = fit_friction(speed, measured + 0.08 * np.abs(carried), np.full(len(speed), noise), carried)
+    assert abs(loaded.load - 0.08) < 2.0 * loaded.error[3] < 0.03

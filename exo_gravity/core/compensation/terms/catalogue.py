@@ -39,6 +39,7 @@ FREE = 3.15  # rad: no edge of the workspace
 
 # Bounds of the parameters
 MAX_COULOMB, MAX_VISCOUS = 3.0, 1.0  # Nm, Nm s/rad
+MAX_LOAD_FRICTION = 0.3  # planetary gears lose 0.03 to 0.15
 MAX_FRICTION_SHARE = 0.85  # leaves a friction that is 15 % smaller than identified
 MAX_INERTIA_SHARE = 0.8  # leaves a fifth for masses that are not known exactly
 
@@ -255,6 +256,13 @@ class Friction(TermParameters):
     )
     viscous: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT, "viscous friction of each joint, by `calibrate friction`", (0.0, MAX_VISCOUS), "Nm s/rad"
+    )
+    #: The term leaves it to the joint, which it so overcompensates less.
+    load: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "share of the torque that a joint's gear carries that is friction, by `calibrate friction`; for the estimate "
+        "of the wearer's torque",
+        (0.0, MAX_LOAD_FRICTION),
     )
 
     def torque(self, state: TermState) -> Torque:
