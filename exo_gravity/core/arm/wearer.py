@@ -39,7 +39,7 @@ TABLES = {
 TYPICAL_LENGTH = (0.28, 0.27, 0.086)
 PAPER_LINKS = (3, 4)
 TYPICAL_PLACE = (0.55, 0.6)  # share of link 3 and of link 4 at which the table has the centres of gravity
-TISSUE_REACH = 1.2  # rad from the rest angle, beyond which a spring that was found in the middle says nothing
+TISSUE_REACH = 2.0  # rad from the rest angle, beyond which a spring that was found in the middle says nothing
 MAX_TISSUE = 4.0  # Nm/rad; the motors push a joint away from its rest angle with what the tissue does not have of it
 
 

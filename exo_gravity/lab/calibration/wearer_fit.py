@@ -30,6 +30,7 @@ class WearerPrior:
     mass: float = 0.15  #: share of the whole mass, against that which the moments have at the table's places
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses
+    offset: float = 1.0  #: rad, farthest of a rest angle from the middle of the poses: beyond, it is no spring
     least_gain: float = 4.0  #: of the sum of squares that a spring must explain: 2 for each of its two numbers
     breathing: float = 0.1  #: Nm: standard deviation by which a relaxed, breathing person differs from pose to pose
     same_pose: float = 0.05  #: rad, within which two poses are visits of one
@@ -96,14 +97,17 @@ def fit_wearer(
     whole, least = solved(every)
     asked = np.array([solved(every & (np.arange(count) != n))[1] - least > PRIOR.least_gain for n in range(count)])
     best, _ = solved(asked & (whole[moments : moments + count] > 0.0))
-    stiffness = np.maximum(best[moments : moments + count], 0.0)
-    at_middle = best[moments + count :]
+    for _ in range(count):  # without what is no spring
+        stiffness, at_middle = best[moments : moments + count], best[moments + count :]
+        way = np.divide(at_middle, stiffness, out=np.zeros(count), where=stiffness > 0.0)
+        best, _ = solved((stiffness > 0.0) & (np.abs(way) <= PRIOR.offset))
+    stiffness, at_middle = np.maximum(best[moments : moments + count], 0.0), best[moments + count :]
     rest = middle - np.divide(at_middle, stiffness, out=np.zeros(count), where=stiffness > 0.0)
     remainder = torque - (_with_springs(columns, theta, middle) @ best)
     freedom = max(1.0, torque.size - moments - 2.0 * np.count_nonzero(asked))
     factor = max(1.0, float(np.sum((remainder / sigma) ** 2)) / freedom)
     covariance = factor * np.linalg.inv(matrix.T @ matrix)
-    return WearerFit(best[:moments], stiffness, np.clip(rest, -np.pi, np.pi), covariance, middle, remainder)
+    return WearerFit(best[:moments], stiffness, rest, covariance, middle, remainder)
 
 
 def unrest(theta: np.ndarray, torque: np.ndarray) -> tuple[int, np.ndarray]:
