@@ -49,7 +49,8 @@ def motor_torques(bridge: Mapping[str, Any]) -> np.ndarray:
     """
     names = ("torque_scale", "torque_scale_slope", "torque_scale_temperature")
     columns = zip(*(bridge[name] for name in names), strict=True)
-    weakest = [min(motor[0], scale_at(*motor, HEAT.most - HEAT.span)) for motor in columns]
+    warm = HEAT.most - HEAT.span
+    weakest = [min(scale, scale_at(scale, slope, reference, warm)) for scale, slope, reference in columns]
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
     scale = np.minimum(four_floats("torque_scale", weakest, 0.1, 2.0), 1.0)
     torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in bridge["motor"]]

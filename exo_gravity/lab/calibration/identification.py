@@ -289,4 +289,6 @@ def _fit(speed: np.ndarray, torque: np.ndarray, stribeck_speed: float, load: np.
     inverse = np.linalg.pinv(matrix)
     is_used = matrix.any(axis=0)
     values, errors = is_used * (inverse @ torque), is_used * np.sqrt(np.square(inverse).sum(axis=1))
-    return FrictionCurve(speed, torque, load, matrix @ values, *values.tolist(), stribeck_speed, tuple(errors.tolist()))
+    coulomb, viscous, stribeck, share = values.tolist()
+    found = coulomb, viscous, stribeck, share, stribeck_speed, tuple(errors.tolist())
+    return FrictionCurve(speed, torque, load, matrix @ values, *found)

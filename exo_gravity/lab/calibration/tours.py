@@ -240,7 +240,7 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
     now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
-    lines, refusals = [], []
+    lines, refusals = list[str](), list[str]()
     for n, name in enumerate(arm.joint_names):
         if band[n] > CHECK.widest:
             lines.append(f"{name}: these poses show too little of its torque: {held[:, n].round(2).tolist()} Nm")
