@@ -22,6 +22,8 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio
 
 from .support import ROOT
@@ -105,6 +107,81 @@ def test_the_notebook_leads_to_drift_effort_and_the_share_that_was_set():
     for row, hold in zip(variables["effort"].to_numpy(), variables["analysis"].holds, strict=True):
         expected = np.abs(torque(np.array([hold.pose]), np.array([(0.0, 0.0, 1.0)]))[0])
         np.testing.assert_allclose(row / 100.0 * (3.0, 9.0, 3.0, 3.0), expected, atol=0.05)
+
+
+def cascade() -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "examples" / "admittance.py"))
+
+
+@pytest.mark.thorough
+def test_the_cascade_takes_work_off_a_wearer_who_reaches_and_lets_the_arm_go_where_they_lead_it():
+    variables = cascade()
+    (_, led, alone), (_, poses, assisted) = (map(np.array, variables["reach"](is_on)) for is_on in (False, True))
+    assert variables["effort_of"](assisted) < 0.8 * variables["effort_of"](alone)
+    assert np.degrees(np.abs(poses - led)).max() < 10.0
+
+
+def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_damps_what_moves_by_itself():
+    variables, still = cascade(), [0.0] * 4
+    robot, worn = ROBOT.links, ROBOT.worn_links(*LOAD)
+
+    def after(seconds: float, velocity: list[float], wearer: list[float], deviation: float) -> np.ndarray:
+        loop = variables["Admittance"](robot, worn)
+        for _ in range(round(seconds / variables["PERIOD"])):
+            efforts = loop.step([0.3] * 4, velocity, wearer, [deviation] * 4)
+        return np.array(efforts)
+
+    push = [1.0, -1.0, 1.0, -1.0]
+    assert not after(1.0, still, push, deviation=0.6).any()  # perhaps an error of the model
+    assert np.all(after(0.02, still, push, deviation=0.0) * push > 0.5)
+    assert np.all(after(0.5, push, still, deviation=0.0) * push < 0.0)
+    assert after(9.0, still, [99.0, -99.0, 99.0, 99.0], deviation=0.0).tolist() == [1.0, -2.0, 1.0, 1.0]  # as a spring
+
+
+@pytest.fixture
+def admittance() -> Iterator[tuple[Any, ...]]:
+    """A node with the cascade for the arm of three_joints.yaml, one that plays its arm, and a wait as of `emg`."""
+    rclpy.init()
+    variables = cascade()
+    carried = carried_arm(load(packaged_config("three_joints.yaml")), "/right")
+    node = variables["AdmittanceNode"]("/right", carried.limits.joint_names, carried.settings)
+    arm, executor = rclpy.create_node("arm", namespace="/right"), SingleThreadedExecutor()
+    for each in (node, arm):
+        executor.add_node(each)
+
+    def wait(condition: Callable[[], bool], seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
+        return condition()
+
+    yield node, arm, wait
+    executor.shutdown()
+    node.destroy_node()
+    arm.destroy_node()
+    rclpy.try_shutdown()
+
+
+@pytest.mark.thorough
+def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_torque_is_known(admittance):
+    node, arm, wait = admittance
+    heard: list[JointState] = []
+    arm.create_subscription(JointState, "assist_efforts", heard.append, 10)
+    names = node.names
+    parts = {
+        "joint_states": JointState(name=names[::-1], position=[0.1] * 3, velocity=[0.0] * 3),
+        "wearer_efforts": JointState(name=names, effort=[0.0, 2.0, 0.0]),
+        "wearer_efforts_std": JointState(name=names, effort=[0.1] * 3),
+    }
+    publishers = {topic: arm.create_publisher(JointState, topic, 1) for topic in parts}
+    timers = {topic: arm.create_timer(0.01, lambda t=topic: publishers[t].publish(parts[t])) for topic in parts}
+    assert wait(lambda: any(message.effort[1] > 0.5 for message in heard), 30.0)
+    assert list(heard[-1].name) == names and heard[-1].effort[0] == heard[-1].effort[2] == 0.0
+    timers["wearer_efforts"].cancel()
+    wait(lambda: False, 0.5)
+    count = len(heard)
+    wait(lambda: False, 0.3)
+    assert len(heard) == count
 
 
 def example() -> dict[str, Any]:

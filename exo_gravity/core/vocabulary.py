@@ -228,7 +228,7 @@ class NoEstimate(Word):
     NO_COMPENSATOR = "no_compensator"
     NO_PARAMETERS = "no_parameters"
     REFUSED_PARAMETERS = "refused_parameters"
-    NO_WEARER = "no_wearer"
+    NO_DESCRIPTION = "no_description"
     NO_JOINT_STATES = "no_joint_states"
     INCOMPLETE_JOINT_STATES = "incomplete_joint_states"
     NO_TILT = "no_tilt"

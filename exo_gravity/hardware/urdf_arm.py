@@ -35,7 +35,7 @@ from exo_gravity.core.arm.arm import (
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ParameterError, with_extra
 from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 
@@ -323,5 +323,5 @@ def _pinocchio() -> Any:
     try:
         import pinocchio
     except ImportError:
-        raise ParameterError("law", "urdf", "used with Pinocchio: pip install 'exo_gravity[urdf]'") from None
+        raise ParameterError("law", "urdf", f"used with Pinocchio: {with_extra('urdf')}") from None
     return pinocchio

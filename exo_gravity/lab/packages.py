@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.errors import ExoGravityError, with_extra
 
 # Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
 APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl", "yaml")
@@ -26,7 +26,7 @@ def missing(module: str, extra: str) -> str:
     """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
     module = module.partition(".")[0]
     apt = f"apt install python3-{module}, or " if module in APT else ""
-    return f"the Python package {module} is not installed: {apt}pip install 'exo_gravity[{extra}]'"
+    return f"the Python package {module} is not installed: {apt}{with_extra(extra)}"
 
 
 def check_packages(executables: Iterable[str]) -> None:

@@ -26,7 +26,6 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
@@ -119,8 +118,9 @@ def wearers(nodes: Nodes) -> list[str]:
     found = []
     for node, values in nodes.items():
         namespace, _, name = node.rpartition("/")
-        is_worn = values.get("law") != URDF_LAW and values.get("command_interface") != "multi_array"
-        if name == "compensator" and is_worn and f"{namespace}/wearer" not in nodes:
+        if values.get("command_interface") == "multi_array":
+            continue  # an arm of ros2_control
+        if name == "compensator" and f"{namespace}/wearer" not in nodes:
             found.append(f"{namespace}/wearer")
     return found
 

@@ -27,6 +27,7 @@ KEYS: Mapping[str, frozenset[str]] = {
     "marker": frozenset({"text"}),
     # of the page that holds control
     "enable": ARM,
+    "activate": ARM,  # and enable: an arm whose bridge waits for its operator
     "clear_fault": ARM,
     "resume": ARM,  # clear and enable, after a fault that leaves nothing to repair
     "confirm_pose": ARM,  # the arm hangs as it is drawn
@@ -182,7 +183,7 @@ class Control:
                 return self._refused(page, 403, f"{text}: another page holds control")
             if arm and (other := self.arms.other_holder(arm, str(page))):
                 return self._refused(page, 403, f"{text}: {other} holds control of this arm")
-        if kind in ("enable", "resume"):  # by a page that confirms nothing, the arm is not carried for long
+        if kind in ("enable", "activate", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
         try:
             problem = await self._carry_out(request, kind, arm, page)

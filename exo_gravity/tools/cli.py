@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.errors import ExoGravityError, with_extra
 from exo_gravity.lab.packages import extras
 
 
@@ -50,6 +50,6 @@ def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
 def require_ros(tool: str) -> None:
     """End `tool` with exit code 2 and one line if ROS 2's Python library is not found."""
     if not find_spec("rclpy"):
-        remedy = "source /opt/ros/jazzy/setup.bash, or without ROS: pip install 'exo_gravity[ros]'"
+        remedy = f"source /opt/ros/jazzy/setup.bash, or without ROS: {with_extra('ros')}"
         print(f"{tool}: the Python package rclpy is not found: {remedy}", file=sys.stderr)
         raise SystemExit(2)

@@ -95,7 +95,8 @@ def outer_loops(context):
     for arm in ("left", "right"):
         node = rclpy.create_node("outer_loop", namespace=arm, context=context)
         node.create_publisher(JointState, "assist_efforts", 1)
-        node.create_subscription(JointState, "joint_states", lambda message: None, 1)
+        for topic in ("joint_states", "wearer_efforts", "wearer_efforts_std"):
+            node.create_subscription(JointState, topic, lambda message: None, 1)
         node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: None, 1)
         executor.add_node(node)
     return executor

@@ -15,14 +15,18 @@ import pytest
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.nodes.ros.messages import to_nanoseconds
+from exo_gravity.nodes.ros.subscriptions import LATCHED
 
 from ..support.joint_state_feeder import PARTS, POSE
 from ..support.launched_nodes import NO_IMU
+from ..support.urdf_oracle import MujocoArm
 
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -39,9 +43,15 @@ NONE = ["0.0"] * len(PARTS)  # Nm
 class StillArm:
     """Publishes the joint states of a still arm every 5 ms; `effort` of its motors in Nm. Stamps count them in ns."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(
+        self,
+        node: Node,
+        names: Sequence[str] = tuple(f"right_{part}" for part in PARTS),
+        pose: Sequence[float] = POSE,
+    ) -> None:
         self.effort: Sequence[float] = ()
-        self.velocity: Sequence[float] = (0.0,) * 4
+        self.velocity: Sequence[float] = (0.0,) * len(names)
+        self._names, self._pose = names, pose
         self.sinking = 0.0  # rad every 5 ms, of the abduction
         self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
         self._stopping = threading.Event()
@@ -49,7 +59,7 @@ class StillArm:
         self._thread.start()
 
     def _publish(self) -> None:
-        message, number = JointState(name=[f"right_{part}" for part in PARTS], position=POSE, velocity=[0.0] * 4), 0
+        message, number = JointState(name=self._names, position=self._pose), 0
         while not self._stopping.wait(0.005):
             number += 1
             message.header.stamp = Time(nanoseconds=number).to_msg()
@@ -115,6 +125,25 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_th
     assert len(found[""]) == told
     os.kill(nodes.pid("compensator"), signal.SIGCONT)
     probe.wait_until(lambda: torques() == NONE and len(found[""]) > told)
+
+
+def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arrives(launch, probe):
+    names, pose, given = ["abduction", "flexion", "elbow"], [0.4, 0.5, 0.7], np.array((1.0, -2.0, 0.5))
+    text = packaged_config("arms/three_joints.urdf").read_text(encoding="utf-8")
+    found: list[JointState] = []
+    probe.node.create_subscription(JointState, "/right/wearer_efforts", found.append, 100)
+    from_topic = {"urdf": {"topic": "/robot_description", "hand": "hand"}}
+    launch(base="three_joints.yaml", without=OTHER_NODES, compensator=from_topic, wearer=True)
+    probe.node.create_publisher(String, "/robot_description", LATCHED).publish(String(data=text))
+    three = StillArm(probe.node, names, pose)
+    try:
+        three.effort = (MujocoArm(text, names).torque(pose, (0.0, 0.0, -9.80665)) - given).tolist()
+        probe.wait_until(lambda: len(found) > 50)
+    finally:
+        three.close()
+    assert list(found[-1].name) == names
+    assert found[-1].effort == pytest.approx(given, abs=1e-6)
+    assert probe.diagnostic("wearer", "budget") == "unknown"
 
 
 def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(launch, probe, arm):

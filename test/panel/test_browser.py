@@ -58,6 +58,17 @@ def test_enable_asks_once_and_says_what_will_happen_also_beyond_rated_torque(vis
     confirm(page, "More than rated torque")
 
 
+def test_an_arm_whose_bridge_waits_for_its_operator_is_activated_with_the_button_and_question_of_enable(visit, stage):
+    stage.arms.states["right"] = "inactive"
+    page = visit()
+    wait_for_state(page, "inactive")
+    page.wait_for_selector(of_arm(".remedy:has-text('press Enable')"))
+    page.click(of_arm(".enable"))
+    confirm(page, "takes its weight")
+    wait_for_state(page, "active")
+    assert stage.arms.calls == [("activate", "right")]
+
+
 def test_a_question_is_about_the_settings_at_the_press_and_is_asked_again_where_they_change_meanwhile(visit, stage):
     page, settings = visit(), stage.arms.settings["right"]
     page.wait_for_selector(of_arm(".mark:not([hidden])"), state="attached")

@@ -58,6 +58,7 @@ RIGHT = [
     {"do": "let_down"},
     {"do": "let_down", "arm": "left"},
     {"do": "enable", "arm": "right"},
+    {"do": "activate", "arm": "right"},
     {"do": "trial", "name": "demo"},
     {"do": "take"},
 ]
@@ -127,7 +128,7 @@ def test_every_page_lets_down_and_only_the_one_in_control_does_anything_else(pan
         assert panel.arms.calls == DOWN
         assert panel.status(page, "let_down", "left") == 200
         assert panel.arms.calls[-1] == ("let_down", "left")
-    for kind in ("enable", "clear_fault", "resume", "confirm_pose"):
+    for kind in ("enable", "activate", "clear_fault", "resume", "confirm_pose"):
         panel.arms.calls.clear()
         assert [panel.status(page, kind, "right") for page in (panel.second, "", "guessed")] == [403] * 3
         assert panel.arms.calls == []

@@ -13,6 +13,8 @@ from typing import Any
 import httpx
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from websockets.sync.client import ClientConnection, connect
@@ -60,6 +62,7 @@ class PlayedArm:
         self.leases: set[tuple[str, str]] = set()
         self.holder = "nobody"
         self.asked: list[tuple[str, Any]] = []
+        self.lifecycle = State.PRIMARY_STATE_UNCONFIGURED
         self._thread = NodeThread("can_bridge", "compensator", namespace="right")
         self.bridge, self.compensator = self._thread.nodes
         self.close = self._thread.close
@@ -67,6 +70,8 @@ class PlayedArm:
         self.compensator.declare_parameter("support", 0.1)
         self.bridge.create_service(SetBool, "~/enable", self._on_enable)
         self.bridge.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
+        self.bridge.create_service(GetState, "~/get_state", self._on_get_state)
+        self.bridge.create_service(ChangeState, "~/change_state", self._on_change_state)
         self.bridge.create_subscription(KeyValue, "~/control", self._on_control, 10)
         self._states = self.bridge.create_publisher(JointState, "joint_states", 1)
         self._statuses = self.bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
@@ -87,6 +92,20 @@ class PlayedArm:
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.asked.append(("enable", request.data))
         response.success = True
+        return response
+
+    def _on_get_state(self, request: GetState.Request, response: GetState.Response) -> GetState.Response:
+        response.current_state = State(id=self.lifecycle, label="played")
+        return response
+
+    def _on_change_state(self, request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+        self.asked.append(("change_state", request.transition.id))
+        after = {
+            (State.PRIMARY_STATE_UNCONFIGURED, Transition.TRANSITION_CONFIGURE): State.PRIMARY_STATE_INACTIVE,
+            (State.PRIMARY_STATE_INACTIVE, Transition.TRANSITION_ACTIVATE): State.PRIMARY_STATE_ACTIVE,
+        }.get((self.lifecycle, request.transition.id))
+        response.success = after is not None
+        self.lifecycle = after or self.lifecycle
         return response
 
     def _on_clear_fault(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -147,12 +166,20 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
                 message(connection, "state", lambda _: True)
             assert ask(do="enable", arm="right") == (200, "")
             assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
+            for begin in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE):
+                arm.lifecycle = begin
+                assert ask(do="activate", arm="right") == (200, "")
+                assert arm.lifecycle == State.PRIMARY_STATE_ACTIVE
+            refusal = "the bridge does not wait for its operator: it is played"
+            assert ask(do="activate", arm="right") == (409, refusal)
             assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")
             answer = httpx.get(panel.url + "settings/right", verify=False)  # also before the panel has heard of it
             assert answer.json() == {"settings": {"support": 0.2}}
             message(connection, "setup", lambda setup: is_known(setup, 0.2))
             assert ask(do="let_down") == (200, "")
-            assert arm.asked == [("enable", True), ("clear_fault", None), ("enable", False)]
+            steps = (Transition.TRANSITION_CONFIGURE, *[Transition.TRANSITION_ACTIVATE] * 2)
+            activated = [("change_state", step) for step in steps]
+            assert arm.asked == [("enable", True), ("clear_fault", None), *activated, ("enable", False)]
         finally:
             arm.close()
         message(connection, "state", lambda state: state["arms"]["right"]["bridge"] is None)

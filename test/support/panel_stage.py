@@ -35,7 +35,13 @@ WEARER_FILE = {
     "limits.upper": [0.5, 1.5, 1.5, 2.0],
 }
 POWERED = ("proving signs", "ramping in", "active", "letting down")
-STATE_AFTER = {"let_down": "letting down", "enable": "active", "resume": "active", "clear_fault": "disabled"}
+STATE_AFTER = {
+    "let_down": "letting down",
+    "enable": "active",
+    "activate": "active",
+    "resume": "active",
+    "clear_fault": "disabled",
+}
 
 
 @dataclass

@@ -102,4 +102,4 @@ def test_a_missing_package_is_named_with_the_extra_that_installs_it(run, monkeyp
         run("--body-mass", 75, "--support", 0.068)
     assert ended.value.code == 2
     text = capsys.readouterr().err
-    assert "matplotlib is not installed" in text and "exo_gravity[report]" in text
+    assert "matplotlib is not installed" in text and "'.[report]'" in text

@@ -45,7 +45,7 @@ WRONG = [
     ("validate", ["--output", "taken.html/folder"], "taken.html"),
 ]
 WITHOUT = {  # by tool: the package, words that need it, and how it is installed
-    "report": ("rosbags.typesys", ["b"], "exo_gravity[report]"),
+    "report": ("rosbags.typesys", ["b"], ".[report]"),
     "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
     "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
     "doctor": ("rich", ["--seconds", "0"], "python3-rich"),
@@ -102,7 +102,7 @@ def test_a_node_whose_package_is_missing_ends_with_one_sentence_in_place_of_a_tr
     program = NODE.format(module=module, node=node, where=node_modules()[node])
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100)
     (line,) = ended.stderr.splitlines()
-    assert ended.returncode == 2 and module in line and f"pip install 'exo_gravity[{extra}]'" in line
+    assert ended.returncode == 2 and module in line and f"pip install '.[{extra}]' in the source folder" in line
 
 
 @pytest.mark.parametrize("node", node_modules())

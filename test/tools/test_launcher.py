@@ -193,12 +193,12 @@ def test_bridges_stop_first_and_recorders_last():
         ({"/right/compensator": {}, "/left/compensator": {"law": "anfis"}}, ["/right/wearer", "/left/wearer"]),
         ({"/compensator": {}, "/right/can_bridge": {}}, ["/wearer"]),
         ({"/right/compensator": {}, "/right/wearer": {}}, []),
-        ({"/right/compensator": {"law": "urdf"}}, []),
+        ({"/right/compensator": {"law": "urdf"}}, ["/right/wearer"]),
         ({"/right/compensator": {"command_interface": "multi_array"}}, []),
     ],
     ids=["both arms", "no namespace", "a key of its own", "another arm", "ros2_control"],
 )
-def test_a_compensator_of_our_own_arm_gets_a_wearer_unless_the_file_has_one(nodes, added):
+def test_a_compensator_behind_a_bridge_gets_a_wearer_unless_the_file_has_one(nodes, added):
     assert wearers(nodes) == added
 
 
@@ -250,7 +250,8 @@ def test_a_node_whose_package_is_missing_is_refused_before_any_starts(monkeypatc
     monkeypatch.setattr(packages, "find_spec", lambda name: None)
     error = refused({})
     assert error == (
-        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install 'exo_gravity[sim]'\n"
+        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install '.[sim]' in the "
+        "source folder of exo_gravity\n"
     )
 
 

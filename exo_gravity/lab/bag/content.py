@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from exo_gravity.core.errors import with_extra
 from exo_gravity.core.params import Param, params_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.source import source_of
@@ -126,7 +127,7 @@ class Bag:
         try:
             import pandas
         except ModuleNotFoundError:
-            sentence = "to_frame needs pandas, which is not installed: pip install 'exo_gravity[analysis]'"
+            sentence = f"to_frame needs pandas, which is not installed: {with_extra('analysis')}"
             raise ModuleNotFoundError(sentence, name="pandas") from None
         return pandas.DataFrame(self.columns())
 

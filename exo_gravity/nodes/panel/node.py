@@ -18,6 +18,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import Vector3Stamped
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
@@ -31,6 +33,7 @@ from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.bag.content import MARKERS
+from exo_gravity.lab.packages import missing
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run
@@ -48,6 +51,7 @@ class PanelTiming:
     discovery_period: float = 0.5  #: s between two searches for nodes
     silent: float = 1.5  #: s without diagnostics or joint states after which the last ones are not shown any more
     call_timeout: float = 3.0  #: s, longer than can_bridge itself waits
+    transition_timeout: float = 15.0  #: s in which can_bridge opens its buses and starts its watchdog
     absent_timeout: float = 0.5  #: s, where the service seems to be absent
     look_period: float = 0.005  #: s between two looks for an answer
 
@@ -70,6 +74,10 @@ ASKED = {  # service and request for each request of a page; None for the parame
     "set": (SetParametersAtomically, f"{COMPENSATOR}/{SET}", None),
     "perform": (SetParametersAtomically, f"{SIMULATOR}/{SET}", None),  # of no page
 }
+STEPS = {  # from the state of a bridge that waits for its operator to the one in which it drives its motors
+    State.PRIMARY_STATE_UNCONFIGURED: (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE),
+    State.PRIMARY_STATE_INACTIVE: (Transition.TRANSITION_ACTIVATE,),
+}
 
 
 class ArmClient:
@@ -78,8 +86,24 @@ class ArmClient:
     def __init__(self, node: Node, name: str) -> None:
         self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
         self.settings = node.create_client(GetParameters, f"/{name}/{COMPENSATOR}/get_parameters")
+        self._lifecycle = node.create_client(GetState, f"/{name}/{BRIDGE}/get_state")
+        self._transitions = node.create_client(ChangeState, f"/{name}/{BRIDGE}/change_state")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
+
+    async def activate(self) -> str:
+        """Configure the bridge if it is not, and activate it, which enables the arm; return '' or why not."""
+        try:
+            state = (await answer_of(self._lifecycle, GetState.Request())).current_state
+            if state.id not in STEPS:
+                return f"the bridge does not wait for its operator: it is {state.label}"
+            for step in STEPS[state.id]:
+                request = ChangeState.Request(transition=Transition(id=step))
+                if not (await answer_of(self._transitions, request, TIMING.transition_timeout)).success:
+                    return "the bridge could not be activated: its log says why"
+        except ExoGravityError as error:
+            return str(error)
+        return ""
 
 
 class Arms:
@@ -165,6 +189,8 @@ class Arms:
 
     async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
         """Do what a page asks of one arm. The request is sent even where the service seems to be absent."""
+        if kind == "activate":
+            return await self.clients[arm].activate()
         if kind == "bring_home":
             if f"/{arm}/{SIMULATOR}" not in self._others.found:
                 return "the arm is not simulated"
@@ -198,10 +224,10 @@ class Arms:
             self._others.found[event.node].refresh()
 
 
-async def answer_of(client: Client, request: Any) -> Any:
-    """Send `request` at once; return the response. Raises ExoGravityError if there is none."""
+async def answer_of(client: Client, request: Any, timeout: float = TIMING.call_timeout) -> Any:
+    """Send `request` at once; return the response. Raises ExoGravityError if there is none within `timeout` s."""
     sent = client.call_async(request)
-    deadline = time.monotonic() + (TIMING.call_timeout if client.service_is_ready() else TIMING.absent_timeout)
+    deadline = time.monotonic() + (timeout if client.service_is_ready() else TIMING.absent_timeout)
     while not sent.done():
         if time.monotonic() > deadline:
             client.remove_pending_request(sent)
@@ -248,8 +274,7 @@ class Panel(Node):
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:
-            missing = f"the Python package {error.name} is not installed: pip install 'exo_gravity[panel]'"
-            raise ExoGravityError(missing) from None
+            raise ExoGravityError(missing(error.name or "", "panel")) from None
         self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(TIMING.state_period, self._send_state)
         self.create_timer(TIMING.discovery_period, self._arms.discover)

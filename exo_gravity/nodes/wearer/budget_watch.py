@@ -12,6 +12,7 @@ from typing import Any
 from rclpy.node import Node
 
 from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
@@ -46,6 +47,9 @@ class BudgetWatch:
 
         names: of the joints (n,).
         """
+        if settings.law == URDF_LAW:
+            self.result = Reason(Budget.UNKNOWN, "unknown: the budget is for the paper's arm alone")
+            return
         self._bridge.update()
         if self._job is not None:
             if self._job.done():

@@ -9,6 +9,7 @@ It reads `joint_states`, the trunk's motion and the compensator's parameters, 10
 
 No arm comes down if it ends or is late: without a fresh request the compensator returns to its parameter `support`.
 While the compensator is silent, or its parameters are not known, nothing is published, and /diagnostics says why.
+An arm from a URDF (`law: urdf`) is read from the compensator's own file or topic.
 """
 
 import math
@@ -19,23 +20,25 @@ from typing import Any
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import Settings, settings_of
+from exo_gravity.core.compensation.settings import Settings, settings_of, urdf_settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, NONE, Adapts, NoEstimate, Reason, WearerState
+from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import PeriodicThread, PolledSubscription, TiltSubscription
+from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread, PolledSubscription, TiltSubscription
 from exo_gravity.nodes.wearer.budget_watch import BudgetWatch
 
 COMPENSATOR = "compensator"
@@ -103,6 +106,10 @@ class WearerNode(Node):
         self._settings: Settings | None = None
         self._fixed: tuple[object, ...] = ()
         self._refusal = NO_REASON
+        # Of an arm from a URDF: its text where it comes from a topic, and the arm, None for the paper's.
+        self._description = ""
+        self._descriptions: Any = None  # the topic's subscription
+        self._urdf: UrdfArm | None = None
         # What is read and reported, once the parameters are known.
         self._names: list[str] = []
         self._joint_states: PolledSubscription | None = None
@@ -143,15 +150,15 @@ class WearerNode(Node):
 
     def _on_parameters(self, _name: str, values: dict[str, Any]) -> None:
         """Use the compensator's parameters, or note why they cannot be used."""
-        if values["law"] == URDF_LAW:
-            no_wearer = f"law {URDF_LAW}: there is no wearer to estimate"
-            self._settings, self._refusal = None, Reason(NoEstimate.NO_WEARER, no_wearer)
-            return
         try:
-            settings = settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
+            settings = self._read(values)
         except ParameterError as error:
             self._settings = None
             self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {error}")
+            return
+        if settings is None:
+            waiting = f"waiting for the arm's URDF on {values['urdf.topic']}"
+            self._settings, self._refusal = None, Reason(NoEstimate.NO_DESCRIPTION, waiting)
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -171,6 +178,33 @@ class WearerNode(Node):
         if self._trunk:
             self._trunk.apply(settings)
         self._settings, self._refusal = settings, NO_REASON
+
+    def _read(self, values: dict[str, Any]) -> Settings | None:
+        """Return the settings of the compensator's parameters; None while its URDF has not arrived on its topic.
+
+        Raises ParameterError.
+        """
+        if values["law"] != URDF_LAW:
+            return settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
+        if self._urdf is None:
+            text = read_urdf(values["urdf.file"]) if values["urdf.file"] else self._description
+            if not text:
+                self._listen(values["urdf.topic"])
+                return None
+            self._urdf = UrdfArm(text, values["joint_names"], values["urdf.hand"])
+            if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
+                self._urdf.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
+        return urdf_settings_of(values, self._urdf)
+
+    def _listen(self, topic: str) -> None:
+        """Read the parameters again when the URDF arrives."""
+
+        def on_description(message: String) -> None:
+            self._description = message.data
+            self._compensator.refresh()
+
+        if self._descriptions is None:
+            self._descriptions = self.create_subscription(String, topic, on_description, LATCHED)
 
     def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
         age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
@@ -211,6 +245,8 @@ class WearerNode(Node):
     def _joints(self, message: JointState) -> list[tuple[float, ...]] | None:
         """Return positions, velocities and efforts (n,); None if one is missing."""
         try:
+            if self._urdf:
+                self._urdf.follow(message.name, message.position)
             return [by_name(message, field, self._names, exact=False) for field in ("position", "velocity", "effort")]
         except ParameterError:
             return None

@@ -4,7 +4,7 @@ import { showLoad, showShare } from "./load.js";
 import { changes, jointText, poseAsked, tell } from "./telling.js";
 import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
-const SIGNS = { disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?", unseen: "?" };
+const SIGNS = { inactive: "○", disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?", unseen: "?" };
 const PAUSE = 300; // ms without a move of the slider after which its support is asked for
 const SETTLING = 2000; // ms after that until the parameters in force are known again
 const FRESH = 700; // ms for which a button that has just appeared takes no press: the finger was on its way to another
@@ -12,7 +12,7 @@ const CARRIED = ["proving signs", "ramping in", "active"];
 const STILL = 0.08; // rad/s; slower joints rest
 const MEAN = 3; // states over which speed and power are averaged: a velocity is noisy
 const RESTED = 1000; // ms at rest after which an arm no longer moves
-const OFF = ["disabled", "checking", "fault"]; // the motors are off
+const OFF = ["inactive", "disabled", "checking", "fault"]; // the motors are off
 
 export class ArmCard {
   constructor(name, actions) {

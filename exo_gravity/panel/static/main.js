@@ -108,7 +108,7 @@ const actions = {
       const text = `${t("enable_ask")} ${t(`enable_mode.${card.mode}`, percent(card))} ${over}`;
       return [t("enable_arm", card.armText()), text, t("enable")];
     });
-    if (isSure) send({ do: "enable", arm: card.name });
+    if (isSure) send({ do: card.state === "inactive" ? "activate" : "enable", arm: card.name });
   },
   async mode(card, mode) {
     if (mode === card.mode) return;
@@ -193,7 +193,7 @@ function showBar() {
     chips.children[n].toggleAttribute("data-moves", card.moves);
     write(chips.children[n], card.summary());
   });
-  const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => card.state === "disabled");
+  const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => ["disabled", "inactive"].includes(card.state));
   byId("let-down").toggleAttribute("data-off", off);
   write(byId("let-down-hint"), t(off ? "let_down_off" : "let_down_hint"));
   const { on, foreign, seconds } = state.recording;

@@ -48,7 +48,7 @@ export function tell(arm, name, state, moving, isSimulated) {
 const join = (texts) => texts.filter(Boolean).join(" ");
 
 function actionOf(name, bridge) {
-  if (name === "disabled") return "enable";
+  if (name === "disabled" || name === "inactive") return "enable";
   if (name === "fault") return bridge.resume === "possible" ? "resume" : "clear";
   return poseAsked(bridge) ? "look" : "down";
 }
