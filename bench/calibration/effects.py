@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 os.environ["OMP_NUM_THREADS"] = "1"
@@ -124,7 +124,7 @@ class Device:
         self, poses: int, temperature: float, load: tuple[float, float], stand: tuple[float, float]
     ) -> list[Observation]:
         mass, lever = load
-        worn = {"wearer_mass": (0.0, 0.0, 0.0, mass), "wearer_cog": (0.0, 0.0, 0.0, lever)}
+        worn: dict[str, Any] = {"wearer_mass": (0.0, 0.0, 0.0, mass), "wearer_cog": (0.0, 0.0, 0.0, lever)}
         arm = SimulatedArm(ArmConfig(**self.mechanics, **worn))
         device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in self.motors])
         for motor in device.motors:
@@ -143,7 +143,7 @@ class Device:
     def judged(self, observations: list[Observation], temperature: float) -> tuple[Judged, tuple[int, int]]:
         """Return how the file that these give holds the arm with motors at `temperature` degC, and what it has."""
         result = moments_from(ARM, observations)
-        given = {change.name: change.value for change in result.changes}
+        given: dict[str, Any] = {change.name: change.value for change in result.changes}
         none = [0.0] * len(ASSUMED)
         spring = JointSpring(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
         slope = given.get("torque_scale_slope", none)

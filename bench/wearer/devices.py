@@ -192,7 +192,7 @@ def _of_effect(seed: int, effect: str) -> tuple[dict[str, np.ndarray], float]:
     """Return what the simulated wearer has beyond masses on the links, and the share that they carry."""
     rng, worn = np.random.default_rng(8000 + seed), np.array((0.0, 0.0, 1.0, 1.0))
     angle, rest, carried = rng.uniform(0.0, 2.0 * np.pi, 4), rng.uniform(-REST_SPREAD, REST_SPREAD, 4), rng.uniform()
-    person = {}
+    person: dict[str, np.ndarray] = {}
     if effect in ("beside", "all"):
         person |= {"wearer_cog_y": BESIDE * worn * np.cos(angle), "wearer_cog_z": BESIDE * worn * np.sin(angle)}
     if effect in ("springs", "all"):

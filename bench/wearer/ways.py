@@ -159,7 +159,7 @@ def seen_of(worn: Worn) -> Seen:
         share = share_of(curve)
         bands.append(COVER * float(share.deviation))
         share_covered.append(abs(float(share.value)) <= bands[-1])
-    return Seen(*map(np.array, (left, covered, share_covered, bands)), bool(worn.refusals))
+    return Seen(np.array(left), np.array(covered), np.array(share_covered), np.array(bands), bool(worn.refusals))
 
 
 def seen_by_effect(seed: int) -> list[Seen]:

@@ -397,7 +397,7 @@ def wearer_of(
         if load.mass.sum() > MAX_CARRIED:
             heaviest = f"that of an arm of at most {MAX_CARRIED:g} kg, not {load.mass.sum():.1f}"
             raise ParameterError("wearer.first_moment", moments, heaviest)
-        return load
+        return tuple(load.mass), tuple(load.cog)
     if any(values["wearer.mass"]) or not values["wearer.body_mass"]:
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}

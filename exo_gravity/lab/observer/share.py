@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -73,8 +72,10 @@ class RunningShare:
 
     def __init__(self) -> None:
         # Nm^2, (n,): the means of the joints' parts of both sums, and of the deviation's own and common part
-        self._given: Torque = ()
-        self._carried = self._own = self._common = self._given
+        self._given: tuple[float, ...] = ()
+        self._carried: tuple[float, ...] = ()
+        self._own: tuple[float, ...] = ()
+        self._common: tuple[float, ...] = ()
 
     def update(self, dt: float, estimate: WearerEstimate) -> Shares:
         """Take an estimate, `dt` s after the last; return the shares."""
