@@ -29,7 +29,7 @@ from .node_log import NodeLog
 from .timing import LoopTiming, analyse, split_cycles
 
 POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; on the way between them the torque changes every cycle
-MOVE = 1.0  # s from one pose to the other
+MOVE = 2.0  # s from one pose to the other: slow enough that the safety machine adds no damping
 START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
 THREAD_PRIORITY = {"nodes": 0, "fifo": 50, "one process": 0}  # of the kinds that run the package's nodes

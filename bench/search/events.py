@@ -162,7 +162,7 @@ def push(stage: Stage, torque: list[float], duration: float) -> None:
 
 
 def payload_taken(stage: Stage, mass: float, told: float) -> None:
-    """Let the wearer pick up `mass` kg; the operator enters `told` times that mass as the payload."""
+    """Let the wearer pick up `mass` kg; the operator sets the payload to `told` times that mass."""
     stage.arm.catch_up()
     stage.device.arm.carry(mass)
     stage.change(payload_mass=told * mass)

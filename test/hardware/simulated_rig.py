@@ -16,7 +16,7 @@ from .rig import LIMITS, MOTORS_OF_ARM, POSE, Rig
 
 PERIOD = 0.004  # s
 
-_PORTS = own_ports(30_000)
+_PORTS = own_ports()
 
 
 class SimulatedRig(Rig):

@@ -23,14 +23,14 @@ SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 
 def test_a_bad_parameter_ends_the_launcher_with_one_sentence_and_no_motor_is_enabled(prepare, listen):
-    nodes = prepare(can_bridge={"home": [4.0] * 4})  # test_validation.py has the other refusals
+    nodes = prepare(can_bridge={"homes": [0.2] * 4})  # test_validation.py has the other refusals
     listener = listen(nodes)
     command = [executable("launcher"), "--params", str(nodes.path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode in (1, 2)
     output = done.stdout + done.stderr
-    (sentence,) = [line for line in output.splitlines() if "home" in line]
-    assert "must be " in sentence
+    (sentence,) = [line for line in output.splitlines() if "homes = [0.2" in line]
+    assert "must be one of" in sentence
     assert "Traceback" not in output
     assert ENTER not in [frame.data for frame in listener.frames]
 

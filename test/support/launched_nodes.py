@@ -25,7 +25,7 @@ from .ports import own_ports
 
 Parameters = Mapping[str, Any]
 
-PORTS = own_ports(20_000)
+PORTS = own_ports()
 GROUP, SECOND_GROUP = "239.74.163.2", "239.74.163.3"  # the second is that of an arm's second bus
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0}

@@ -9,8 +9,9 @@ import os
 import socket
 from collections.abc import Iterator
 
-BLOCKS, BLOCK = 25, 400  # blocks, and ports in each
-DOMAINS = 100
+FIRST_PORT = 20_000  # of a bus; those of other programs begin at 32,768
+BLOCKS, BLOCK = 25, 500  # blocks, and ports in each
+DOMAINS = 49  # DDS takes ports from 7,400 on, 250 for each domain: these end below the first of a bus
 
 
 @functools.cache
@@ -33,9 +34,11 @@ def own_domain() -> int:
     return 1 + _claim("domain", DOMAINS)[0]
 
 
-def own_ports(first: int) -> Iterator[int]:
-    """Return every second port of a block of this process's own, from `first` on; the ones between are free too."""
-    return itertools.count(first + BLOCK * _claim("ports", BLOCKS)[0], 2)
+@functools.cache
+def own_ports() -> Iterator[int]:
+    """Return every second port of this process's block, again and again; the ones between are free too."""
+    first = FIRST_PORT + BLOCK * _claim("ports", BLOCKS)[0]
+    return itertools.cycle(range(first, first + BLOCK, 2))
 
 
 def free_port() -> int:

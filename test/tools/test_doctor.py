@@ -21,7 +21,7 @@ from exo_gravity.tools import doctor
 from ..support import CONFIG
 from ..support.ports import own_ports
 
-PORTS = own_ports(20_600)
+PORTS = own_ports()
 IN_TIME = Wakeups(np.full(2500, 1e-4), -20)
 CPU = "sys/devices/system/cpu"
 LINK = {"linkinfo": {"info_kind": "can", "info_data": {

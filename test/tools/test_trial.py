@@ -28,7 +28,7 @@ from ..support.waiting import PATIENCE
 
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
-PORTS = own_ports(30_000)
+PORTS = own_ports()
 
 
 def by_length(path: Path) -> int:

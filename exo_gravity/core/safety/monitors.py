@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the safety machine monitors besides the motors' readings: whether the arm is at rest, and the efforts' age."""
+"""Monitors of the safety machine that read no single motor: whether the arm is at rest, and how old the efforts are."""
 
 import math
 from collections.abc import Sequence

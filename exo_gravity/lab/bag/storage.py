@@ -21,7 +21,7 @@ from io import BytesIO
 from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import lz4.frame
@@ -40,8 +40,10 @@ MAGIC = b"\x89MCAP0\r\n"
 ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
-_FIELDS = {"names": ["size", "channel", "time"], "formats": ["<u8", "<u2", "<u8"], "offsets": [1, 9, 15]}
-HEAD = np.dtype(cast(Any, {**_FIELDS, "itemsize": 31}))  # of a message's record; the serialised message follows
+LAYOUT: Any = {
+    "names": ["size", "channel", "time"], "formats": ["<u8", "<u2", "<u8"], "offsets": [1, 9, 15], "itemsize": 31,
+}  # fmt: skip
+HEAD = np.dtype(LAYOUT)  # of a message's record; the serialised message follows
 LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most
