@@ -49,6 +49,7 @@ def worst_of_peak(result, truth: ArmConfig, tilt: Tilt) -> float:
 
 
 @pytest.mark.thorough
+@pytest.mark.timeout(600)  # minutes of a tour, in virtual time
 @pytest.mark.parametrize("cables", [CABLES, {}], ids=["cables", "none"])
 def test_a_tour_of_an_arm_with_or_without_cables_holds_it_to_1_percent_of_peak(cables) -> None:
     truth = ArmConfig(**cables)
