@@ -118,7 +118,8 @@ def test_the_cascade_takes_work_off_a_wearer_who_reaches_and_lets_the_arm_go_whe
     variables = cascade()
     (_, led, alone), (_, poses, assisted) = (map(np.array, variables["reach"](is_on)) for is_on in (False, True))
     assert variables["effort_of"](assisted) < 0.8 * variables["effort_of"](alone)
-    assert np.degrees(np.abs(poses - led)).max() < 10.0
+    steps = min(len(poses), len(led))  # one of them may end a control cycle later
+    assert np.degrees(np.abs(poses[:steps] - led[:steps])).max() < 10.0
 
 
 def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_damps_what_moves_by_itself():

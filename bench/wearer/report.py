@@ -53,7 +53,7 @@ def verdict(trials: Sequence[Trial]) -> list[Row]:
 def contacts(trial: Trial) -> int:
     """Return how many contacts the estimate shows."""
     watch, curve = ContactWatch(), trial.curve
-    for time, *row in zip(curve.time.tolist(), curve.torque, curve.deviation, curve.weight, strict=True):
+    for time, *row in zip(curve.time.tolist(), *curve[1:], strict=True):
         watch.update(time, WearerEstimate(*(tuple(values.tolist()) for values in row)))
     return watch.count
 
