@@ -102,7 +102,7 @@ def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
     page.click('[data-mode="zero_g"]')
     page.click("#ask-yes")
     probe.wait_until(lambda: probe.diagnostic("compensator", "mode") == "zero_g")
-    page.focus(".support input")
+    page.focus(".support input:enabled")
     page.keyboard.press("ArrowRight")
     probe.wait_until(lambda: float(probe.diagnostic("compensator", "support") or 0.0) == pytest.approx(0.005))
     page.keyboard.press("Space")
