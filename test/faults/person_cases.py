@@ -204,7 +204,7 @@ REQUESTS = (
 )
 CONNECTIONS = (
     FaultCase("CAN IDs of motors 3 and 4 exchanged", await_refusal, ExchangedRig, None, "started",
-        outcomes=("wrong_sign", "sign_unproven", "torque_while_hanging", "disabled"), ends_rig=True),
+        outcomes=("joints_exchanged",), ends_rig=True),
     # Two motors answer each command, and what either reports is taken for what the other applies.
     FaultCase("a second arm with the same IDs on the bus", connect_a_second_arm, limit=None, ends_rig=True,
         steps_from=math.inf, outcomes=("position_jump", "over_speed", "readings_contradict", "torque_not_delivered",
