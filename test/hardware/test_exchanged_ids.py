@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""An arm two of whose motors have each other's CAN ID is refused before it is carried, worn or bare; in virtual time."""
+"""An arm two of whose motors have each other's CAN ID is refused before it is carried, in virtual time."""
 
 from __future__ import annotations
 
