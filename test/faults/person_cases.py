@@ -151,9 +151,12 @@ def refused_again(rig: Rig) -> None:
     NO_ERROR(rig)
 
 
-def await_refusal(rig: Rig) -> None:
-    """Wait until the start has failed."""
+def await_refusal(rig: Rig) -> float:
+    """Wait until the start has failed; return when all motors were on: before, each is switched on and off once."""
+    rig.probe.wait_until(lambda: (newest := rig.truth.newest()) is not None and newest["on"].all(), 30.0)
+    start = time.time()
     rig.probe.wait_until(lambda: rig.probe.state in ("fault", "disabled"), 30.0)
+    return start
 
 
 def connect_a_second_arm(rig: Rig) -> float:
