@@ -175,6 +175,16 @@ def test_of_two_parallel_joints_the_one_nearer_to_the_base_must_be_the_slower_on
     assert code is None or arm.machine.fault.reason.startswith("c moved sooner than d, which it carries: ")
 
 
+def test_efforts_that_are_nan_while_signs_are_proven_compare_no_joints_and_are_refused_before_they_are_applied():
+    arm = YieldingArm((0.5, 0.2, 0.5, 0.2))
+    arm.effort = (math.nan,) * 4
+    arm.enable()
+    while arm.machine.state in (State.CHECKING, State.PROVING):
+        arm.cycle()
+    assert arm.fault_code == "command_impossible"
+    assert max(map(abs, arm.drive.effort)) < 0.1
+
+
 def assert_a_wrong_angle_is_refused(arm):
     """The encoder of an arm that is off is wrong by a turn of the motor: the arm is not carried."""
     arm.changes[1].update(position=math.radians(40.0))  # one turn of an AK80-9's motor

@@ -88,7 +88,7 @@ class JointOrder:
     def exchanged(self) -> tuple[int, ...]:
         """Two joints of which the inner one is quicker, from 0 on; () if there are none."""
         pushed = [i for i, (times, ends) in enumerate(zip(self._times, self._ends, strict=True)) if times and ends]
-        stiffness = self._stiffness(pushed)
+        stiffness = self._stiffness(pushed) if pushed else np.empty((0, 0))
         for inner, outer in combinations(pushed, 2):
             own, shared = stiffness[outer, outer], stiffness[outer, inner]
             are_parallel = own >= JOINT_ORDER.least and shared >= JOINT_ORDER.parallel * own
