@@ -43,7 +43,7 @@ class JointOrderTuning:
 JOINT_ORDER = JointOrderTuning()
 
 
-class End(NamedTuple):
+class Extreme(NamedTuple):
     """Where a joint was farthest while it was pushed."""
 
     angle: float  #: rad
@@ -60,7 +60,7 @@ class JointOrder:
         self._pushed: int | None = None
         self._path: list[tuple[float, float]] = []  # time in s and angle in rad of the joint that is pushed
         self._times: list[list[float]] = [[] for _ in names]  # s, of each push
-        self._ends: list[list[End]] = [[] for _ in names]  # the two ends of each joint's motion while it was pushed
+        self._ends: list[list[Extreme]] = [[] for _ in names]  # the two ends of each joint's motion while it was pushed
 
     def begin(self, i: int) -> None:
         """Note that joint `i` is pushed from now on."""
@@ -76,7 +76,7 @@ class JointOrder:
         self._path.append((sample.time, sample.position))
         if not all(map(math.isfinite, asked)):
             return
-        here = [*ends, End(sample.position, tuple(joint.position for joint in joints), tuple(asked))]
+        here = [*ends, Extreme(sample.position, tuple(joint.position for joint in joints), tuple(asked))]
         ends[:] = min(here), max(here)
 
     def end(self, still: float, moved: float) -> None:
