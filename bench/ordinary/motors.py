@@ -47,6 +47,10 @@ class OrdinaryMotor(SimulatedMotor):
         applied = self.applied if self.entered and not self.unplugged else 0.0
         return applied + self._random.gauss(0.0, self._electronics.torque_noise)
 
+    def damps_at_once(self, torque: float) -> bool:
+        """Return False: the current loop follows."""
+        return False
+
     def _state(self, position: float, velocity: float) -> bytes:
         return super()._state(position, self._speed)
 

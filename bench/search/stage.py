@@ -50,6 +50,10 @@ class FailingMotor(SimulatedMotor):
         torque = super().advance(position, velocity, dt)
         return -torque if self.reversed else torque
 
+    def damps_at_once(self, torque: float) -> bool:
+        """Return whether its damping follows the velocity without delay; see `SimulatedMotor.damps_at_once`."""
+        return not self.reversed and super().damps_at_once(torque)
+
     def _state(self, position: float, velocity: float) -> bytes:
         return super()._state(position, self.speed_factor * velocity)
 

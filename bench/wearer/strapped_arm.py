@@ -62,7 +62,13 @@ class StrappedArm(SimulatedArm):
         self.data.qpos[7:] = theta
         mujoco.mj_forward(self.model, self.data)
 
-    def step(self, torque: Sequence[float], count: int = 1, of_motors: Sequence[float] | None = None) -> None:
+    def step(
+        self,
+        torque: Sequence[float],
+        count: int = 1,
+        of_motors: Sequence[float] | None = None,
+        damping: Sequence[float] = (),
+    ) -> None:
         """Apply `torque` (4,) Nm, which is that of the motors, for `count` times STEP. The base does not turn."""
         model, data = self.model, self.data
         muscles = data.qfrc_applied[7:].copy()

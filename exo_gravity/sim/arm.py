@@ -214,6 +214,7 @@ class SimulatedArm:
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
 
     @property
     def positions(self) -> list[float]:
@@ -246,11 +247,22 @@ class SimulatedArm:
         self._turns = any(angular_velocity) or any(angular_acceleration)
         self._turning_data.qvel[:3], self._turning_data.qacc[:3] = angular_velocity, angular_acceleration
 
-    def step(self, torque: Sequence[float], count: int = 1, of_motors: Sequence[float] | None = None) -> None:
+    def step(
+        self,
+        torque: Sequence[float],
+        count: int = 1,
+        of_motors: Sequence[float] | None = None,
+        damping: Sequence[float] = (),
+    ) -> None:
         """Apply `torque`, (n,) Nm of motors and wearer together, for `count` times STEP.
 
         of_motors: (n,) Nm, the part that gears carry; None: all of it.
+        damping: (n,) Nm s/rad, of the motors, whose part of `torque` follows the velocity within a step; () for none.
         """
+        self._damping[:] = self._viscous
+        if any(damping):
+            self._damping += damping  # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
+            torque = self._velocity * damping + torque
         self._torque[:] = torque
         constant = self._coulomb
         if self._load_share.any():

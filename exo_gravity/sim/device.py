@@ -245,11 +245,14 @@ class SimulatedDevice:
         elapsed = self.time - self._script_start
         given = self.wearer.torque(elapsed, theta, velocity)
         self._follow_trunk(elapsed)
+        damping = [motor.damping for motor in self.motors]
         if self.truth:
-            damping, on = zip(*((motor.damping, motor.entered) for motor in self.motors), strict=True)
+            on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
             self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
-        self.arm.step(list(map(operator.add, torque, given)), count, torque)
+        at_once = [motor.damps_at_once(pull) for motor, pull in zip(self.motors, torque, strict=True)]
+        prompt = list(map(operator.mul, damping, at_once))
+        self.arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
         self._steps += count
 
 

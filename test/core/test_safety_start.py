@@ -103,12 +103,13 @@ def test_an_arm_away_from_home_is_refused_until_it_has_been_carried_once():
 class YieldingArm(SafetyRun):
     """An arm whose joints yield to torque: by `mobility` (4,) rad/s per Nm beyond 0.45 Nm of friction.
 
+    parallel: joints (0..) whose angles add up to the one by which the last of them is asked to lift; () for none.
     largest_effort: Nm of each joint so far.
     """
 
-    def __init__(self, mobility: Sequence[float]) -> None:
+    def __init__(self, mobility: Sequence[float], parallel: Sequence[int] = ()) -> None:
         super().__init__(sign_check_torque=1.5)
-        self.mobility = mobility
+        self.mobility, self.parallel = mobility, parallel
         self.position = [0.0] * 4
         self.largest_effort = [0.0] * 4
 
@@ -119,6 +120,10 @@ class YieldingArm(SafetyRun):
                 excess = effort - max(-0.45, min(0.45, effort))
                 self.position[i] += excess * mobility * PERIOD
                 self.changes[i] = {"position": self.position[i]}
+            if self.parallel:
+                asked = [0.0] * 4
+                asked[self.parallel[-1]] = 3.6 * sum(self.position[i] for i in self.parallel)
+                self.effort = asked
             super().cycle()
         return self
 
@@ -149,6 +154,35 @@ def test_a_joint_that_moves_backwards_or_not_at_all_under_the_test_torque_is_ref
     assert arm.fault_code == code
     assert arm.machine.fault.reason.startswith("c: ")
     assert arm.largest_effort[3] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("mobility", "parallel", "code"),
+    [
+        ((0.5, 0.2, 0.2, 0.5), (2, 3), None),
+        ((0.5, 0.2, 0.5, 0.2), (2, 3), "joints_exchanged"),
+        ((0.5, 0.2, 0.5, 0.2), (3,), None),  # gravity turns the last joint alone: no axis is parallel to its own
+        ((0.5, 0.2, 0.5, 0.2), (), None),
+    ],
+)
+def test_of_two_parallel_joints_the_one_nearer_to_the_base_must_be_the_slower_one(mobility, parallel, code):
+    arm = YieldingArm(mobility, parallel)
+    arm.effort = (0.0,) * 4
+    arm.enable()
+    while arm.machine.state in (State.CHECKING, State.PROVING):
+        arm.cycle()
+    assert arm.fault_code == code
+    assert code is None or arm.machine.fault.reason.startswith("c moved sooner than d, which it carries: ")
+
+
+def test_efforts_that_are_nan_while_signs_are_proven_compare_no_joints_and_are_refused_before_they_are_applied():
+    arm = YieldingArm((0.5, 0.2, 0.5, 0.2))
+    arm.effort = (math.nan,) * 4
+    arm.enable()
+    while arm.machine.state in (State.CHECKING, State.PROVING):
+        arm.cycle()
+    assert arm.fault_code == "command_impossible"
+    assert max(map(abs, arm.drive.effort)) < 0.1
 
 
 def assert_a_wrong_angle_is_refused(arm):
@@ -238,7 +272,7 @@ class Joint:
             self._position += (0.2 * yielding + self._hand(self._now)) * PERIOD
             self._now += PERIOD
             sample = reading(position=self._position, effort=effort, time=self._now)
-            fault = self.check.step(PERIOD, (sample,) * 4)
+            fault = self.check.step(PERIOD, (sample,) * 4, (0.0,) * 4)
             if fault or self.check.done:
                 return fault
         return None

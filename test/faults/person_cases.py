@@ -151,9 +151,12 @@ def refused_again(rig: Rig) -> None:
     NO_ERROR(rig)
 
 
-def await_refusal(rig: Rig) -> None:
-    """Wait until the start has failed."""
+def await_refusal(rig: Rig) -> float:
+    """Wait until the start has failed; return when all motors were on: before, each is switched on and off once."""
+    rig.probe.wait_until(lambda: (newest := rig.truth.newest()) is not None and newest["on"].all(), 30.0)
+    start = time.time()
     rig.probe.wait_until(lambda: rig.probe.state in ("fault", "disabled"), 30.0)
+    return start
 
 
 def connect_a_second_arm(rig: Rig) -> float:
@@ -204,7 +207,7 @@ REQUESTS = (
 )
 CONNECTIONS = (
     FaultCase("CAN IDs of motors 3 and 4 exchanged", await_refusal, ExchangedRig, None, "started",
-        outcomes=("wrong_sign", "sign_unproven", "torque_while_hanging", "disabled"), ends_rig=True),
+        outcomes=("joints_exchanged",), ends_rig=True),
     # Two motors answer each command, and what either reports is taken for what the other applies.
     FaultCase("a second arm with the same IDs on the bus", connect_a_second_arm, limit=None, ends_rig=True,
         steps_from=math.inf, outcomes=("position_jump", "over_speed", "readings_contradict", "torque_not_delivered",

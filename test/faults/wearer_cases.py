@@ -12,6 +12,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from exo_gravity.sim.judge import RATED_TORQUE, RESOLUTION
+
 from .actions import Steps, compensator, in_turn, pause, send_signal, wearer
 from .fault_case import PROCESS_REACTION, FaultCase
 from .rig import Rig
@@ -38,6 +42,13 @@ THROW = pushes([0.0, 2.5, 0.0, 0.2])
 REACH: Steps = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], list(WornRig.pose)) * 4]
 
 
+def within_max_effort(records: np.ndarray) -> str:
+    """Return which joint was held with more than the rated torque, by default `max_effort`, damping apart; or ''."""
+    effort = np.abs(records["torque"] + records["damping"] * records["velocity"]).max(axis=0)
+    beyond = np.flatnonzero(effort > np.array(RATED_TORQUE) + RESOLUTION)
+    return ", ".join(f"motor {joint + 1} holds with {effort[joint]:.1f} Nm" for joint in beyond)
+
+
 def while_wearer(does: str, steps: Steps, after: float, rig: type[Rig] = WornRig, **options: Any) -> FaultCase:
     """The compensator freezes `after` s after the wearer began `steps`, and goes on with them."""
 
@@ -56,6 +67,7 @@ def while_wearer(does: str, steps: Steps, after: float, rig: type[Rig] = WornRig
         clear=send_signal("compensator", signal.SIGCONT),
         outcomes=("command_stale",),
         driven_limit=MOVED,
+        check=within_max_effort,
         **options,
     )
 

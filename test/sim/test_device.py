@@ -67,6 +67,22 @@ def test_a_motors_damping_acts_at_every_step():
     assert np.abs(device.arm.velocities).max() < 0.015
 
 
+def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it():
+    device = make_device()
+    device.arm.reset(RAISED)
+    for joint in range(len(SPECS)):
+        device.exchange(joint + 1, ENTER)
+        device.exchange(joint + 1, command(joint, kd=5.0))
+    reach = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], [0.0, 0.9, 0.3, 0.6])]
+    device.start(VirtualWearer(TrialScript.parse({"name": "reach", "steps": reach})))
+    velocities = []
+    for _ in range(1600):
+        device.advance(0.001)
+        velocities.append(device.arm.velocities)
+    changes = np.diff(velocities, axis=0)
+    assert np.abs(changes[1:] - changes[:-1]).max() < 0.5
+
+
 def test_tilting_the_trunk_moves_the_arm():
     device = make_device()
     device.advance(0.5)

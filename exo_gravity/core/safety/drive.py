@@ -111,6 +111,10 @@ class FaultCode(str, Enum):
     )
     WRONG_SIGN = "wrong_sign", "a joint moved against a small test torque at the first start"
     SIGN_UNPROVEN = "sign_unproven", "a joint did not move under a small test torque at the first start"
+    JOINTS_EXCHANGED = (
+        "joints_exchanged",
+        "a joint moved sooner than one that it carries at the first start: exchanged CAN IDs, or an arm that is held",
+    )
     # The efforts
     COMMAND_STALE = "command_stale", "no effort command answers a joint state younger than `command_timeout`", RESUME
     COMMAND_WITHDRAWN = "command_withdrawn", "the compensator withdrew its efforts; its diagnostics say why", RESUME

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import Fault, FaultCode
+from exo_gravity.core.safety.joint_order import JOINT_ORDER, JointOrder
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE, Limits
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
@@ -244,6 +245,9 @@ class SignCheck:
     before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
     `direction` that reverses torque and encoder alike: such a joint moves as expected.
 
+    How soon the joints move shows two with exchanged CAN IDs (joint_order.py); they are pushed again before that is a
+    fault.
+
     No joint is damped before it has moved the right way: a reversed motor that damps would drive it, without end.
 
     torque: (n,) Nm, the largest push on each joint; a joint with 0 is skipped.
@@ -262,31 +266,43 @@ class SignCheck:
         self._names = names
         self._dt = 0.0
         self._position = [math.nan] * len(names)  # rad
+        self._order = JointOrder(names)
         self._course = self._check_all(torque)
 
-    def step(self, dt: float, joints: Sequence[JointSample]) -> Fault | None:
-        """Advance by `dt` s with the joints' readings, until `done`; return the fault that they show, if any."""
+    def step(self, dt: float, joints: Sequence[JointSample], asked: Sequence[float]) -> Fault | None:
+        """Advance by `dt` s, until `done`; return the fault that the readings show, if any.
+
+        joints: (n,) the newest readings.
+        asked: (n,) Nm that the controller asks for in this pose.
+        """
         self._dt, self._position = dt, [joint.position for joint in joints]
+        self._order.note(joints, asked)
         return next(self._course, None)
 
     # Each of these yields once a step: a fault, or None.
 
     def _check_all(self, torque: Sequence[float]) -> Iterator[Fault | None]:
-        for i, most in enumerate(torque):
-            if not most:
-                continue
-            for _ in range(SIGN_PUSH.disturbed + 1):
-                yield from self._wait_for_rest(i)
-                if (yield from self._push_both_ways(i, most)):
-                    break
-                self.hint = Reason(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
-            else:
-                yield self._fault(i, "it moves without being pushed: hold still and let it hang")
-            while self.effort[i]:
-                self._approach(i, 0.0, SIGN_PUSH.fall)
-                yield None
-            self.hint = NO_REASON
+        joints: Sequence[int] = [i for i, most in enumerate(torque) if most]
+        for _ in range(JOINT_ORDER.rounds):
+            for i in joints:
+                yield from self._check(i, torque[i])
+            if not (joints := self._order.exchanged):
+                break
+        if joints:
+            yield self._order.fault
         self.done = True
+
+    def _check(self, i: int, most: float) -> Iterator[Fault | None]:
+        for _ in range(SIGN_PUSH.disturbed + 1):
+            if (yield from self._push_both_ways(i, most)):
+                break
+            self.hint = Reason(Wait.HOLD_STILL, f"{self._names[i]} moves without being pushed: hold still")
+        else:
+            yield self._fault(i, "it moves without being pushed: hold still and let it hang")
+        while self.effort[i]:
+            self._approach(i, 0.0, SIGN_PUSH.fall)
+            yield None
+        self.hint = NO_REASON
 
     def _wait_for_rest(self, i: int) -> Iterator[Fault | None]:
         start, still, waited = math.inf, 0.0, 0.0
@@ -300,7 +316,10 @@ class SignCheck:
 
     def _push_both_ways(self, i: int, most: float) -> Generator[Fault | None, None, bool]:
         """Return whether the joint moved under a push each way, False if it moved without one."""
+        self.damped[i] = False
         for sign in (1.0, -1.0):
+            yield from self._wait_for_rest(i)
+            self._order.begin(i)
             start, waited = self._position[i], 0.0
             while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
                 push = self.effort[i]
@@ -308,8 +327,7 @@ class SignCheck:
                     yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
                 waited += self._dt if abs(push) >= most else 0.0
                 start = self._position[i] if push * sign <= 0.0 else start
-                # A push in the old direction is released faster than a new one is built up.
-                self._approach(i, sign * most, SIGN_PUSH.fall if push * sign < 0.0 else SIGN_PUSH.rise)
+                self._approach(i, sign * most, SIGN_PUSH.rise)
                 yield None
             push = self.effort[i]
             if sign * push < SIGN_PUSH.least:
@@ -317,6 +335,8 @@ class SignCheck:
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
                 yield self._fault(i, reason, FaultCode.WRONG_SIGN)
+            if not self.damped[i]:
+                self._order.end(SIGN_PUSH.still, SIGN_PUSH.moved)
             self.damped[i] = True
         return True
 

@@ -211,7 +211,7 @@ class SafetyMachine:
             effort, fault = self.motion.step(self._dt, self._readings.joints, effort, now - efforts.answered)
             self._trip(fault)
         if self.state is State.PROVING:
-            self._prove()
+            self._prove(efforts.effort or self._none)
         self._sent = self._drive(effort or self._none, efforts.damped)
         return self._sent
 
@@ -320,8 +320,8 @@ class SafetyMachine:
             waited = f"not enabled within {patience:g} s: waited for {self.waiting_for}"
             self._refuse(Reason(self.waiting_for.word, waited))
 
-    def _prove(self) -> None:
-        """Advance the checks of motors that were just switched on."""
+    def _prove(self, asked: Sequence[float]) -> None:
+        """Advance the checks of motors that were just switched on; asked: (n,) Nm."""
         if not self._switching.done:
             self._delivery.reset()
             return
@@ -330,7 +330,7 @@ class SafetyMachine:
             fault = self._switch_on.step(self._dt, joints, self._sent.damping)
             self._delivery.reset()
         else:
-            fault = self._signs.step(self._dt, joints)
+            fault = self._signs.step(self._dt, joints, asked)
         self.waiting_for = self._signs.hint
         self._trip(fault)
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):

@@ -277,6 +277,10 @@ class SimulatedMotor:
         peak = joint.spec.peak_torque
         return joint.direction * clamp(torque * self._scale, peak) * self.strength
 
+    def damps_at_once(self, torque: float) -> bool:
+        """Return whether its `torque` in Nm follows the joint's velocity without delay: not at its peak."""
+        return abs(torque) < self.joint.spec.peak_torque * self.strength
+
     def _state(self, position: float, velocity: float) -> bytes:
         """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
         joint, readings = self.joint, self._readings(position, velocity)
