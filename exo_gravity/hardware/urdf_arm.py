@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from exo_gravity import packaged
 from exo_gravity.core.arm.arm import (
@@ -189,6 +190,16 @@ class UrdfArm:
         """
         felt = self.gravity * tilt.magnitude
         return self._holding(theta, [felt * component for component in tilt.gravity_in_trunk], ZERO)
+
+    def torques(self, theta: ArrayLike, direction: ArrayLike) -> np.ndarray:
+        """Return the torque (m, n) in Nm that holds the arm at `theta` (m, n) rad.
+
+        direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
+        """
+        x, y, z = np.transpose(direction)
+        felt = self.gravity * np.transpose((y, x, -z))
+        pairs = zip(np.asarray(theta), felt, strict=True)
+        return np.array([self._holding(pose, own, ZERO) for pose, own in pairs])
 
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.

@@ -143,7 +143,6 @@ FIT = Fit()
 
 
 MEDIAN_BELOW = 0.64  # by which the median of a sum of as many squares is below their number
-TINY = 1e-20  # of the complex step: no difference is taken, so nothing is lost to rounding
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
 EXACT = 1e-6  # error of a value that is held
@@ -179,21 +178,43 @@ class Rows(NamedTuple):
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the commanded effort (m, n) in Nm."""
-        at = self.layout
-        turn = np.eye(at.moments, dtype=unknowns.dtype)
-        for (along, across), angle in zip(at.angles, unknowns[at.angle], strict=True):
-            turn[along, across] = angle
-        moments = unknowns[at.moment] + self.load @ turn
-        direction = self.direction + self.direction @ (unknowns[at.tilt] @ TURN)
-        torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
-        torque = torque + unknowns[at.spring] * self.theta
-        given = np.exp(-unknowns[at.scale]) / (1.0 + unknowns[at.slope] * self.warmth)
-        return np.asarray(torque * given + unknowns[at.offset])
+        _, torque, given = self._parts(unknowns)
+        return np.asarray(torque * given + unknowns[self.layout.offset])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (m, n, count), exact to rounding by complex steps."""
-        steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(self.layout.count))
-        return np.stack(list(steps), axis=-1) / TINY
+        """Return the derivative of `predicted` by the unknowns, (m, n, count)."""
+        at, (rows, torque, given) = self.layout, self._parts(unknowns)
+        own = np.eye(at.joints)[None]  # what belongs to a joint changes that joint's effort alone
+        effort = torque * given
+        angles = [rows[:, :, across] * self.load[:, None, along] for along, across in at.angles]
+        turns = np.einsum("mi,ita->mta", self.direction, TURN)
+        turned = np.einsum("mnka,mta,mk->mnt", self.along, turns, self._moments(unknowns), optimize=True)
+        warming = self.warmth / (1.0 + unknowns[at.slope] * self.warmth)
+        parts = (
+            rows * given[..., None],
+            -own * effort[..., None],
+            np.broadcast_to(own, (len(effort), at.joints, at.joints)),
+            np.stack(angles, axis=-1) * given[..., None] if angles else np.zeros((*effort.shape, 0)),
+            turned * given[..., None],
+            own * (self.theta * given)[..., None],
+            -own * (effort * warming)[..., None],
+        )
+        return np.concatenate(parts, axis=-1)
+
+    def _moments(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the moments of arm and weight, (m, k) kg m."""
+        turn = np.eye(self.layout.moments)
+        for (along, across), angle in zip(self.layout.angles, unknowns[self.layout.angle], strict=True):
+            turn[along, across] = angle
+        return np.asarray(unknowns[self.layout.moment] + self.load @ turn)
+
+    def _parts(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the regressor (m, n, k), the torque of gravity and springs (m, n), and what a command is of it."""
+        at = self.layout
+        direction = self.direction + self.direction @ (unknowns[at.tilt] @ TURN)
+        rows = np.einsum("mnka,ma->mnk", self.along, direction)
+        torque = np.einsum("mnk,mk->mn", rows, self._moments(unknowns)) + unknowns[at.spring] * self.theta
+        return rows, torque, np.exp(-unknowns[at.scale]) / (1.0 + unknowns[at.slope] * self.warmth)
 
 
 class Solution(NamedTuple):

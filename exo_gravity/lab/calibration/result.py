@@ -31,7 +31,7 @@ from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.report import html
-from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, joint_colours, make_plain
 
 PARAMETERS = "ros__parameters"
 WIDTH = 118  # characters of a comment line
@@ -228,13 +228,13 @@ def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarr
 
 def torque_figure(found: Identified, arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:
     """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
-    count = len(arm.joint_names)
+    count, colours = len(arm.joint_names), joint_colours(len(arm.joint_names))
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")
     theta, _, effort, spread = columns(poses)
     *remaining, used = remainders(found, arm, model, poses)
     numbers = np.arange(1, len(poses) + 1)
     for joint, (left, right) in enumerate(figure.subplots(count, 2, width_ratios=(1.0, 3.0), squeeze=False)):
-        colour, friction = _colour(joint), found.friction[joint]
+        colour, friction = colours[joint], found.friction[joint]
         measured, old, new, held_out = (column[:, joint] for column in (effort, *remaining))
         left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
         left.plot(measured, measured - old, "o", ms=4.5, mfc="none", color=INK)
@@ -250,8 +250,8 @@ def torque_figure(found: Identified, arm: AnyArm, model: MomentModel, poses: Seq
         )  # fmt: skip
         right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
         right.set_xticks(numbers, [])
-        _finish(left, joint, arm.joint_names[joint])
-        _finish(right, joint)
+        _finish(left, colour, arm.joint_names[joint])
+        _finish(right, colour)
     left.set_xlabel("Measured (Nm)")
     rows = [[str(n), *(f"{angle:.0f}" for angle in pose)] for n, pose in zip(numbers, np.degrees(theta), strict=True)]
     ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
@@ -263,7 +263,7 @@ def torque_figure(found: Identified, arm: AnyArm, model: MomentModel, poses: Seq
 
 def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
     """Return the friction of each joint over its speed, measured and fitted, less what grows with the torque."""
-    down = math.ceil(len(curves) / MOST_ACROSS)
+    down, colours = math.ceil(len(curves) / MOST_ACROSS), joint_colours(len(curves))
     figure = Figure(figsize=(FIGURE_WIDTH, CURVE_HEIGHT * down), layout="constrained")
     axes = figure.subplots(down, MOST_ACROSS, sharey=True, squeeze=False).ravel()
     for unused in axes[len(curves) :]:
@@ -271,20 +271,16 @@ def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> F
     for joint, axis in enumerate(axes[: len(curves)]):
         curve, order = curves[joint], np.argsort(curves[joint].speed)
         of_load = curve.load * curve.carried
-        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=_colour(joint), label="measured")
+        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=colours[joint], label="measured")
         axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
-        _finish(axis, joint, labels[joint])
+        _finish(axis, colours[joint], labels[joint])
     figure.axes[0].set(ylabel="Friction (Nm)", ylim=(0.0, None))
     return figure
 
 
-def _finish(axis: Axes, joint: int, title: str = "") -> None:
-    axis.set_title(title, fontsize=10, color=_colour(joint), loc="left", weight="bold")
+def _finish(axis: Axes, colour: str, title: str = "") -> None:
+    axis.set_title(title, fontsize=10, color=colour, loc="left", weight="bold")
     make_plain(axis)
     axis.margins(y=0.12)
-
-
-def _colour(joint: int) -> str:
-    return JOINT_COLOURS[joint % len(JOINT_COLOURS)]

@@ -178,7 +178,9 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
         new = urdf_arm_of(arm.compensator).with_moments(moments)
         for name, values in zip(MOMENT_NAMES, new.change.T, strict=True):
-            yield Change(node, name, values.round(5).tolist(), f"{known}, was {_row(np.array(arm.compensator[name]))}")
+            yield Change(
+                node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {_row(np.array(arm.compensator[name]))}"
+            )
         return
     for name, part in MOMENT_PARAMETERS.items():
         note = f"{' '.join(MOMENTS[part])} {unit}, +-{_row(error[part])}, was {_row(before[part])}"

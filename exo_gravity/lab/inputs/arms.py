@@ -5,10 +5,10 @@ An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked 
 unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import yaml
@@ -31,7 +31,6 @@ from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
-
 
 MASSES = {"robot.mass", "robot.first_moment"}  # a file with one of them describes the paper's arm
 
@@ -68,6 +67,9 @@ class ConfiguredArm(AnyArm):
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator "):
             return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
+
+
+OneArm = TypeVar("OneArm", bound=AnyArm)
 
 
 class CarriedArm(NamedTuple):
@@ -140,32 +142,41 @@ def read_any_arm(nodes: Nodes, namespace: str) -> AnyArm:
     return AnyArm(namespace, *read, of_side, names, *bounds)
 
 
+def any_arms(params: str | Path) -> list[AnyArm]:
+    """Return every arm of a parameter file, also those from a URDF. Raises ParameterError if there is none."""
+    return _arms(params, read_any_arm)
+
+
 def any_arm(params: str | Path, side: str) -> AnyArm:
     """Return the only arm of `side` in a parameter file, also one from a URDF. Raises ParameterError."""
-    nodes = load(params)
-    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
-    found = [arm for arm in (read_any_arm(nodes, namespace) for namespace in namespaces) if arm.side == side]
-    if len(found) != 1:
-        wanted = f"a file with one compensator whose side is {side}, not {len(found)}"
-        raise ParameterError("params", str(params), wanted)
-    return found[0]
+    return _only(any_arms(params), params, side)
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:
-    """Return every arm of a parameter file. Raises ParameterError if there is none."""
-    nodes = load(params)
-    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
-    if not namespaces:
-        raise ParameterError("params", str(params), "a file with a compensator")
-    return [read_arm(nodes, namespace) for namespace in namespaces]
+    """Return every arm of a parameter file. Raises ParameterError if there is none, or one is not the paper's."""
+    return _arms(params, read_arm)
 
 
 def configured_arm(params: str | Path | None = None, side: str = "right") -> ConfiguredArm:
     """Return the only arm of `side` in a parameter file, by default in the packaged exo.yaml. Raises ParameterError."""
     path = params or packaged_config("exo.yaml")
-    found = [arm for arm in configured_arms(path) if arm.side == side]
+    return _only(configured_arms(path), path, side)
+
+
+def _arms(params: str | Path, read: Callable[[Nodes, str], OneArm]) -> list[OneArm]:
+    nodes = load(params)
+    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a compensator")
+    return [read(nodes, namespace) for namespace in namespaces]
+
+
+def _only(arms: Sequence[OneArm], params: str | Path, side: str) -> OneArm:
+    found = [arm for arm in arms if arm.side == side]
     if len(found) != 1:
-        raise ParameterError("params", str(path), f"a file with one compensator whose side is {side}, not {len(found)}")
+        raise ParameterError(
+            "params", str(params), f"a file with one compensator whose side is {side}, not {len(found)}"
+        )
     return found[0]
 
 
