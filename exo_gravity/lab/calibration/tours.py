@@ -200,7 +200,7 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
         changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
     if not found.relative:
         known = np.isfinite(found.scale_error)
-        share = np.where(known, found.scale_error / found.scale, ModelError().scale)
+        share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
         changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
     if arm.compensator["law"] not in ("exact", URDF_LAW):
         changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
