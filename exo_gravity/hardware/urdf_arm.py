@@ -263,14 +263,10 @@ class UrdfArm:
         the first moments of that link. The rest are columns of the regressor, from which a QR decomposition in random
         poses leaves out those that depend on others (M. Gautier, ICRA 1990).
         """
-        random, pin, model = np.random.default_rng(0), self._pin, self._bare
-        pin.computeJointJacobians(model, self._data, pin.neutral(model))
-        across = []
+        random, across = np.random.default_rng(0), []
         for n, joint in enumerate(self._joints):
-            jacobian = pin.getJointJacobian(model, self._data, joint, pin.ReferenceFrame.LOCAL)
-            axis = np.reshape(jacobian, (6, -1))[3:, model.joints[joint].idx_v]
-            _, _, rows = np.linalg.svd(axis[None])
-            across += [(n, row) for row in rows[1:] if model.inertias[joint].mass]
+            if self._bare.inertias[joint].mass:
+                across += [(n, way) for way in self._across(n)]
         poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
         down = random.normal(size=(BASE_POSES, 3))
         columns = np.concatenate([self._columns(pose, way, across) for pose, way in zip(poses, down, strict=True)])
@@ -303,6 +299,48 @@ class UrdfArm:
         for (n, way), difference in zip(self.base, moments - own, strict=True):
             change[n] += difference * way
         return self.corrected(change)
+
+    @cached_property
+    def _axes(self) -> np.ndarray:
+        """The joints' axes (n, 3) in their own frames."""
+        pin, model = self._pin, self._bare
+        pin.computeJointJacobians(model, self._data, pin.neutral(model))
+        own, axes = pin.ReferenceFrame.LOCAL, []
+        for joint in self._joints:
+            jacobian = np.reshape(pin.getJointJacobian(model, self._data, joint, own), (6, -1))
+            axes.append(jacobian[3:, model.joints[joint].idx_v].copy())
+        return np.array(axes)
+
+    def _across(self, n: int) -> np.ndarray:
+        """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
+        return np.asarray(np.linalg.svd(self._axes[n][None])[2][1:])
+
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (n,) rad, in the root link's axes.
+
+        The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
+        vectors (n, 3) across them, as far as possible along the links.
+        """
+        own, along = self._axes, []  # before the places, because it moves the joints
+        origins = self.places(theta)
+        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
+            across = way - axis * (axis @ way)
+            size = float(np.linalg.norm(across))
+            along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
+        axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
+        return origins, axes, links
+
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
+
+        While all angles are 0, in the root link's axes.
+        """
+        self.places([0.0] * len(self.names))
+        links = [self._bare.inertias[joint] for joint in self._joints]
+        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
+        return np.array([link.mass for link in links]), np.array(centres)
 
     def places(self, theta: Sequence[float]) -> np.ndarray:
         """Return where the joints are at `theta` (n,) rad, and the hand or the last joint again: (n + 1, 3) m.

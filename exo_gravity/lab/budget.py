@@ -105,7 +105,7 @@ def overload(names: Sequence[str], joints: Sequence[JointBudget]) -> str:
 
 
 def torque_at(arm: Arm, points: np.ndarray) -> np.ndarray:
-    """Return the exact torque (m, n) in Nm at points (m, n + 2) in rad: joint angles, then the trunk's pitch and roll."""
+    """Return the exact torque (m, n) in Nm at points (m, n + 2) in rad: joint angles, pitch and roll of the trunk."""
     pitch, roll = points[:, -2], points[:, -1]
     # This is `Tilt.of` for arrays and the left arm. A workspace has both signs of roll, so it covers the right arm too.
     level = np.cos(pitch)

@@ -21,7 +21,7 @@ from exo_gravity.lab.view.scene import (
     gravity_shapes,
     state_of,
 )
-from exo_gravity.lab.view.urdf import ArmDescription, arm_pose, urdf
+from exo_gravity.lab.view.urdf import ArmDescription, urdf
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))
@@ -46,7 +46,7 @@ def test_the_pose_is_that_of_the_description(side):
     data, rng = model.createData(), np.random.default_rng(1)
     for theta in rng.uniform(-math.pi, math.pi, (50, 4)):
         pinocchio.framesForwardKinematics(model, data, theta)
-        origins, axes, _ = arm_pose(arm(side), theta)
+        origins, axes, _ = arm(side).pose(theta)
         frames = [data.oMf[model.getFrameId(name)] for name in arm(side).links]
         assert origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
         # The description's own axes, in the frames of the links, which turn about them.
@@ -58,7 +58,7 @@ def test_the_pose_is_that_of_the_description(side):
 
 def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle():
     theta = (0.3, 0.8, 0.5, 1.0)
-    origins, _, _ = arm_pose(arm(), theta)
+    origins, _, _ = arm().pose(theta)
     shapes = lines(arm_shapes(view(theta)), "limits")
     for n, (arc, needle) in enumerate(zip(shapes[0::2], shapes[1::2], strict=True)):
         assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(SIZES.range_radius)
@@ -74,7 +74,7 @@ def test_a_joint_near_its_limit_is_red():
 
 def test_a_torque_spans_its_share_of_the_limit_in_its_direction_and_is_red_at_the_limit():
     shapes = lines(arm_shapes(view(effort=(0.0, 4.5, -1.0, 3.0))), "torques")
-    origins, axes, _ = arm_pose(arm(), STILL)
+    origins, axes, _ = arm().pose(STILL)
     for n, share in enumerate((0.0, 0.5, -1.0 / 3.0, 1.0)):
         start, end = ((shapes[n].points[i] - origins[n]) / SIZES.torque_radius for i in (0, -1))
         turn = math.atan2(np.cross(start, end) @ axes[n], start @ end)
