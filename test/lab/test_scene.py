@@ -3,12 +3,15 @@
 
 import math
 
+import mujoco
 import numpy as np
 import pinocchio
 import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.inputs.arms import any_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.view.scene import (
     AMBER,
     GREEN,
@@ -21,7 +24,8 @@ from exo_gravity.lab.view.scene import (
     gravity_shapes,
     state_of,
 )
-from exo_gravity.lab.view.urdf import ArmDescription, urdf
+from exo_gravity.lab.view.urdf import ArmDescription, described, urdf
+from exo_gravity.sim.urdf import UrdfConfig
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))
@@ -104,3 +108,25 @@ def test_gravity_points_along_its_vector_and_without_a_tilt_there_is_no_arrow():
 )
 def test_the_state_is_shown_by_colour_and_words(state, more, shown):
     assert state_of(view(state=state, **more)) == shown
+
+
+def test_the_picture_of_a_seven_joint_arm_has_its_joints_where_mujoco_has_them() -> None:
+    arm = any_arm(packaged_config("seven_joints.yaml"), "right")
+    picture, random = described(arm.compensator, arm.can_bridge), np.random.default_rng(0)
+    text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
+    given, _ = UrdfConfig(text=text, joint_names=arm.joint_names, hand="hand").models()
+    drawn = mujoco.MjModel.from_xml_string(urdf([picture]))
+    assert picture.side == "right" and [drawn.joint(n).name for n in range(drawn.njnt)] == list(arm.joint_names)
+    truth, shown = mujoco.MjData(given), mujoco.MjData(drawn)
+    for _ in range(20):
+        theta = random.uniform(arm.low, arm.high)
+        truth.qpos[:] = shown.qpos[:] = theta
+        mujoco.mj_kinematics(given, truth)
+        mujoco.mj_kinematics(drawn, shown)
+        origins, axes, along = picture.pose(theta.tolist())
+        np.testing.assert_allclose(origins[:-1], truth.xanchor, atol=1e-9)
+        np.testing.assert_allclose(axes, truth.xaxis, atol=1e-9)
+        np.testing.assert_allclose(origins[:-1], shown.xanchor, atol=1e-5)
+        np.testing.assert_allclose(np.einsum("na,na->n", axes, along), 0.0, atol=1e-9)
+    view = ArmView(picture, theta.tolist(), [0.0] * drawn.njnt, [1.0] * drawn.njnt, "active")
+    assert len([shape for shape in arm_shapes(view) if shape.group == "torques"]) == 2 * drawn.njnt

@@ -154,10 +154,12 @@ class Stage:
         places = [self._pixel(joint) for joint in view.arm.pose(view.theta)[0][:-1]]
         middle, _ = self._pixel(np.multiply(view.arm.base, (1.0, 0.0, 1.0)))
         is_left, below, line = places[0][0] < middle, 0.16 * height, 1.15 * LINE_HEIGHT * height
-        for name, effort, (x, y) in zip(view.arm.limits.joint_names, view.effort, places, strict=True):
+        names = view.arm.limits.joint_names
+        step = min(2.4 * line, (height - below) / len(names))  # so that the labels of many joints fit, too
+        for n, (name, effort, (x, y)) in enumerate(zip(names, view.effort, places, strict=True)):
             label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shown(effort, 2)} Nm"
-            top = max(below, y - line)
-            below = top + 2.4 * line
+            top = min(max(below, y - line), height - step * (len(names) - n))
+            below = top + step
             at, anchor = ((line / 2, top), "la") if is_left else ((width - line / 2, top), "ra")
             draw.multiline_text(at, label, INK, font, anchor, align="left" if is_left else "right")
             start, _, end, _ = draw.multiline_textbbox(at, label, font, anchor)
