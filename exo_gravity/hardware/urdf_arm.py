@@ -351,12 +351,14 @@ class UrdfArm:
         frames = [self._data.oMi[joint] for joint in self._joints]
         return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
 
-    def _columns(self, theta: Sequence[float] | np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
+    def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""
         model, pin = self._bare, self._pin
         model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
         still = np.zeros(model.nv)
-        whole = pin.computeJointTorqueRegressor(model, self._data, self._moves.configuration(theta), still, still)
+        whole = pin.computeJointTorqueRegressor(
+            model, self._data, self._moves.configuration(theta.tolist()), still, still
+        )
         parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
         moments = parts.reshape(len(self.names), -1, INERTIAL)[:, :, 1:4]
         return np.stack([moments[:, self._joints[n] - 1] @ way for n, way in base], axis=-1)

@@ -130,7 +130,7 @@ def joint_figure(arm: ArmBudget, joint: int) -> "Figure":
 
     other = arm.others[joint]
     if REST ** (len(arm.bounds.T) - 2) > MOST_RESTS:
-        points = np.random.default_rng(0).uniform(*arm.bounds, (RANDOM_RESTS, len(arm.bounds.T)))
+        points = np.random.default_rng(0).uniform(arm.bounds[0], arm.bounds[1], (RANDOM_RESTS, len(arm.bounds.T)))
     else:
         axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
         axes[joint] = axes[other] = np.zeros(1)

@@ -80,11 +80,13 @@ class MomentModel(Protocol):
 class PapersMoments:
     """The paper's arm. arm: of which the moments are known, and the lengths."""
 
-    count, names = JOINT_COUNT, MOMENTS
+    count = JOINT_COUNT
+    names: tuple[str, ...] = MOMENTS
     start = np.array((0.0, *TYPICAL_MOMENTS[1:]))
-    angles = (2, 6), (3, 7), (3, 5)  # from M3 to Y3, from M4 to Y4, and from M4 to Z
-    compared, positive = (1, 2, 3), (0,)  # joint 1 carries nothing while its axis is vertical; M1 is the least certain
-    optional = 0, 4, 8, 12  # M1, W, scale and offset of joint 1
+    angles: tuple[tuple[int, int], ...] = (2, 6), (3, 7), (3, 5)  # from M3 to Y3, from M4 to Y4, and from M4 to Z
+    compared: tuple[int, ...] = 1, 2, 3  # joint 1 carries nothing while its axis is vertical
+    positive: tuple[int, ...] = (0,)  # M1, the least certain
+    optional: tuple[int, ...] = 0, 4, 8, 12  # M1, W, scale and offset of joint 1
     shows_tilt, expects_scales = True, False
     suggested = np.radians(list(itertools.product(*GRID)))
 
@@ -152,7 +154,8 @@ class UrdfMoments:
         numbers = [n for n, _ in arm.base]
         self.names = tuple(f"{arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))
         self.compared = tuple(range(self.count))
-        poses = np.random.default_rng(1).uniform(*arm.ranges, (SUGGESTED, self.count))
+        low, high = arm.ranges
+        poses = np.random.default_rng(1).uniform(low, high, (SUGGESTED, self.count))
         self.suggested = np.radians(STEP * np.round(np.degrees(poses) / STEP))
         self._loaded: dict[tuple[float, float], UrdfArm] = {(0.0, 0.0): arm}
 

@@ -274,21 +274,22 @@ def of_urdf(name: str) -> bool:
     return name in OF_URDF or name.startswith("urdf.")
 
 
-def calibrator_table(given: Mapping[str, Any]) -> Sequence[Param]:
+def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     """Return the parameters of `calibrator` for an arm with the parameters `given`."""
     if given.get("law") != URDF_LAW:
         return CALIBRATOR
     own = [replace(param, fixed=True) for param in urdf_table(given) if of_urdf(param.name)]
     known = {param.name for param in own} | {*ARM, *MOMENTS, *BRIDGE}
     bridge = {param.name: param for param in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if param.name in OF_BRIDGE}
-    return table_for((*own, *bridge.values(), *(param for param in CALIBRATOR if param.name not in known)), given)
+    others = (param for param in CALIBRATOR if param.name not in known)
+    return tuple(table_for((*own, *bridge.values(), *others), given))
 
 
 def tour_of(values: Mapping[str, Any]) -> Tour:
     """Return the tour that parameter values describe. Raises ParameterError."""
     load, is_urdf = (values["tour.load_mass"], values["tour.load_lever"]), values.get("law") == URDF_LAW
-    home = {"home": tuple(values["home"])} if is_urdf else {}
-    limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in LIMITS}, **home)
+    given_limits = {name: values[name] for name in ((*LIMITS, "home") if is_urdf else LIMITS)}
+    limits = Limits(tuple(values["joint_names"]), **given_limits)
     model = urdf_moments(values) if is_urdf else _papers_moments(values)
     upright = Tilt.of(values.get("side", "left"))  # the root link of a URDF is not mirrored
     guess = TorqueGuess(model, model.moments + model.load(*load), upright)
