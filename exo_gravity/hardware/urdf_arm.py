@@ -15,6 +15,7 @@ from __future__ import annotations
 import copy
 import math
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -114,6 +115,7 @@ class UrdfArm:
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
+        self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
         self._identity = text, tuple(names)
         self._bare = self._model  # without load and wearer
         self._data = self._model.createData()
@@ -347,9 +349,10 @@ class UrdfArm:
 
         In the root link's axes.
         """
-        self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
-        frames = [self._data.oMi[joint] for joint in self._joints]
-        return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
+        with self._lock:
+            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
+            frames = [self._data.oMi[joint] for joint in self._joints]
+            return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
 
     def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,6 +177,26 @@ def test_the_moments_of_any_chain_give_mujocos_torque(count: int) -> None:
             rows(theta[None], down)[0] @ moments, truth.torque(theta, 9.80665 * down), atol=1e-10
         )
         np.testing.assert_allclose(other.torque(theta, tilt), base.torque(theta, 9.80665 * down), atol=1e-9)
+
+
+def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
+    model, tilt, theta = model_of(Bench.of("three_joints", tmp_path).arm), Tilt.of("left"), [0.3, 0.5, 0.7]
+    torque = model.holding(np.tile(model.moments, (model.count, 1)))
+    expected, done, interval = torque(theta, tilt), threading.Event(), sys.getswitchinterval()
+
+    def choose() -> None:
+        while not done.is_set():
+            model.along(model.suggested[:20])
+
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=choose)
+    thread.start()
+    try:
+        assert {torque(theta, tilt) for _ in range(3_000)} == {expected}
+    finally:
+        done.set()
+        thread.join()
+        sys.setswitchinterval(interval)
 
 
 @pytest.mark.thorough
