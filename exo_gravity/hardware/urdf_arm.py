@@ -356,13 +356,12 @@ class UrdfArm:
 
     def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""
-        model, pin = self._bare, self._pin
-        model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
-        still = np.zeros(model.nv)
-        whole = pin.computeJointTorqueRegressor(
-            model, self._data, self._moves.configuration(theta.tolist()), still, still
-        )
-        parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
+        model, data, compute = self._bare, self._data, self._pin.computeJointTorqueRegressor
+        at, still = self._moves.configuration(theta.tolist()), np.zeros(model.nv)
+        with self._lock:
+            model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
+            whole = compute(model, data, at, still, still)
+            parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
         moments = parts.reshape(len(self.names), -1, INERTIAL)[:, :, 1:4]
         return np.stack([moments[:, self._joints[n] - 1] @ way for n, way in base], axis=-1)
 
