@@ -56,8 +56,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
         elif name == "motors":
             option(
-                "--pose", type=float, nargs=4, default=(0.0,) * 4, metavar="DEG",
-                help="joint angles at which zero is measured, if the arm is in a jig (default: 0 0 0 0, it hangs)",
+                "--pose", type=float, nargs="+", default=(), metavar="DEG",
+                help="joint angles at which zero is measured, if the arm is in a jig (default: home, it hangs)",
             )  # fmt: skip
         else:
             option("--bag", type=Path, metavar="FOLDER", help="use this recording instead of the device")
