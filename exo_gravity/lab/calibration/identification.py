@@ -36,7 +36,7 @@ from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
-    Layout,
+    FitLayout,
     asked_for,
     bounded,
     final,
@@ -250,7 +250,7 @@ def _unknown(
         yield f"{names}: no pose shows them while the base stands as it does; the file's values are kept."
 
 
-def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: Layout) -> Iterator[str]:
+def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: FitLayout) -> Iterator[str]:
     """Yield what an error of a zero of the paper's arm looks like."""
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))

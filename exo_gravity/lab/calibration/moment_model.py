@@ -36,10 +36,10 @@ class MomentModel(Protocol):
     moments: np.ndarray  #: (k,) kg m, as far as known
     start: np.ndarray  #: (k,) kg m, from which the fit begins
     gravity: float  #: m/s^2
-    angles: tuple[tuple[int, int], ...]  #: of a weight, as in `pose_fit.Layout`
+    angles: tuple[tuple[int, int], ...]  #: of a weight, as in `pose_fit.FitLayout`
     compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
     positive: tuple[int, ...]  #: numbers of the moments that are at least 0
-    optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.Layout` that need not show
+    optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
     shows_tilt: bool  #: whether gravity's direction is fitted, too
     expects_scales: bool  #: whether a torque scale is expected to be near that of the file
     suggested: np.ndarray  #: (m, n) rad, from which a missing pose is taken

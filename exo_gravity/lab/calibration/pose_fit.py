@@ -34,7 +34,7 @@ NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005)
 
 
 @dataclass(frozen=True)
-class Layout:
+class FitLayout:
     """Where each of the unknowns stands.
 
     joints, moments: how many the arm has.
@@ -111,9 +111,9 @@ class Layout:
         return np.append(moments, np.zeros(self.count - self.moments))
 
 
-def layout_of(model: MomentModel) -> Layout:
+def layout_of(model: MomentModel) -> FitLayout:
     """Return where the unknowns of an arm stand."""
-    return Layout(model.count, len(model.names), model.angles)
+    return FitLayout(model.count, len(model.names), model.angles)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Rows(NamedTuple):
     load: np.ndarray  #: (m, k) kg m, moments of the weight
     effort: np.ndarray  #: (m, n) Nm
     sigma: np.ndarray  #: (m, n) Nm, standard error of `effort`
-    layout: Layout
+    layout: FitLayout
     start: np.ndarray  #: (count,), the unknowns from which the search begins
     #: (c, count), linear combinations of the unknowns' change from `start` that are 0, divided by their standard errors
     anchor: np.ndarray
