@@ -149,8 +149,10 @@ def budget_worn(
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        theta = points[:, :count]
-        return own + spring.torques(theta), with_all - own + tissue.torques(theta)
+        theta, added = points[:, :count], with_all - own
+        if any(tissue.joint_stiffness):
+            added = added + tissue.torques(theta)
+        return own + spring.torques(theta), added
 
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, count + 2))
     upright = np.repeat((1.0, 0.0), (count, 2))
