@@ -22,7 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import load_moments, moments_of
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
@@ -34,6 +34,7 @@ from exo_gravity.core.motors.joint_motor import SCALE_TEMPERATURE, JointMotor, s
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration import identification
+from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.lab.calibration.tour import DURATION, Tour
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
@@ -133,7 +134,7 @@ class Device:
         let_hang(device)
         limits, tilt = Limits(ARM.joint_names, sign_check_torque=0.0), Tilt.of(device.side, *stand)
         expected = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-        guess = TorqueGuess(DEFAULT_LINKS.length, expected, tilt, STANDARD_GRAVITY)
+        guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), expected, tilt)
         tour = Tour(limits, guess, Itinerary(limits, poses, DURATION), RATE, load)
         fault = Player(tour, device, ASSUMED, limits, RATE, tilt).play().fault
         if not tour.done:

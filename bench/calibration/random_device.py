@@ -9,14 +9,14 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.pose_fit import TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
 from exo_gravity.lab.calibration.poses import next_pose
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
+PAPERS = PapersMoments(ArmModel.from_moments(LENGTH, (0.0,) * 4))
 LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something
 UPRIGHT = (0.0, 0.0, 1.0)
 Direction = tuple[float, float, float]
@@ -85,5 +85,5 @@ def best(direction: Direction, count: int, weight: Weight = NO_WEIGHT) -> tuple[
     moments = np.array(TYPICAL_MOMENTS) + load_moments(LENGTH, *weight)
     taken: list[tuple[float, ...]] = []
     while len(taken) < count:
-        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments, STANDARD_GRAVITY)]))
+        taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments, PAPERS)]))
     return tuple(taken)

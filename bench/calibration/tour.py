@@ -20,13 +20,13 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
-from exo_gravity.lab.calibration.tour import CALIBRATOR, Tour, TourController, tour_of
+from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.imu import SimulatedImu, measured_tilt
-from exo_gravity.sim.params import SIMULATOR, device_of, imu_of
+from exo_gravity.sim.params import device_of, imu_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
 LONGEST = 420.0  # s
@@ -77,15 +77,18 @@ class Player:
 def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -> Player:
     """Return what plays the tour that `nodes`, each with its parameters, describe; `path`: where to write them."""
     path.write_text(text_of(nodes), encoding="utf-8")
-    content = load(path)
-    values = node_values(content, f"{namespace}/calibrator", CALIBRATOR)
+    content, node = load(path), f"{namespace}/calibrator"
+    values = node_values(content, node, calibrator_table(content[node]))
     bridge = node_values(content, f"{namespace}/can_bridge", CAN_BRIDGE)
-    simulator = node_values(content, f"{namespace}/simulator", SIMULATOR)
+    simulated = f"{namespace}/simulator"
+    simulator = node_values(content, simulated, simulator_table(content[simulated]))
     device = device_of(simulator)
     let_hang(device)
-    imu = SimulatedImu(imu_of(simulator))
-    tilt = measured_tilt(device.pitch, device.roll, imu, content["/imu"]["rotation_trunk_from_imu"])
-    side = values["side"]
+    tilt = (device.pitch, device.roll)
+    if values["use_imu"]:
+        imu = SimulatedImu(imu_of(simulator))
+        tilt = measured_tilt(*tilt, imu, content["/imu"]["rotation_trunk_from_imu"])
+    side = values.get("side", "left")  # the root link of a URDF is not mirrored
     return Player(tour_of(values), device, motors_of(bridge), limits_of(bridge), bridge["rate"], Tilt.of(side, *tilt))
 
 

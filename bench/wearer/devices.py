@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
-from bench.calibration.random_device import LEANING, LENGTH, UPRIGHT, Device, off_axis_of
+from bench.calibration.random_device import LEANING, LENGTH, PAPERS, UPRIGHT, Device, off_axis_of
 from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
 from exo_gravity.core.arm.gravity import moments_of
@@ -128,10 +128,10 @@ def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     nominal = configured_arm(packaged_config("sim.yaml"))
     low, high = np.maximum(nominal.low, WEARER.comfortable[0]), np.minimum(nominal.high, WEARER.comfortable[1])
     limits = replace(nominal.limits, position_min=low.tolist(), position_max=high.tolist())
-    poses, taken = candidates(limits), [hanging(limits).theta]
+    poses, taken = candidates(limits, PAPERS), [hanging(limits).theta]
     expected = moments_of(nominal.robot.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)))
     while len(taken) < WEARER.poses:
-        best = next_pose(taken, poses, UPRIGHT, expected, STANDARD_GRAVITY)
+        best = next_pose(taken, poses, UPRIGHT, expected, PAPERS)
         taken.append(tuple(poses[best].tolist()))
         poses = np.delete(poses, best, axis=0)
     return (*taken, *taken[: WEARER.again])
@@ -164,7 +164,7 @@ def draw(seed: int, effect: str = "none") -> Worn:
     seen = [one._replace(direction=turned(one.direction, -turn)) for one in tours]
     nominal = configured_arm(packaged_config("sim.yaml"))
     bare = moments_from(nominal, seen)
-    left = turn - identify(seen, LENGTH).tilt
+    left = turn - identify(seen, PAPERS).tilt
     values: dict[str, Any] = {change.name: change.value for change in bare.changes}
     found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g", "support": 1.0}
     found |= {name: value for name, value in values.items() if name != "torque_scale"}

@@ -15,12 +15,14 @@ from __future__ import annotations
 import copy
 import math
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from exo_gravity import packaged
 from exo_gravity.core.arm.arm import (
@@ -40,8 +42,13 @@ from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 
 PACKAGE = "package://"
+MOMENT_NAMES = tuple(f"urdf.moment_{axis}" for axis in "xyz")  # the compensator's parameters
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 POSES = 500  # at random, for the least inertia
+BASE_POSES = 60  # at random, from which the moments are found that torque can show
+DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
+INERTIAL = 10  # parameters of a link in Pinocchio's regressor: mass, first moment, inertia
+Base = Sequence[tuple[int, np.ndarray]]
 
 
 def read_urdf(path: str) -> str:
@@ -61,6 +68,19 @@ def _located(path: str) -> Path:
     shares = [Path(prefix, "share", name) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if prefix]
     found = (file for share in shares if (file := share / rest).exists())
     return next(found, Path(path))
+
+
+def arm_from(values: Mapping[str, Any], text: str) -> UrdfArm:
+    """Return the arm that the compensator's parameter `values` describe, from the `text` of its URDF.
+
+    can_bridge reports the arm's own joints alone: any other is then taken to be at 0. Raises ParameterError as
+    `UrdfArm` does, and if another joint cannot be at 0.
+    """
+    names = values["joint_names"]
+    arm = UrdfArm(text, names, values["urdf.hand"])
+    if values.get("command_interface") != "multi_array":
+        arm.follow(names, [0.0] * len(names))
+    return arm.corrected(np.transpose([values[name] for name in MOMENT_NAMES]))
 
 
 class UrdfArm:
@@ -94,6 +114,8 @@ class UrdfArm:
         self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
+        self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
+        self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
         self._identity = text, tuple(names)
         self._bare = self._model  # without load and wearer
         self._data = self._model.createData()
@@ -114,7 +136,8 @@ class UrdfArm:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        return (*self._identity, self._hand, self._rotors, self.scale, self.payload, self._worn, self._own_mass)
+        held = self.payload, self._worn, self._own_mass
+        return (*self._identity, self._hand, self._rotors, self.scale, *held, self._change.tobytes())
 
     @cached_property
     def scale(self) -> tuple[float, ...]:
@@ -170,6 +193,16 @@ class UrdfArm:
         felt = self.gravity * tilt.magnitude
         return self._holding(theta, [felt * component for component in tilt.gravity_in_trunk], ZERO)
 
+    def torques(self, theta: ArrayLike, direction: ArrayLike) -> np.ndarray:
+        """Return the torque (m, n) in Nm that holds the arm at `theta` (m, n) rad.
+
+        direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
+        """
+        x, y, z = np.transpose(direction)
+        felt = self.gravity * np.transpose((y, x, -z))
+        pairs = zip(np.asarray(theta), felt, strict=True)
+        return np.array([self._holding(pose, own, ZERO) for pose, own in pairs])
+
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.
 
@@ -184,6 +217,153 @@ class UrdfArm:
         arm.gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
         arm._anew().__dict__["links"] = self.links  # what takes long to compute, the least inertia, is computed once
         return arm
+
+    def corrected(self, change: np.ndarray) -> UrdfArm:
+        """Return this arm with other first moments of its links, in place of any other change. Raises ParameterError.
+
+        change: (n, 3) kg m, by which the moment of the link of each joint differs from the URDF's, along x, y, z of the
+        joint's frame. The masses stay the URDF's: the centres of gravity move.
+        """
+        if np.array_equal(change, self._change):
+            return self
+        arm = copy.copy(self)
+        arm._bare = self._bare.copy()
+        for joint, name, own in zip(self._joints, self._moves.names, change - self._change, strict=True):
+            link = arm._bare.inertias[joint]
+            if any(own) and not link.mass:
+                raise ParameterError(f"urdf.moment of {name}", own.tolist(), "0: its link has no mass in the URDF")
+            if any(own):
+                arm._bare.inertias[joint] = self._pin.Inertia(link.mass, link.lever + own / link.mass, link.inertia)
+        arm._change = np.array(change)
+        return arm._held()
+
+    @property
+    def change(self) -> np.ndarray:
+        """By what `corrected` changed the moments, (n, 3) kg m."""
+        return self._change
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The joints (n,)."""
+        return self._moves.names
+
+    @property
+    def moves_alone(self) -> bool:
+        """Whether the links move with the arm's joints alone, and no joint follows another one."""
+        return len(self._joints) == self._bare.njoints - 1
+
+    @cached_property
+    def ranges(self) -> np.ndarray:
+        """The joints' limits in the URDF, (2, n) rad."""
+        return np.transpose([self._moves.limits(name) for name in self.names])
+
+    @cached_property
+    def base(self) -> tuple[tuple[int, np.ndarray], ...]:
+        """The k moments that gravity's torque can show: each a joint's number, and a unit vector (3,) in its frame.
+
+        Of a link's first moment the part along its joint's axis turns with the link before, as masses do: both count as
+        the first moments of that link. The rest are columns of the regressor, from which a QR decomposition in random
+        poses leaves out those that depend on others (M. Gautier, ICRA 1990).
+        """
+        random, across = np.random.default_rng(0), []
+        for n, joint in enumerate(self._joints):
+            if self._bare.inertias[joint].mass:
+                across += [(n, way) for way in self._across(n)]
+        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
+        down = random.normal(size=(BASE_POSES, 3))
+        columns = np.concatenate([self._columns(pose, way, across) for pose, way in zip(poses, down, strict=True)])
+        size = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
+        return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
+
+    def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the torque of each joint per unit of each moment of `base`: (m, n, k) in Nm per kg m.
+
+        theta: (m, n) rad. direction: (3,) or (m, 3), gravity's unit vector in the root link's axes. Gains do not count.
+        """
+        down = np.broadcast_to(direction, (len(theta), 3))
+        return np.array([self._columns(*one, self.base) for one in zip(theta, self.gravity * down, strict=True)])
+
+    @property
+    def moments(self) -> np.ndarray:
+        """The moments (k,) in kg m of `base`, of all that the arm holds."""
+        random = np.random.default_rng(1)
+        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
+        down = random.normal(size=(BASE_POSES, 3))
+        columns = [self._columns(pose, way, self.base) for pose, way in zip(poses, down, strict=True)]
+        pairs = zip(poses.tolist(), down.tolist(), strict=True)
+        torque = [np.divide(self._holding(pose, way, ZERO), self.gain) for pose, way in pairs]
+        return np.asarray(np.linalg.lstsq(np.concatenate(columns), np.concatenate(torque), rcond=None)[0])
+
+    def with_moments(self, moments: np.ndarray) -> UrdfArm:
+        """Return this arm with the `moments` (k,) kg m of `base`, of the robot alone. Raises ParameterError."""
+        change = self._change.copy()
+        own = self.with_payload(0.0).with_wearer(*np.zeros((2, len(self.gain)))).moments
+        for (n, way), difference in zip(self.base, moments - own, strict=True):
+            change[n] += difference * way
+        return self.corrected(change)
+
+    @cached_property
+    def _axes(self) -> np.ndarray:
+        """The joints' axes (n, 3) in their own frames."""
+        pin, model = self._pin, self._bare
+        pin.computeJointJacobians(model, self._data, pin.neutral(model))
+        own, axes = pin.ReferenceFrame.LOCAL, []
+        for joint in self._joints:
+            jacobian = np.reshape(pin.getJointJacobian(model, self._data, joint, own), (6, -1))
+            axes.append(jacobian[3:, model.joints[joint].idx_v].copy())
+        return np.array(axes)
+
+    def _across(self, n: int) -> np.ndarray:
+        """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
+        return np.asarray(np.linalg.svd(self._axes[n][None])[2][1:])
+
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (n,) rad, in the root link's axes.
+
+        The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
+        vectors (n, 3) across them, as far as possible along the links.
+        """
+        own, along = self._axes, []  # before the places, because it moves the joints
+        origins = self.places(theta)
+        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
+            across = way - axis * (axis @ way)
+            size = float(np.linalg.norm(across))
+            along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
+        axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
+        return origins, axes, links
+
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
+
+        While all angles are 0, in the root link's axes.
+        """
+        self.places([0.0] * len(self.names))
+        links = [self._bare.inertias[joint] for joint in self._joints]
+        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
+        return np.array([link.mass for link in links]), np.array(centres)
+
+    def places(self, theta: Sequence[float]) -> np.ndarray:
+        """Return where the joints are at `theta` (n,) rad, and the hand or the last joint again: (n + 1, 3) m.
+
+        In the root link's axes.
+        """
+        with self._lock:
+            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
+            frames = [self._data.oMi[joint] for joint in self._joints]
+            return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
+
+    def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
+        """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""
+        model, data, compute = self._bare, self._data, self._pin.computeJointTorqueRegressor
+        at, still = self._moves.configuration(theta.tolist()), np.zeros(model.nv)
+        with self._lock:
+            model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
+            whole = compute(model, data, at, still, still)
+            parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
+        moments = parts.reshape(len(self.names), -1, INERTIAL)[:, :, 1:4]
+        return np.stack([moments[:, self._joints[n] - 1] @ way for n, way in base], axis=-1)
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""

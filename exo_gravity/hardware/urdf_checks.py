@@ -141,6 +141,11 @@ class UrdfJoints:
                 raise ParameterError(f"position of {other.name}", position, "finite: the arm's torque depends on it")
             self._reported[other.name] = self._at[self.others.index(other)] = position
 
+    def limits(self, name: str) -> tuple[float, float]:
+        """Return the lowest and the highest angle of an arm's joint in rad; a continuous one may be anywhere."""
+        own = self._limits(name)
+        return own.lower, own.upper
+
     @property
     def fixed(self) -> tuple[str, ...]:
         """The other joints that are taken to be at 0, because none is reported."""

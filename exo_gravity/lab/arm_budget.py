@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.arm.arm import papers
+from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.wearer import PAPER_LINKS, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
 from exo_gravity.lab.budget import (
@@ -26,7 +27,7 @@ from exo_gravity.lab.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,6 +41,7 @@ LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}{:>12}"
 CELLS = 31  # of a map, along each axis
 REST = 5  # values of each angle that a map does not show
 OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
+MOST_RESTS, RANDOM_RESTS = 625, 200  # poses of the angles that a map does not show: at random if a grid has more
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,19 @@ class ArmBudget:
     """What each joint of an arm needs to carry its wearer's arm."""
 
     name: str  #: of the arm's namespace
-    carrying: ArmModel  #: with its share of the wearer's arm
+    joint_names: Sequence[str]
+    carrying: Arm  #: with its share of the wearer's arm
     support: float  #: 0..1, that share
     motors: Sequence[str]
-    bounds: np.ndarray  #: of its workspace, (2, 6) rad
+    bounds: np.ndarray  #: of its workspace, (2, n + 2) rad
+    by_urdf: bool  #: whether a URDF describes it
     joints: tuple[JointBudget, ...]
+
+    @property
+    def others(self) -> Sequence[int]:
+        """The second axis of each map: of an arm from a URDF the next joint, or the one before, or the pitch."""
+        count = len(self.joints)
+        return OTHER if not self.by_urdf else [n + 1 if n + 1 < count else n - 1 if n else 1 for n in range(count)]
 
     @property
     def is_beyond(self) -> bool:
@@ -59,20 +69,21 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(configured: ConfiguredArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
+def arm_budget(configured: AnyArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
     max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
     """
-    motors = configured.can_bridge["motor"]
-    robot = configured.robot.with_payload(payload, configured.compensator["payload.cog"])
+    values, motors = configured.compensator, configured.can_bridge["motor"]
+    names = configured.joint_names if configured.by_urdf else JOINTS
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
-        load = wearer.on_links(robot.length)
+        robot = configured.robot.with_payload(payload, values["payload.cog"])
+        load = wearer.on_links(configured.robot.length, values.get("wearer.links", PAPER_LINKS))
         torques = motor_torques(configured.can_bridge)
-        joints = budget(robot, load, joint_spring_of(configured.compensator), support, bounds, *torques)
+        joints = budget(robot, load, joint_spring_of(values), support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, carrying, support, motors, bounds, joints)
+    return ArmBudget(configured.namespace, names, carrying, support, motors, bounds, configured.by_urdf, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
@@ -81,7 +92,7 @@ def table_lines(arm: ArmBudget) -> Iterator[str]:
     for number, joint in enumerate(arm.joints):
         *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
         yield LINE.format(
-            f"{number + 1} {JOINTS[number]}",
+            f"{number + 1} {arm.joint_names[number]}",
             arm.motors[number],
             f"{joint.rated:.3g}",
             f"{joint.peak:.3g}",
@@ -107,18 +118,24 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
     else:
         yield f"The largest support within rated torque everywhere is {fits:g}."
-    moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in arm.carrying.first_moment)
+    if arm.by_urdf:
+        return
+    moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in papers(arm.carrying).first_moment)
     yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
 
 
 def joint_figure(arm: ArmBudget, joint: int) -> "Figure":
-    """Map the largest torque of a joint (0..3) over two angles: the maximum over the others and the trunk's tilt."""
+    """Map the largest torque of a joint (from 0) over two angles: the maximum over the others and the trunk's tilt."""
     from matplotlib.figure import Figure
 
-    other = OTHER[joint]
-    axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
-    axes[joint] = axes[other] = np.zeros(1)
-    rest = np.vstack((list(product(*axes)), arm.joints[joint].worst))
+    other = arm.others[joint]
+    if REST ** (len(arm.bounds.T) - 2) > MOST_RESTS:
+        points = np.random.default_rng(0).uniform(arm.bounds[0], arm.bounds[1], (RANDOM_RESTS, len(arm.bounds.T)))
+    else:
+        axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
+        axes[joint] = axes[other] = np.zeros(1)
+        points = np.array(list(product(*axes)))
+    rest = np.vstack((points, arm.joints[joint].worst))
     across, up = (np.linspace(low, high, CELLS) for low, high in arm.bounds.T[[joint, other]])
     points = np.tile(rest, (CELLS * CELLS, 1))
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
@@ -133,7 +150,10 @@ def joint_figure(arm: ArmBudget, joint: int) -> "Figure":
     for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
         if largest.min() < limit < largest.max():
             axis.clabel(axis.contour(*angles, largest, [limit], colors="red", linestyles=style), fmt=f"{limit:g} Nm")
-    axis.set_title(f"{arm.name} joint {joint + 1}, {JOINTS[joint]}: {arm.motors[joint]}", loc="left", weight="bold")
+    axis.set_title(
+        f"{arm.name} joint {joint + 1}, {arm.joint_names[joint]}: {arm.motors[joint]}", loc="left", weight="bold"
+    )
     axis.set_xlabel(f"Joint {joint + 1} (deg)")
-    axis.set_ylabel(f"Joint {other + 1} (deg); maximum over the other joints and the trunk's tilt")
+    second = f"Joint {other + 1}" if other < len(arm.joints) else "Trunk's pitch"
+    axis.set_ylabel(f"{second} (deg); maximum over the other joints and the trunk's tilt")
     return figure

@@ -16,17 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.wearer import Tissue
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import scale_at
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats
+from exo_gravity.core.numbers import Vector, floats
 from exo_gravity.core.safety.limits import HEAT
 
-Cost = Callable[[np.ndarray], np.ndarray]  # points (n, 6) -> (n, 4)
+Cost = Callable[[np.ndarray], np.ndarray]  # points (m, n + 2) -> (m, n)
 
 USUAL_TILT = 20.0  # deg of trunk pitch and roll, in both directions, that a budget covers by default
 SAMPLES = 50_000  # random poses, which give shares to within 0.5 %
@@ -43,7 +42,7 @@ def motor_for(torque: float) -> str | None:
 
 
 def motor_torques(bridge: Mapping[str, Any]) -> np.ndarray:
-    """Return rated and peak torque (2, 4) in Nm of the motors of `can_bridge`'s parameter values.
+    """Return rated and peak torque (2, n) in Nm of the motors of `can_bridge`'s parameter values.
 
     They are as warm as they may be with all of their torque. Raises ParameterError.
     """
@@ -52,15 +51,15 @@ def motor_torques(bridge: Mapping[str, Any]) -> np.ndarray:
     warm = HEAT.most - HEAT.span
     weakest = [min(scale, scale_at(scale, slope, reference, warm)) for scale, slope, reference in columns]
     # A motor that gives less than commanded already reaches its rated current when its rated torque is commanded.
-    scale = np.minimum(four_floats("torque_scale", weakest, 0.1, 2.0), 1.0)
+    scale = np.minimum(floats("torque_scale", weakest, len(weakest), 0.1, 2.0), 1.0)
     torques = [(MOTORS[name].rated_torque, MOTORS[name].peak_torque) for name in bridge["motor"]]
     return np.asarray(scale * np.transpose(torques))
 
 
 def workspace(position_min: Vector, position_max: Vector, max_tilt: float) -> np.ndarray:
-    """Return the lowest and the highest point (2, 6): four joint angles, then pitch and roll of the trunk, in rad.
+    """Return the lowest and the highest point (2, n + 2): the joint angles, then pitch and roll of the trunk, in rad.
 
-    position_min, position_max: the joint limits, (4,) rad. max_tilt: of the trunk, in either direction, rad.
+    position_min, position_max: the joint limits, (n,) rad. max_tilt: of the trunk, in either direction, rad.
     """
     return np.array(((*position_min, -max_tilt, -max_tilt), (*position_max, max_tilt, max_tilt)))
 
@@ -72,7 +71,7 @@ class JointBudget:
     rated: float  #: Nm, of its motor
     peak: float  #: Nm
     torque: float  #: Nm, the largest needed in the workspace
-    worst: np.ndarray  #: (6,) rad, the pose and the trunk's pitch and roll at which it is needed
+    worst: np.ndarray  #: (n + 2,) rad, the pose and the trunk's pitch and roll at which it is needed
     within_rated: float  #: share 0..1 of the workspace in which the motor stays within its rated torque, rounded down
     within_peak: float  #: the same for peak torque
     #: the largest support 0..1 at which the joint stays within rated torque everywhere, rounded down; None: the robot
@@ -105,17 +104,17 @@ def overload(names: Sequence[str], joints: Sequence[JointBudget]) -> str:
     return f"motors overloaded: {', '.join(needs)}; {remedy}"
 
 
-def torque_at(arm: ArmModel, points: np.ndarray) -> np.ndarray:
-    """Return the exact torque (n, 4) in Nm at points (n, 6): joint angles, then pitch and roll of the trunk, in rad."""
-    pitch, roll = points[:, JOINT_COUNT], points[:, JOINT_COUNT + 1]
+def torque_at(arm: Arm, points: np.ndarray) -> np.ndarray:
+    """Return the exact torque (m, n) in Nm at points (m, n + 2) in rad: joint angles, pitch and roll of the trunk."""
+    pitch, roll = points[:, -2], points[:, -1]
     # This is `Tilt.of` for arrays and the left arm. A workspace has both signs of roll, so it covers the right arm too.
     level = np.cos(pitch)
     directions = np.stack((-np.sin(roll) * level, np.sin(pitch), np.cos(roll) * level), axis=1)
-    return gravity_torque(arm, points[:, :JOINT_COUNT], directions)
+    return arm.torques(points[:, :-2], directions)
 
 
 def budget(
-    robot: ArmModel,
+    robot: Arm,
     load: tuple[Vector, Vector],
     spring: JointSpring,
     support: float,
@@ -125,16 +124,16 @@ def budget(
 ) -> tuple[JointBudget, ...]:
     """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
 
-    load: mass (4,) in kg and centre of gravity (4,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. spring:
-    the device's own. bounds: of the workspace, (2, 6) rad. rated, peak: (4,) Nm at the joints. Raises ParameterError if
-    the load does not fit the robot.
+    load: mass (n,) in kg and centre of gravity (n,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. spring:
+    the device's own. bounds: of the workspace, (2, n + 2) rad. rated, peak: (n,) Nm at the joints. Raises
+    ParameterError if the load does not fit the robot.
     """
     return budget_worn(robot, robot.with_wearer(*load), (spring, Tissue()), support, bounds, rated, peak)
 
 
 def budget_worn(
-    robot: ArmModel,
-    full: ArmModel,
+    robot: Arm,
+    full: Arm,
     springs: tuple[JointSpring, Tissue],
     support: float,
     bounds: np.ndarray,
@@ -142,19 +141,22 @@ def budget_worn(
     peak: Vector,
 ) -> tuple[JointBudget, ...]:
     """Return the same where `full` is the robot with the wearer's whole arm. springs: the device's and the wearer's."""
-    spring, tissue = springs
+    (spring, tissue), count = springs, len(rated)
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the torques (n, 4) in Nm of robot and springs, and what the wearer's arm adds; points: (n, 6)."""
+        """Return the torques (m, n) in Nm of robot and springs, and what the wearer's arm adds."""
         chunks = []
         for chunk in np.array_split(points, len(points) // CHUNK + 1):
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        theta = points[:, :JOINT_COUNT]
-        return own + spring.torques(theta), with_all - own + tissue.torques(theta)
+        theta, added = points[:, :count], with_all - own
+        if any(tissue.joint_stiffness):
+            added = added + tissue.torques(theta)
+        return own + spring.torques(theta), added
 
-    points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, JOINT_COUNT + 2))
-    starts = np.vstack((points[: SAMPLES // 5] * (1, 1, 1, 1, 0, 0), points))  # those with an upright trunk first
+    points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, count + 2))
+    upright = np.repeat((1.0, 0.0), (count, 2))
+    starts = np.vstack((points[: SAMPLES // 5] * upright, points))  # those with an upright trunk first
 
     def need(at: np.ndarray) -> np.ndarray:
         own, added = torques(at)
@@ -184,10 +186,10 @@ def budget_worn(
 def _worst(
     cost: Cost, joint: int, bounds: np.ndarray, starts: np.ndarray, costs: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the point (6,) with the largest cost of `joint`, and that cost.
+    """Return the point (n + 2,) with the largest cost of `joint`, and that cost.
 
-    Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (m,), of `starts`
-    (m, 6).
+    Among equal points it prefers upright ones and sets as many coordinates as possible to 0. costs: (k,), of `starts`
+    (k, n + 2).
     """
     low, high = bounds
     chosen = sorted({*np.argsort(costs)[-STARTS:].tolist(), int(np.argmax(costs[: SAMPLES // 5]))})

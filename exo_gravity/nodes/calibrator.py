@@ -25,9 +25,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN, NodeState
-from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.lab.calibration.tour import calibrator_table, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
-from exo_gravity.nodes.ros.parameters import declare
+from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
     NEWEST_ONLY,
@@ -47,10 +47,10 @@ class CalibratorNode(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator", automatically_declare_parameters_from_overrides=True)
-        values = declare(self, CALIBRATOR)
+        values = declare(self, calibrator_table(given_to(self)))
         self._names, self._uses_imu = values["joint_names"], values["use_imu"]
         self._tour = tour_of(values)
-        self._tilt = TiltInput(values["side"], values["tilt_timeout"])
+        self._tilt = TiltInput(values.get("side", "left"), values["tilt_timeout"])
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._bridge_state, self._bridge_message = "", ""
         self._began = False
@@ -95,7 +95,7 @@ class CalibratorNode(Node):
         self._publisher.publish(self._command)
 
     def _effort(self, position: tuple[float, ...], velocity: tuple[float, ...]) -> Torque | None:
-        """Return the effort (4,) in Nm, None to withdraw."""
+        """Return the effort (n,) in Nm, None to withdraw."""
         now = time.monotonic()
         with self._lock:
             tilt, state = self._tilt.at(now), self._bridge_state

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.arms import any_arm, configured_arm
 from exo_gravity.tools.cli import extras, require_ros
 
 if TYPE_CHECKING:
@@ -56,8 +56,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
         elif name == "motors":
             option(
-                "--pose", type=float, nargs=4, default=(0.0,) * 4, metavar="DEG",
-                help="joint angles at which zero is measured, if the arm is in a jig (default: 0 0 0 0, it hangs)",
+                "--pose", type=float, nargs="+", default=(), metavar="DEG",
+                help="joint angles at which zero is measured, if the arm is in a jig (default: home, it hangs)",
             )  # fmt: skip
         else:
             option("--bag", type=Path, metavar="FOLDER", help="use this recording instead of the device")
@@ -126,7 +126,7 @@ def _run(options: argparse.Namespace) -> int:
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
     options.wait = person.wait
-    arm = None if command == "imu" else configured_arm(options.params, options.side)
+    arm = None if command == "imu" else any_arm(options.params, options.side)
     if options.bag is None and command != "motors":
         require_ros("calibrate")
     module = import_module(f"exo_gravity.lab.calibration.{COMMANDS[command][0]}")

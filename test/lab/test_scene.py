@@ -3,12 +3,15 @@
 
 import math
 
+import mujoco
 import numpy as np
 import pinocchio
 import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.inputs.arms import any_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.view.scene import (
     AMBER,
     GREEN,
@@ -21,7 +24,8 @@ from exo_gravity.lab.view.scene import (
     gravity_shapes,
     state_of,
 )
-from exo_gravity.lab.view.urdf import ArmDescription, arm_pose, urdf
+from exo_gravity.lab.view.urdf import ArmDescription, described, urdf
+from exo_gravity.sim.urdf import UrdfConfig
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ROBOT = ArmModel((0.05, 0.13, 0.3, 0.3), (0.04, 0.1, 0.2, 0.15), (0.6, 0.5, 0.6, 0.2))
@@ -46,7 +50,7 @@ def test_the_pose_is_that_of_the_description(side):
     data, rng = model.createData(), np.random.default_rng(1)
     for theta in rng.uniform(-math.pi, math.pi, (50, 4)):
         pinocchio.framesForwardKinematics(model, data, theta)
-        origins, axes, _ = arm_pose(arm(side), theta)
+        origins, axes, _ = arm(side).pose(theta)
         frames = [data.oMf[model.getFrameId(name)] for name in arm(side).links]
         assert origins == pytest.approx(np.array([frame.translation for frame in frames]), abs=1e-12)
         # The description's own axes, in the frames of the links, which turn about them.
@@ -58,7 +62,7 @@ def test_the_pose_is_that_of_the_description(side):
 
 def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle():
     theta = (0.3, 0.8, 0.5, 1.0)
-    origins, _, _ = arm_pose(arm(), theta)
+    origins, _, _ = arm().pose(theta)
     shapes = lines(arm_shapes(view(theta)), "limits")
     for n, (arc, needle) in enumerate(zip(shapes[0::2], shapes[1::2], strict=True)):
         assert np.linalg.norm(arc.points - origins[n], axis=1) == pytest.approx(SIZES.range_radius)
@@ -74,7 +78,7 @@ def test_a_joint_near_its_limit_is_red():
 
 def test_a_torque_spans_its_share_of_the_limit_in_its_direction_and_is_red_at_the_limit():
     shapes = lines(arm_shapes(view(effort=(0.0, 4.5, -1.0, 3.0))), "torques")
-    origins, axes, _ = arm_pose(arm(), STILL)
+    origins, axes, _ = arm().pose(STILL)
     for n, share in enumerate((0.0, 0.5, -1.0 / 3.0, 1.0)):
         start, end = ((shapes[n].points[i] - origins[n]) / SIZES.torque_radius for i in (0, -1))
         turn = math.atan2(np.cross(start, end) @ axes[n], start @ end)
@@ -104,3 +108,25 @@ def test_gravity_points_along_its_vector_and_without_a_tilt_there_is_no_arrow():
 )
 def test_the_state_is_shown_by_colour_and_words(state, more, shown):
     assert state_of(view(state=state, **more)) == shown
+
+
+def test_the_picture_of_a_seven_joint_arm_has_its_joints_where_mujoco_has_them() -> None:
+    arm = any_arm(packaged_config("seven_joints.yaml"), "right")
+    picture, random = described(arm.compensator, arm.can_bridge), np.random.default_rng(0)
+    text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
+    given, _ = UrdfConfig(text=text, joint_names=arm.joint_names, hand="hand").models()
+    drawn = mujoco.MjModel.from_xml_string(urdf([picture]))
+    assert picture.side == "right" and [drawn.joint(n).name for n in range(drawn.njnt)] == list(arm.joint_names)
+    truth, shown = mujoco.MjData(given), mujoco.MjData(drawn)
+    for _ in range(20):
+        theta = random.uniform(arm.low, arm.high)
+        truth.qpos[:] = shown.qpos[:] = theta
+        mujoco.mj_kinematics(given, truth)
+        mujoco.mj_kinematics(drawn, shown)
+        origins, axes, along = picture.pose(theta.tolist())
+        np.testing.assert_allclose(origins[:-1], truth.xanchor, atol=1e-9)
+        np.testing.assert_allclose(axes, truth.xaxis, atol=1e-9)
+        np.testing.assert_allclose(origins[:-1], shown.xanchor, atol=1e-5)
+        np.testing.assert_allclose(np.einsum("na,na->n", axes, along), 0.0, atol=1e-9)
+    view = ArmView(picture, theta.tolist(), [0.0] * drawn.njnt, [1.0] * drawn.njnt, "active")
+    assert len([shape for shape in arm_shapes(view) if shape.group == "torques"]) == 2 * drawn.njnt

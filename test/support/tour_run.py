@@ -18,6 +18,7 @@ from exo_gravity.core.compensation.tracking import Station
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.lab.calibration.tour import Tour
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -55,7 +56,7 @@ class TourRun:
         device.pitch, device.roll = self.tilt
         tilt = Tilt.of("right", *self.tilt)
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
-        guess = TorqueGuess(self.assumed.length, moments, tilt, self.assumed.gravity)
+        guess = TorqueGuess(PapersMoments(self.assumed), moments, tilt)
         tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
         player = Player(tour, device, MOTORS_AS_MOUNTED, self.limits, self.rate, tilt, self._disturb)
         self.device, self.log = device, player.log

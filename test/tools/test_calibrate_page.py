@@ -15,6 +15,7 @@ from exo_gravity.core.arm.gravity import gravity_torque, load_moments, regressor
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.lab.calibration.identification import fit_friction, identify
+from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders
 from exo_gravity.lab.inputs.arms import configured_arm
 
@@ -51,9 +52,11 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
         Observation(theta, DOWN, torque, FRICTION, np.full(4, 0.005), *(LOAD if loaded else (0.0, 0.0)))
         for theta, torque, loaded in zip(POSES, effort, LOADED, strict=True)
     )
-    result = identify(taken, ROBOT.length)
+    result = identify(taken, PapersMoments(ROBOT))
     change = Change("/right/compensator", "robot.first_moment", result.moments.tolist(), "kg m, <±0.001>")
-    found = CalibrationResult((change,), ("M4 is 20 % larger.",), (), configured_arm(), taken, result)
+    found = CalibrationResult(
+        (change,), ("M4 is 20 % larger.",), (), configured_arm(), PapersMoments(ROBOT), taken, result
+    )
     return replace(found, **changes)  # type: ignore[arg-type]
 
 
@@ -65,7 +68,7 @@ def found() -> CalibrationResult:
 
 def remainders_of(result: CalibrationResult) -> tuple[np.ndarray, ...]:
     assert result.identified and result.arm
-    return remainders(result.identified, result.arm, result.observations)
+    return remainders(result.identified, result.arm, PapersMoments(ROBOT), result.observations)
 
 
 def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found: CalibrationResult) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import LENGTH, Device
+from bench.calibration.random_device import LENGTH, PAPERS, Device
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
@@ -73,16 +73,16 @@ def sprung(device: Device, stiffness: float, rest: float, **tour: int) -> list[O
 def test_springs_are_found_where_there_are_some_and_nowhere_else() -> None:
     for seed in range(300, 306):
         device = Device(seed)
-        found = identify(sprung(device, 0.15, 0.4, bare=8, weighed=8), LENGTH)
+        found = identify(sprung(device, 0.15, 0.4, bare=8, weighed=8), PAPERS)
         np.testing.assert_allclose(found.stiffness[1:], 0.15, atol=0.02)
         assert np.all(np.abs(found.stiffness - 0.15)[1:] < 3.5 * found.stiffness_error[1:])
-        assert not np.any(identify(device.tour(bare=8, weighed=8), LENGTH).stiffness)
+        assert not np.any(identify(device.tour(bare=8, weighed=8), PAPERS).stiffness)
 
 
 def test_a_hand_on_the_arm_in_one_pose_is_no_spring() -> None:
     tour = Device(7).tour(bare=12, weighed=0)
     tour[5] = tour[5]._replace(effort=tour[5].effort + np.array((0.0, 0.0, 0.8, 0.0)))
-    found = identify(tour, LENGTH)
+    found = identify(tour, PAPERS)
     assert [index for index, _ in found.rejected] == [5]
     assert not np.any(found.stiffness)
 

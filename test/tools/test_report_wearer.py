@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -13,8 +14,10 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.report import trial_report, wearer_share
 from exo_gravity.lab.trial.recording import Recording
+from exo_gravity.sim.urdf import UrdfConfig
 
 from ..support.synthetic_bags import bag_of
 
@@ -79,3 +82,36 @@ def test_a_hanging_arm_has_nothing_to_carry():
     hanging = Recording("right", JOINTS, TIME, still, still, still, still)
     report = trial_report.analyse(bag_of(hanging, parameters=parameters(use_imu=False)))
     assert "nothing to carry" in wearer_share.sentence(report.wearers["right"], Source.UNKNOWN)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_the_share_of_each_joint_of_a_seven_joint_arm_is_found_and_its_page_shows_all_joints(share, tmp_path):
+    nodes = load(packaged_config("seven_joints.yaml"))
+    given = nodes["/right/compensator"]
+    names, text = given["joint_names"], packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
+    mass, cog = [0.0, 0.0, 1.5, 0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.12, 0.0, 0.1, 0.0, 0.0]
+    pose = [0.6, 0.5, 0.3, 0.9, 0.2, 0.3, -0.2]
+
+    def needed(worn):
+        config = UrdfConfig(text=text, joint_names=names, hand="hand", wearer_mass=worn, wearer_cog=cog)
+        model, _ = config.models()
+        model.opt.gravity = 9.80665 * gravity_in_trunk(0.0, 0.0)
+        data = mujoco.MjData(model)
+        data.qpos[:] = pose
+        mujoco.mj_forward(model, data)
+        return data.qfrc_bias.copy()
+
+    effort = needed([(1.0 - share) * m for m in mass])
+    rows = [np.tile(row, (len(TIME), 1)) for row in (pose, [0.0] * 7, effort, effort)]
+    recording = Recording("right", tuple(names), TIME, *rows, carried=((1.0, 7.0),))
+    values = {**given, "wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 1.0}
+    recorded_values = {"/right/compensator": yaml.safe_dump({"/right/compensator": {"ros__parameters": values}})}
+    report = trial_report.analyse(bag_of(recording, parameters=recorded_values))
+    part = report.wearers["right"]
+    assert part.whole.value == pytest.approx(share, abs=0.005)
+    known = np.isfinite(part.joints.value)
+    assert known.sum() >= 3
+    np.testing.assert_allclose(part.joints.value[known], share, atol=0.005)
+    trial_report.write(report, tmp_path)
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert all(name.replace("_", " ") in page for name in names)

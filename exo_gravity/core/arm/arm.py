@@ -19,7 +19,7 @@ from exo_gravity.core.arm.arm_data import (
     ModelError,
     moments_along,
 )
-from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, moments_of
+from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, gravity_torque, moments_of
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
 from exo_gravity.core.numbers import Vector
@@ -47,6 +47,7 @@ class ArmModel(ArmData):
     """The paper's arm of Table 1; `ArmData` says what it is made of, `interface.Arm` what each method is for."""
 
     torque = exact_torque
+    torques = gravity_torque
     turning_torque = turning_torque
 
     @property

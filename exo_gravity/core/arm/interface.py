@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
@@ -46,6 +47,11 @@ class Links(Protocol):
 
 class Arm(Protocol):
     """An arm of n joints with what it holds. Immutable; equal arms have equal hashes."""
+
+    @property
+    def length(self) -> Vector:
+        """(n,) m of each link."""
+        ...
 
     @property
     def gain(self) -> np.ndarray:
@@ -98,6 +104,13 @@ class Arm(Protocol):
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad."""
+        ...
+
+    def torques(self, theta: ArrayLike, direction: ArrayLike) -> np.ndarray:
+        """Return the torque (m, n) in Nm that holds the arm at `theta` (m, n) rad.
+
+        direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
+        """
         ...
 
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:

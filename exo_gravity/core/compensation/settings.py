@@ -275,6 +275,9 @@ URDF = (
     URDF_HAND,
     Param("wearer.links", list(PAPER_LINKS), "which links carry the upper arm, and forearm and hand, from 1 on; 0: the "
           "robot does not carry it", (0, MAX_JOINTS), vector=True, fixed=True),
+    *(Param(f"urdf.moment_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: what the first moment of each joint's "
+            f"link has beyond the URDF's, along {axis} of the joint's frame", (-MAX_MOMENT, MAX_MOMENT), "kg m",
+            fixed=True, expert=True) for axis in "xyz"),
 )
 PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
          "wearer.first_moment", "wearer.off_axis"}

@@ -5,8 +5,8 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 
     effort = (torque(moments + load) + spring theta) / scale + offset
 
-where torque is `core.arm.gravity.regressor` times the moments. A spring across a joint, and a slope of its scale over
-the motor's temperature, are identified only where the poses ask for them (`pose_fit.asked_for`).
+where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint, and a slope of its
+scale over the motor's temperature, are identified only where the poses ask for them (`pose_fit.asked_for`).
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
@@ -27,28 +27,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import MOMENTS
 from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.numbers import Vector
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
-    ANGLE,
-    COUNT,
     DISTURBED,
-    EXTRAS,
     FIT,
-    MOMENT,
-    OFFSET,
-    SCALE,
-    SLOPE,
-    SPRING,
-    START,
-    TILT,
+    FitLayout,
     asked_for,
     bounded,
     final,
+    layout_of,
     possible_extras,
     robust,
     rows_of,
@@ -56,7 +48,7 @@ from exo_gravity.lab.calibration.pose_fit import (
     without_each_pose,
     without_outliers,
 )
-from exo_gravity.lab.calibration.poses import missing_pose
+from exo_gravity.lab.calibration.poses import missing_pose, shown_by
 
 
 @dataclass(frozen=True)
@@ -68,6 +60,7 @@ class Acceptance:
     least_misfit: float = 0.1  #: Nm
     least_zero_error: float = 0.5  #: deg worth a sentence
     slope: float = 0.005  #: 1/K; magnets lose 0.001 to 0.002
+    least_torque: float = 0.3  #: Nm, root mean square of a joint in any pose, from which it is compared with the URDF's
 
 
 ACCEPTED = Acceptance()
@@ -88,50 +81,48 @@ class FrictionFit:
 FRICTION = FrictionFit()
 
 
-# Unknowns of joint 1, which carries nothing while its axis is vertical.
-FIRST_JOINT = (0, MOMENTS.index("W"), SCALE.start, OFFSET.start)
-NAMES = (*MOMENTS, *(f"{what} {n + 1}" for what in ("torque scale", "offset") for n in range(JOINT_COUNT)))
 LEAN = "lean the stand by 10 to 14 degrees to the arm's side, where the arm still hangs close to its home"
 
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The result of `identify` from n observations. Two standard errors cover 95 %, also for few poses."""
+    """The result of `identify` from m observations of n joints. Two standard errors cover 95 %, also for few poses."""
 
-    moments: np.ndarray  #: (8,) kg m in the order of `MOMENTS`
-    error: np.ndarray  #: (8,) kg m, their standard errors, infinite where the poses do not show a moment, which is 0
-    scale: np.ndarray  #: (4,), true torque per commanded torque
-    scale_error: np.ndarray  #: (4,), standard errors, infinite where not known
-    offset: np.ndarray  #: (4,) Nm as commanded
-    friction: np.ndarray  #: (4,) Nm as commanded
-    residual: np.ndarray  #: (n, 4) Nm, effort minus prediction
-    held_out: np.ndarray  #: (n, 4) Nm, the same predicted without that pose, NaN where the others do not suffice
+    moments: np.ndarray  #: (k,) kg m in the order of the model's names
+    #: (k,) kg m, their standard errors, infinite where the poses do not show a moment, which is then the model's start
+    error: np.ndarray
+    scale: np.ndarray  #: (n,), true torque per commanded torque
+    scale_error: np.ndarray  #: (n,), standard errors, infinite where not known
+    offset: np.ndarray  #: (n,) Nm as commanded
+    friction: np.ndarray  #: (n,) Nm as commanded
+    residual: np.ndarray  #: (m, n) Nm, effort minus prediction
+    held_out: np.ndarray  #: (m, n) Nm, the same predicted without that pose, NaN where the others do not suffice
     singular_values: np.ndarray  #: of the information in the poses, the largest first; below 1: not known
     unknown: tuple[str, ...]  #: sentences on what the poses do not show, and what would
     rejected: tuple[tuple[int, str], ...]  #: index and reason of each observation that is not used
-    #: No weight was hung: the product of the scales of joints 2 to 4 is taken as 1, moments are in commanded torque.
+    #: No weight was hung: the product of the compared scales is taken as 1, moments are in commanded torque.
     relative: bool
     tilt: np.ndarray  #: (3,) rad in the base frame, rotation of gravity from the measured to the true direction
     tilt_covariance: np.ndarray  #: (3, 3); one lean of the stand does not show the turn about gravity, two do
-    stiffness: np.ndarray  #: (4,) Nm/rad of the springs across the joints, 0 where the poses ask for none
-    stiffness_error: np.ndarray  #: (4,), standard errors, 0 where there is none
-    rest: np.ndarray  #: (4,) rad, where they are slack: a joint with a spring has its offset in it
-    slope: np.ndarray  #: (4,) 1/K of the scales over the motors' temperatures, 0 where the poses ask for none
-    slope_error: np.ndarray  #: (4,), standard errors, 0 where there is none
-    temperature: np.ndarray  #: (4,) degC, mean of the motors, at which `scale` is true; NaN where not known
+    stiffness: np.ndarray  #: (n,) Nm/rad of the springs across the joints, 0 where the poses ask for none
+    stiffness_error: np.ndarray  #: (n,), standard errors, 0 where there is none
+    rest: np.ndarray  #: (n,) rad, where they are slack: a joint with a spring has its offset in it
+    slope: np.ndarray  #: (n,) 1/K of the scales over the motors' temperatures, 0 where the poses ask for none
+    slope_error: np.ndarray  #: (n,), standard errors, 0 where there is none
+    temperature: np.ndarray  #: (n,) degC, mean of the motors, at which `scale` is true; NaN where not known
 
     @property
     def left_offset(self) -> np.ndarray:
-        """The part of the offset that no spring carries, (4,) Nm as commanded."""
+        """The part of the offset that no spring carries, (n,) Nm as commanded."""
         return self.offset + self.stiffness * self.rest / self.scale
 
 
-def identify(observations: Sequence[Observation], length: Vector, gravity: float = STANDARD_GRAVITY) -> Identified:
-    """Return what the observations show of an arm with links of `length` (4,) m.
+def identify(observations: Sequence[Observation], model: MomentModel) -> Identified:
+    """Return what the observations show of an arm.
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    plain = rows_of(observations, length, gravity)
+    at, plain = layout_of(model), rows_of(observations, model)
     extras = asked_for(plain, possible_extras(plain), robust)
     while True:
         rows = plain.with_extras(extras)
@@ -140,51 +131,59 @@ def identify(observations: Sequence[Observation], length: Vector, gravity: float
         if fewer == extras:
             break
         extras = fewer
-    used, solution = bounded(rows.only(keep))
+    used, solution = bounded(rows.only(keep), model.positive)
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
         raise DataError(f"the poses do not fit one arm: {misfit}. {DISTURBED}")
     direction, is_relative = observations[-1].direction, not np.any(used.load)
     hidden = solution.hidden > FIT.hidden
-    _check_known(hidden, len(observations), direction, gravity, is_relative)
-    unknowns = np.where(hidden, START, solution.unknowns)
-    unknowns[[index for index in EXTRAS if index not in extras]] = 0.0  # exactly
+    _check_known(hidden, len(observations), direction, model, is_relative)
+    unknowns = np.where(hidden, rows.start, solution.unknowns)
+    unknowns[[index for index in at.extras if index not in extras]] = 0.0  # exactly
     # Student's distribution: for few poses two standard errors would cover less than 95 %.
     covariance = solution.covariance * (1.0 + 1.25 / (solution.freedom.min() + 6.0)) ** 2
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
-    moments, scale = unknowns[MOMENT], np.exp(unknowns[SCALE])
-    check_physical(moments, error[MOMENT], scale, direction, gravity)
-    stiffness, slope = unknowns[SPRING], unknowns[SLOPE]
+    moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
+    check_physical(moments, error[at.moment], scale, direction, model)
+    stiffness, slope = unknowns[at.spring], unknowns[at.slope]
     _check_extras(stiffness, slope)
-    slack = -unknowns[OFFSET] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
+    slack = -unknowns[at.offset] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
     residual = rows.effort - rows.predicted(solution.unknowns)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
     friction = np.median([observation.friction for observation in observations], axis=0)
     return Identified(
-        moments, error[MOMENT], scale, scale * error[SCALE], unknowns[OFFSET], friction, residual, held_out,
-        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative)), rejected, is_relative,
-        unknowns[TILT], covariance[TILT, TILT], stiffness, error[SPRING] * (stiffness > 0.0),
-        np.clip(slack, -MAX_REST, MAX_REST), slope, error[SLOPE] * (slope != 0.0),
+        moments, error[at.moment], scale, scale * error[at.scale], unknowns[at.offset], friction, residual, held_out,
+        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative, model)), rejected,
+        is_relative, unknowns[at.tilt], covariance[at.tilt, at.tilt], stiffness,
+        error[at.spring] * (stiffness > 0.0), np.clip(slack, -MAX_REST, MAX_REST), slope,
+        error[at.slope] * (slope != 0.0),
         temperatures(observations).mean(axis=0),
     )  # fmt: skip
 
 
-def _check_known(hidden: np.ndarray, count: int, direction: Vector, gravity: float, is_relative: bool) -> None:
-    """Raise DataError that names what is missing if `count` poses do not show `hidden` (COUNT,) of joints 2 to 4."""
-    missing = hidden.copy()
-    missing[list(FIRST_JOINT)] = False
-    if np.all(missing[SCALE][1:]) and not is_relative:
+def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: MomentModel, is_relative: bool) -> None:
+    """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
+    at = layout_of(model)
+    missing = hidden & shown_by(model, model.suggested, direction)
+    missing[list(model.optional)] = False
+    if np.all(missing[at.scale][list(model.compared)]) and not is_relative:
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     if np.any(missing):
-        names = ", ".join(NAMES[index] for index in np.flatnonzero(missing))
-        pose = missing_pose(missing, direction, gravity)
+        names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
+        pose = missing_pose(missing, direction, model)
         raise DataError(f"{count} poses do not show {names}: add the pose {pose}")
 
 
+def _names(model: MomentModel) -> tuple[str, ...]:
+    """Return the names of moments, scales and offsets."""
+    joints = range(1, model.count + 1)
+    return (*model.names, *(f"{what} {n}" for what in ("torque scale", "offset") for n in joints))
+
+
 def _check_extras(stiffness: np.ndarray, slope: np.ndarray) -> None:
-    """Raise DataError unless a device can have springs of `stiffness` (4,) Nm/rad and these slopes (4,) in 1/K."""
+    """Raise DataError unless a device can have springs of `stiffness` (n,) Nm/rad and these slopes (n,) in 1/K."""
     for joint in np.flatnonzero(stiffness > MAX_STIFFNESS):
         most = f"must be at most {MAX_STIFFNESS:g}: does a spring carry the arm, or does the joint touch a stop?"
         raise DataError(f"joint {joint + 1}: a spring of {stiffness[joint]:.2f} Nm/rad: {most}")
@@ -194,17 +193,24 @@ def _check_extras(stiffness: np.ndarray, slope: np.ndarray) -> None:
 
 
 def check_physical(
-    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: Vector, gravity: float
+    moments: np.ndarray, error: np.ndarray, scale: np.ndarray, direction: Vector, model: MomentModel
 ) -> None:
-    """Raise DataError unless an arm can have the moments (8,) kg m and scales (4,), and their `error` (8,) is small."""
+    """Raise DataError unless an arm can have the moments (k,) kg m and scales (n,), and their `error` (k,) is small."""
     low, high = ACCEPTED.scales
     for joint in np.flatnonzero((scale < low) | (scale > high)):
         expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
         raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
+    if model.names == MOMENTS:
+        _check_papers_arm(moments, error, direction, model)
+    else:
+        _check_like(moments, direction, model)
+
+
+def _check_papers_arm(moments: np.ndarray, error: np.ndarray, direction: Vector, model: MomentModel) -> None:
     for index in (1, 2, 3):
         moment, uncertain = f"{MOMENTS[index]} = {moments[index]:.3f} kg m", error[index]
         if uncertain > abs(moments[index]):
-            pose = missing_pose(np.arange(COUNT) == index, direction, gravity)
+            pose = missing_pose(np.arange(layout_of(model).count) == index, direction, model)
             raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
         if moments[index] <= 0.0:
             raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")
@@ -215,17 +221,43 @@ def check_physical(
             raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
 
 
-def _unknown(unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool) -> Iterator[str]:
-    """Yield what the poses do not show, and what would, in sentences; unknowns and `hidden`: (COUNT,)."""
+def _check_like(moments: np.ndarray, direction: Vector, model: MomentModel) -> None:
+    """Raise DataError unless each joint needs about the torque that it needs by the description of the arm."""
+    rows = model.rows(model.suggested, np.asarray(direction))
+    found, given = rows @ moments, rows @ model.moments
+    size = (given**2).sum(axis=0)
+    low, high = ACCEPTED.scales
+    for joint in np.flatnonzero(np.sqrt(size / len(rows)) > ACCEPTED.least_torque):
+        share = float((found[:, joint] * given[:, joint]).sum() / size[joint])
+        if not low <= share <= high:
+            expected = f"from {low:g} to {high:g}: are its direction, its zero and the URDF's masses right?"
+            raise DataError(f"joint {joint + 1} needs {share:.2g} times the torque of the URDF: must be {expected}")
+
+
+def _unknown(
+    unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool, model: MomentModel
+) -> Iterator[str]:
+    """Yield what the poses do not show, and what would, in sentences; unknowns and `hidden`: (count,)."""
+    at = layout_of(model)
     if relative:
-        yield "A common factor of all torque scales and moments: hang a known weight on link 4."
-    if names := ", ".join(NAMES[index] for index in np.flatnonzero(hidden[: ANGLE.start])):
-        yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
+        yield f"A common factor of all torque scales and moments: hang a known weight on link {model.count}."
+    names = ", ".join(name for name, is_hidden in zip(_names(model), hidden, strict=False) if is_hidden)
+    if model.names == MOMENTS:
+        if names:
+            yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
+        yield from _zeros(unknowns, covariance, at)
+    elif names:
+        yield f"{names}: no pose shows them while the base stands as it does; the file's values are kept."
+
+
+def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: FitLayout) -> Iterator[str]:
+    """Yield what an error of a zero of the paper's arm looks like."""
     for joint, along, across in ((4, 3, 7), (3, 2, 6)):
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
         yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
-    elbow, elbow_error = math.degrees(unknowns[ANGLE][0]), math.degrees(math.sqrt(covariance[ANGLE, ANGLE][0, 0]))
+    elbow = math.degrees(unknowns[at.angle][0])
+    elbow_error = math.degrees(math.sqrt(covariance[at.angle, at.angle][0, 0]))
     if elbow and abs(elbow) > max(3.0 * elbow_error, ACCEPTED.least_zero_error):
         yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
 

@@ -34,7 +34,7 @@ from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
+from exo_gravity.lab.inputs.arms import AnyArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import Launcher
 
@@ -98,7 +98,7 @@ class Mounting(NamedTuple):
     bows: int  #: how many
 
 
-def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
+def calibrate_imu(options: argparse.Namespace, arm: AnyArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
     The file's `/imu` names the topic. options.rests: a recording of six rests, None for none. options.wait: waits for
@@ -322,7 +322,7 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     """Return `result` with a better mounting of the IMU in the file `params`, if the arm's weight showed one."""
     found, arm = result.identified, result.arm
     rotation = load(params).get(NODE, {}).get(ROTATION)
-    if found is None or arm is None or not rotation or not arm.compensator["use_imu"]:
+    if found is None or arm is None or arm.by_urdf or not rotation or not arm.compensator["use_imu"]:
         return result
     square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
     error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))

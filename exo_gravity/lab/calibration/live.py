@@ -23,11 +23,12 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.lab.calibration.tour import ARM, BRIDGE
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.calibration.tour import ARM, BRIDGE, OF_BRIDGE, of_urdf
+from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
@@ -102,12 +103,12 @@ def observations_in(record: Path) -> list[Observation]:
 
 
 def tour_parameters(
-    params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
+    params: Path, arm: AnyArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Return the nodes of a file in which `calibrator` replaces the compensator of `arm`, each with its parameters.
 
-    changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m as far as known, by default those
-    of the robot alone. Raises ParameterError.
+    changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m of the paper's arm, as far as
+    known, by default those of the robot alone. Raises ParameterError.
     """
     bridge, compensator = arm.can_bridge, arm.compensator
     if list(compensator["joint_names"]) != list(bridge["joint_names"]):
@@ -117,13 +118,21 @@ def tour_parameters(
     simulator = nodes.get(f"{arm.namespace}/simulator")
     if simulator and (mass := changes.get("tour.load_mass")):
         # The simulated device cannot be reached by hand: it carries the weight as a wearer's forearm would.
-        simulator["wearer.mass"] = [0.0, 0.0, 0.0, mass]
-        simulator["wearer.cog"] = [0.0, 0.0, 0.0, changes["tour.load_lever"]]
-    expected = (moments_of(arm.robot) if moments is None else moments).tolist()
-    values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
-    values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
-    values |= {"first_moment": expected[:4], "off_axis": expected[4:], **changes}
-    return {**nodes, f"{arm.namespace}/calibrator": values}
+        none = [0.0] * (len(arm.joint_names) - 1)
+        simulator["wearer.mass"] = [*none, mass]
+        simulator["wearer.cog"] = [*none, changes["tour.load_lever"]]
+    if arm.by_urdf:
+        values = {name: value for name, value in compensator.items() if of_urdf(name)}
+        values |= {name: bridge[name] for name in OF_BRIDGE}
+        strongest = np.array(bridge["max_effort"])
+        own = np.array(compensator["max_effort"])
+        values["max_effort"] = np.where(own > 0.0, np.minimum(own, strongest), strongest).tolist()
+    else:
+        expected = (moments_of(papers(arm.robot)) if moments is None else moments).tolist()
+        values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
+        values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
+        values |= {"first_moment": expected[:4], "off_axis": expected[4:]}
+    return {**nodes, f"{arm.namespace}/calibrator": values | dict(changes)}
 
 
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
 
+import numpy as np
 from rich.table import Table
 
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.ak import FAMILY, MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor, buses_of
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 Clock = Callable[[], float]
@@ -35,6 +35,7 @@ MOTIONS = (
     "lift the upper arm to the front",
     "bend the elbow",
 )
+TURN = "turn it in the positive direction of the URDF"  # a joint of another arm
 UNCHECKED = "not checked after a power-up"
 SERVO_MODE = (
     "A V1 or V2 board in servo mode sends the same frames as a V3 board, and obeys none of our commands: read the "
@@ -67,11 +68,15 @@ class StillArm:
 HAND, STILL = HandMotion(), StillArm()
 
 
-def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
-    """Calibrate the motors of `arm`. options.wait: a `Wait`; options.pose: (4,) deg, the arm's pose for `zero`.
+def calibrate_motors(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+    """Calibrate the motors of `arm`. options.wait: a `Wait`; options.pose: (n,) deg, the arm's pose for `zero`.
 
-    Raises BusError if the bus cannot be used.
+    Without a pose the arm hangs, at the angles `home`. Raises BusError if the bus cannot be used, ParameterError if the
+    pose has another number of angles.
     """
+    names, pose = list(arm.joint_names), options.pose or np.degrees(arm.limits.home).tolist()
+    if len(pose) != len(names):
+        raise ParameterError("pose", list(pose), f"one angle in deg for each of {', '.join(names)}")
     node, interface = f"{arm.namespace}/can_bridge", arm.can_bridge["can.interface"]
     bus_options = can_options(load(options.params)[node])
     buses = buses_of(arm.can_bridge["can.channel"], bus_options, len(arm.motors))
@@ -79,7 +84,7 @@ def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) 
     with ArmScan((interface, name, each) for name, each in own.items()) as bus:
         say(f"Asking IDs 1 to {MAX_CAN_ID} on {bus.name}: nothing moves")
         search = MotorSearch(bus, arm, options.wait, say)
-        result = search.result(options.pose)
+        result = search.result(pose)
         channels = [bus.channels[can_id] for can_id in search.found]
     if len(own) == 1:
         return result
@@ -96,7 +101,7 @@ class MotorSearch:
     """
 
     def __init__(
-        self, bus: ArmScan | BusScan, arm: ConfiguredArm, wait: Wait, say: Say, clock: Clock = time.monotonic
+        self, bus: ArmScan | BusScan, arm: AnyArm, wait: Wait, say: Say, clock: Clock = time.monotonic
     ) -> None:
         self.found: dict[int, tuple[str, int]] = {}
         self._bus, self._arm = bus, arm
@@ -108,9 +113,10 @@ class MotorSearch:
         self._was_silent: set[int] = set()
 
     def result(self, pose: Sequence[float]) -> CalibrationResult:
-        """Return the result; pose: (4,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
+        """Return the result; pose: (n,) deg in which `zero` is measured. Raises DataError if a motor is not found."""
         self._scan()
-        for name, motion in zip(self._arm.joint_names, MOTIONS, strict=True):
+        motions = [TURN] * len(self._arm.joint_names) if self._arm.by_urdf else MOTIONS
+        for name, motion in zip(self._arm.joint_names, motions, strict=True):
             self._watch(f"{name}: {motion}, by 30 degrees or so, and back", partial(self._found_by, name))
         where = f"{' '.join(f'{angle:g}' for angle in pose)} deg" if any(pose) else ""
         rest = f"bring the arm to {where}" if where else "let the arm hang"
@@ -157,9 +163,9 @@ class MotorSearch:
         self._say(self._table())
         if any(answer.wire_format == MIT_V3.name for answer in answers):
             self._say(SERVO_MODE)
-        if len(answers) < JOINT_COUNT:
+        if len(answers) < len(self._arm.motors):
             listed = ", ".join(map(str, self._last)) or "none"
-            count = f"IDs that answer: {listed}. An arm has {JOINT_COUNT} motors"
+            count = f"IDs that answer: {listed}. An arm has {len(self._arm.motors)} motors"
             problems = (
                 *problems,
                 f"{count}: check power, plugs, terminators and the bit rate. A V1 or V2 board must be in MIT mode; "

@@ -1,12 +1,12 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighted least squares for the unknowns of an arm in held poses.
 
-The unknowns are the eight moments in kg m, the logarithm of the four torque scales, the four offsets in Nm, three
-angles by which a known weight seems to lie off the links (a zero of joint 3 or 4 that is off by a degree moves a weight
-by more than a light forearm's own moment), and the rotation of gravity's direction from the measured to the true one:
-an IMU is mounted, and a stand placed, to no better than a degree. The commanded effort is `torque(moments + load) /
-scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns
-that the poses do not show: those whose standard error exceeds `NATURAL`.
+The unknowns are the moments of an arm of n joints (moment_model.py) in kg m, the logarithm of its torque scales, the
+offsets in Nm, of the paper's arm three angles by which a known weight seems to lie off the links (a zero of joint 3 or
+4 that is off by a degree moves a weight by more than a light forearm's own moment), and the rotation of gravity's
+direction from the measured to the true one: an IMU is mounted, and a stand placed, to no better than a degree. The
+commanded effort is `torque(moments + load) / scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each
+step leaves out the combinations of unknowns that the poses do not show: those whose standard error exceeds `NATURAL`.
 
 Further unknowns, the extras, are 0 unless the poses ask for them: a spring across each joint in Nm/rad (where it is
 slack is part of the offset), and the slope of each scale over the motor's temperature. `asked_for` decides by an
@@ -19,33 +19,101 @@ joint gets a factor of its own, estimated from its residuals and pooled with the
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import MOMENTS, load_moments, regressor
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.lab.calibration.moment_model import MomentModel
 
-MOMENT = slice(0, 8)
-SCALE = slice(8, 12)
-OFFSET = slice(12, 16)
-ANGLE = slice(16, 19)  # of the load, from M3 to Y3, from M4 to Y4, and from M4 to Z
-ALONG, ACROSS = [2, 3, 3], [6, 7, 5]  # indices of these moments
-TILT = slice(19, 22)  # rotation vector of gravity in the base frame
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
-SPRING = slice(22, 26)  # Nm/rad
-SLOPE = slice(26, 30)  # 1/K, of the torque scale over the motor's temperature
-EXTRAS = tuple(range(SPRING.start, SLOPE.stop))
-COUNT = 30
 # kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = np.repeat(
-    (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005), (len(MOMENTS), JOINT_COUNT, JOINT_COUNT, 3, 3, JOINT_COUNT, JOINT_COUNT)
-)
-# kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
-TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
-START = np.array((0.0, *TYPICAL_MOMENTS[1:4], *np.zeros(COUNT - JOINT_COUNT)))  # of the search
+NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005)
+
+
+@dataclass(frozen=True)
+class FitLayout:
+    """Where each of the unknowns stands.
+
+    joints, moments: how many the arm has.
+    angles: of a weight, the numbers of the moment along a link and of that across it.
+    """
+
+    joints: int
+    moments: int
+    angles: tuple[tuple[int, int], ...]
+
+    @cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Of moments, scales, offsets, angles, tilt, springs and slopes."""
+        return self.moments, self.joints, self.joints, len(self.angles), 3, self.joints, self.joints
+
+    @cached_property
+    def slices(self) -> tuple[slice, ...]:
+        """Of the same."""
+        ends = np.cumsum((0, *self.sizes)).tolist()
+        return tuple(map(slice, ends[:-1], ends[1:]))
+
+    @property
+    def moment(self) -> slice:
+        """Kg m."""
+        return self.slices[0]
+
+    @property
+    def scale(self) -> slice:
+        """Logarithms."""
+        return self.slices[1]
+
+    @property
+    def offset(self) -> slice:
+        """Nm."""
+        return self.slices[2]
+
+    @property
+    def angle(self) -> slice:
+        """Rad."""
+        return self.slices[3]
+
+    @property
+    def tilt(self) -> slice:
+        """Rad, the rotation vector of gravity in the base frame."""
+        return self.slices[4]
+
+    @property
+    def spring(self) -> slice:
+        """Nm/rad."""
+        return self.slices[5]
+
+    @property
+    def slope(self) -> slice:
+        """1/K, of the torque scale over the motor's temperature."""
+        return self.slices[6]
+
+    @property
+    def count(self) -> int:
+        """How many unknowns there are."""
+        return sum(self.sizes)
+
+    @property
+    def extras(self) -> tuple[int, ...]:
+        """The unknowns that are 0 unless the poses ask for them."""
+        return tuple(range(self.spring.start, self.slope.stop))
+
+    @cached_property
+    def natural(self) -> np.ndarray:
+        """`NATURAL` of each unknown, (count,)."""
+        return np.repeat(NATURAL, self.sizes)
+
+    def start(self, moments: np.ndarray) -> np.ndarray:
+        """Return the unknowns (count,) with these moments, and nothing else."""
+        return np.append(moments, np.zeros(self.count - self.moments))
+
+
+def layout_of(model: MomentModel) -> FitLayout:
+    """Return where the unknowns of an arm stand."""
+    return FitLayout(model.count, len(model.names), model.angles)
 
 
 @dataclass(frozen=True)
@@ -58,6 +126,7 @@ class Fit:
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
+    scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
     pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each
     steps: int = 40  #: of Gauss-Newton, at most
@@ -73,122 +142,149 @@ class Fit:
 FIT = Fit()
 
 
-TINY = 1e-20  # of the complex step: no difference is taken, so nothing is lost to rounding
+MEDIAN_BELOW = 0.64  # by which the median of a sum of as many squares is below their number
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
-MEDIAN_CAUSED = 3.36  # of the sum of four such squares
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
 EXACT = 1e-6  # error of a value that is held
 
 
 class Rows(NamedTuple):
-    """What is fitted, for n poses."""
+    """What is fitted, for m poses of an arm with n joints and k moments."""
 
-    along: np.ndarray  #: (n, 4, 8, 3) Nm per kg m, the torque with gravity along each axis of the base frame
-    theta: np.ndarray  #: (n, 4) rad
-    warmth: np.ndarray  #: (n, 4) K of the motors, beyond the mean of their poses; 0 where it is not known
-    direction: np.ndarray  #: (n, 3), gravity's unit vector in the base frame, as measured
-    load: np.ndarray  #: (n, 8) kg m, moments of the weight
-    effort: np.ndarray  #: (n, 4) Nm
-    sigma: np.ndarray  #: (n, 4) Nm, standard error of `effort`
-    #: (k, COUNT), linear combinations of the unknowns that are 0, divided by their standard errors
-    anchor: np.ndarray = np.zeros((0, COUNT))
+    along: np.ndarray  #: (m, n, k, 3) Nm per kg m, the torque with gravity along each axis of the base frame
+    theta: np.ndarray  #: (m, n) rad
+    warmth: np.ndarray  #: (m, n) K of the motors, beyond the mean of their poses; 0 where it is not known
+    direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
+    load: np.ndarray  #: (m, k) kg m, moments of the weight
+    effort: np.ndarray  #: (m, n) Nm
+    sigma: np.ndarray  #: (m, n) Nm, standard error of `effort`
+    layout: FitLayout
+    start: np.ndarray  #: (count,), the unknowns from which the search begins
+    #: (c, count), linear combinations of the unknowns' change from `start` that are 0, divided by their standard errors
+    anchor: np.ndarray
 
     def only(self, keep: np.ndarray) -> "Rows":
-        """Return the poses that `keep` (n,) selects."""
-        return Rows._make([*(column[keep] for column in self[:-1]), self.anchor])
+        """Return the poses that `keep` (m,) selects."""
+        return Rows._make([*(column[keep] for column in self[:7]), *self[7:]])
 
     def holding(self, indices: Sequence[int]) -> "Rows":
-        """Return the rows with these unknowns held at 0."""
-        return self._replace(anchor=np.vstack((self.anchor, np.eye(COUNT)[list(indices)] / EXACT)))
+        """Return the rows with these unknowns held at their start."""
+        held = np.eye(self.layout.count)[list(indices)] / EXACT
+        return self._replace(anchor=np.vstack((self.anchor, held)))
 
     def with_extras(self, free: Sequence[int]) -> "Rows":
-        """Return the rows with all of EXTRAS but the `free` ones held at 0."""
-        return self.holding([index for index in EXTRAS if index not in free])
+        """Return the rows with all extras but the `free` ones held at 0."""
+        return self.holding([index for index in self.layout.extras if index not in free])
 
     def predicted(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the commanded effort (n, 4) in Nm."""
-        turn = np.eye(len(MOMENTS), dtype=unknowns.dtype)
-        turn[ALONG, ACROSS] = unknowns[ANGLE]
-        moments = unknowns[MOMENT] + self.load @ turn
-        direction = self.direction + self.direction @ (unknowns[TILT] @ TURN)
-        torque = np.einsum("njka,nka->nj", self.along, moments[:, :, None] * direction[:, None, :])
-        torque = torque + unknowns[SPRING] * self.theta
-        return np.asarray(torque * np.exp(-unknowns[SCALE]) / (1.0 + unknowns[SLOPE] * self.warmth) + unknowns[OFFSET])
+        """Return the commanded effort (m, n) in Nm."""
+        _, torque, given = self._parts(unknowns)
+        return np.asarray(torque * given + unknowns[self.layout.offset])
 
     def jacobian(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the derivative of `predicted` by the unknowns, (n, 4, COUNT), exact to rounding by complex steps."""
-        steps = (self.predicted(unknowns + 1j * TINY * one).imag for one in np.eye(COUNT))
-        return np.stack(list(steps), axis=-1) / TINY
+        """Return the derivative of `predicted` by the unknowns, (m, n, count)."""
+        at, (rows, torque, given) = self.layout, self._parts(unknowns)
+        own = np.eye(at.joints)[None]  # what belongs to a joint changes that joint's effort alone
+        effort = torque * given
+        angles = [rows[:, :, across] * self.load[:, None, along] for along, across in at.angles]
+        turns = np.einsum("mi,ita->mta", self.direction, TURN)
+        turned = np.einsum("mnka,mta,mk->mnt", self.along, turns, self._moments(unknowns), optimize=True)
+        warming = self.warmth / (1.0 + unknowns[at.slope] * self.warmth)
+        parts = (
+            rows * given[..., None],
+            -own * effort[..., None],
+            np.broadcast_to(own, (len(effort), at.joints, at.joints)),
+            np.stack(angles, axis=-1) * given[..., None] if angles else np.zeros((*effort.shape, 0)),
+            turned * given[..., None],
+            own * (self.theta * given)[..., None],
+            -own * (effort * warming)[..., None],
+        )
+        return np.concatenate(parts, axis=-1)
+
+    def _moments(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return the moments of arm and weight, (m, k) kg m."""
+        turn = np.eye(self.layout.moments)
+        for (along, across), angle in zip(self.layout.angles, unknowns[self.layout.angle], strict=True):
+            turn[along, across] = angle
+        return np.asarray(unknowns[self.layout.moment] + self.load @ turn)
+
+    def _parts(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the regressor (m, n, k), the torque of gravity and springs (m, n), and what a command is of it."""
+        at = self.layout
+        direction = self.direction + self.direction @ (unknowns[at.tilt] @ TURN)
+        rows = np.einsum("mnka,ma->mnk", self.along, direction)
+        torque = np.einsum("mnk,mk->mn", rows, self._moments(unknowns)) + unknowns[at.spring] * self.theta
+        return rows, torque, np.exp(-unknowns[at.scale]) / (1.0 + unknowns[at.slope] * self.warmth)
 
 
 class Solution(NamedTuple):
     """The fit of `Rows`."""
 
-    unknowns: np.ndarray  #: (COUNT,)
-    covariance: np.ndarray  #: (COUNT, COUNT) of what is known
-    hidden: np.ndarray  #: (COUNT,), share 0..1 of each unknown that is not known
+    unknowns: np.ndarray  #: (count,)
+    covariance: np.ndarray  #: (count, count) of what is known
+    hidden: np.ndarray  #: (count,), share 0..1 of each unknown that is not known
     singular_values: np.ndarray  #: of the poses alone, in units of `NATURAL`, the largest first
-    residual: np.ndarray  #: (n, 4) Nm
-    left: np.ndarray  #: (n, 4), part of each residual's variance that the fit leaves, 0..1
-    freedom: np.ndarray  #: (4,), degrees of freedom of each joint's residuals
-    hat: np.ndarray  #: (n, 4, n, 4), derivative of the predicted by the measured effort, both divided by sigma
-    inverse: np.ndarray  #: (COUNT, 4 n + k), change of the unknowns with each effort and condition, by its error
+    residual: np.ndarray  #: (m, n) Nm
+    left: np.ndarray  #: (m, n), part of each residual's variance that the fit leaves, 0..1
+    freedom: np.ndarray  #: (n,), degrees of freedom of each joint's residuals
+    hat: np.ndarray  #: (m, n, m, n), derivative of the predicted by the measured effort, both divided by sigma
+    inverse: np.ndarray  #: (count, m n + c), change of the unknowns with each effort and condition, by its error
 
 
-def rows_of(observations: Sequence[Observation], length: Vector, gravity: float) -> Rows:
-    """Return the observations as arrays, with what is held. Raises DataError that names the observation."""
+def rows_of(observations: Sequence[Observation], model: MomentModel) -> Rows:
+    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
     theta, direction, effort, spread = found = columns(observations)
     for name, values in zip(("theta", "direction", "effort", "spread"), found, strict=True):
         for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
-    load = np.array([load_moments(length, one.load_mass, one.load_lever) for one in observations])
-    product = np.eye(COUNT)[SCALE][1:].sum(axis=0, keepdims=True)  # of the scales of joints 2 to 4: 1 without a weight
-    product *= not np.any(load)
-    anchor = np.vstack((np.eye(COUNT)[ANGLE] / FIT.beside_error, np.eye(COUNT)[TILT] / FIT.tilt_error, product / EXACT))
-    along, sigma = along_axes(theta, gravity), np.hypot(spread, FIT.least_spread)
+    at = layout_of(model)
+    load = np.array([model.load(one.load_mass, one.load_lever) for one in observations])
+    unit = np.eye(at.count)
+    # Without a weight a common factor of scales and moments does not show.
+    product = unit[at.scale][list(model.compared)].sum(axis=0, keepdims=True) * (not np.any(load))
+    tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
+    scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
+    anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, product / EXACT))
+    along, sigma = model.along(theta), np.hypot(spread, FIT.least_spread)
     temperature = temperatures(observations)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
-    return Rows(along, theta, warmth, direction, load, effort, sigma, anchor)
+    return Rows(along, theta, warmth, direction, load, effort, sigma, at, at.start(model.start), anchor)
 
 
 def temperatures(observations: Sequence[Observation]) -> np.ndarray:
-    """Return the motors' temperatures (n, 4) in degC, NaN where one is not known."""
-    unknown = np.full(JOINT_COUNT, np.nan)
+    """Return the motors' temperatures (m, n) in degC, NaN where one is not known."""
+    unknown = np.full(len(observations[0].theta), np.nan)
     given = [one.temperature if len(one.temperature) else unknown for one in observations]
     return np.array(given, dtype=float)
 
 
 def columns(observations: Sequence[Observation]) -> list[np.ndarray]:
-    """Return theta (n, 4) rad, direction (n, 3), effort and spread (n, 4) Nm of the observations."""
+    """Return theta (m, n) rad, direction (m, 3), effort and spread (m, n) Nm of the observations."""
     return [np.array([one[i] for one in observations], dtype=float) for i in (0, 1, 2, 4)]
 
 
-def along_axes(theta: np.ndarray, gravity: float) -> np.ndarray:
-    """Return `Rows.along` of the poses `theta` (n, 4) rad."""
-    return np.stack([regressor(theta, axis, gravity) for axis in np.eye(3)], axis=-1)
-
-
-def solve(rows: Rows, start: np.ndarray = START, weight: np.ndarray | float = 1.0) -> Solution:
-    """Return the least-squares solution from `start` (COUNT,); weight: (n, 4) of the squared residuals."""
+def solve(rows: Rows, start: np.ndarray | None = None, weight: np.ndarray | float = 1.0) -> Solution:
+    """Return the least-squares solution from `start` (count,); weight: (m, n) of the squared residuals."""
+    at, natural = rows.layout, rows.layout.natural
     root = np.sqrt(weight) / rows.sigma
-    unknowns = start
+    unknowns = rows.start if start is None else start
     for _ in range(FIT.steps):
-        poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, COUNT)
+        poses = (rows.jacobian(unknowns) * root[..., None]).reshape(-1, at.count)
         whitened = np.vstack((poses, rows.anchor))
-        left, size, right = np.linalg.svd(whitened * NATURAL, full_matrices=False)
+        left, size, right = np.linalg.svd(whitened * natural, full_matrices=False)
         known = size > 1.0
-        inverse = NATURAL[:, None] * (right[known].T / size[known]) @ left[:, known].T
+        inverse = natural[:, None] * (right[known].T / size[known]) @ left[:, known].T
         residual = rows.effort - rows.predicted(unknowns)
-        step = inverse @ np.append(root * residual, -rows.anchor @ unknowns)
-        if np.all(np.abs(step) < 1e-9 * NATURAL):
+        step = inverse @ np.append(root * residual, -rows.anchor @ (unknowns - rows.start))
+        if np.all(np.abs(step) < 1e-9 * natural):
             break
         # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
-        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[SCALE]).max()))
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[at.scale]).max()))
     hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
-    size = np.linalg.svd((poses * NATURAL)[:, : ANGLE.start], compute_uv=False)
-    singular_values = np.pad(size, (0, ANGLE.start - len(size)))
+    size = np.linalg.svd((poses * natural)[:, : at.angle.start], compute_uv=False)
+    singular_values = np.pad(size, (0, at.angle.start - len(size)))
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
     left_over = 1.0 - np.einsum("njnj->nj", hat)
     freedom = np.maximum(left_over.sum(axis=0), 0.0)
@@ -222,14 +318,18 @@ def final(rows: Rows) -> tuple[Rows, Solution]:
     return scaled, solution._replace(covariance=solution.covariance + _common_error(scaled, solution))
 
 
-def bounded(rows: Rows) -> tuple[Rows, Solution]:
-    """Return the solution with M1, the least certain moment, at least 0, and the rows with their estimated errors."""
+def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
+    """Return the solution, and the rows with their estimated errors.
+
+    positive: numbers of moments that are at least 0, because the least certain of them may come out below.
+    """
     used, solution = final(rows)
-    if solution.unknowns[0] >= 0.0:
-        return used, solution
-    used, held = final(rows.holding([0]))
-    held.unknowns[0], held.covariance[0, 0] = 0.0, solution.covariance[0, 0]
-    return used, held
+    for index in positive:
+        if solution.unknowns[index] < 0.0:
+            error = solution.covariance[index, index]
+            used, solution = final(rows.holding([index]))
+            solution.unknowns[index], solution.covariance[index, index] = 0.0, error
+    return used, solution
 
 
 def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows, Solution]]) -> tuple[int, ...]:
@@ -239,12 +339,13 @@ def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows
     criterion of J. Chen and Z. Chen, Biometrika 95 (2008): ln of the number of efforts (Schwarz's), plus 2 ln of the
     number of candidates. A spring that would push is none. None stays that hides another unknown.
     """
-    left, penalty = list(among), math.log(rows.effort.size) + 2.0 * math.log(len(EXTRAS))
-    is_shown = fit(rows.with_extras(()))[1].hidden <= FIT.hidden if left else np.ones(COUNT, dtype=bool)
+    at = rows.layout
+    left, penalty = list(among), math.log(rows.effort.size) + 2.0 * math.log(len(at.extras))
+    is_shown = fit(rows.with_extras(()))[1].hidden <= FIT.hidden if left else np.ones(at.count, dtype=bool)
     while left:
         solution = fit(rows.with_extras(left))[1]
         value, variance = solution.unknowns[left], np.diag(solution.covariance)[left]
-        pushes = (value < 0.0) & (np.array(left) < SPRING.stop)
+        pushes = (value < 0.0) & (np.array(left) < at.spring.stop)
         gain = np.where(pushes | (solution.hidden[left] > FIT.hidden), 0.0, value**2 / np.maximum(variance, 1e-30))
         least = int(np.argmin(gain))
         if gain[least] > penalty and not np.any(is_shown & (solution.hidden > FIT.hidden)):
@@ -256,22 +357,23 @@ def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows
 def possible_extras(rows: Rows) -> tuple[int, ...]:
     """Return the extras that the poses can show at all."""
     warms = np.ptp(rows.warmth, axis=0) >= FIT.least_warming
-    slopes = [index for index, is_warm in zip(range(SLOPE.start, SLOPE.stop), warms.tolist(), strict=True) if is_warm]
-    return (*range(SPRING.start, SPRING.stop), *slopes)
+    spring, slope = rows.layout.spring, rows.layout.slope
+    slopes = [index for index, is_warm in zip(range(slope.start, slope.stop), warms.tolist(), strict=True) if is_warm]
+    return (*range(spring.start, spring.stop), *slopes)
 
 
 def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
-    """Return the covariance (COUNT, COUNT) that the error `FIT.common_error` of each joint and weight causes."""
-    torque = (rows.predicted(solution.unknowns) - solution.unknowns[OFFSET]) / rows.sigma
+    """Return the covariance (count, count) that the error `FIT.common_error` of each joint and weight causes."""
+    torque = (rows.predicted(solution.unknowns) - solution.unknowns[rows.layout.offset]) / rows.sigma
     loads, group = np.unique(rows.load, axis=0, return_inverse=True)
     shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
-    columns = FIT.common_error * torque * shared * np.eye(JOINT_COUNT)[:, None, :]
+    columns = FIT.common_error * torque * shared * np.eye(rows.layout.joints)[:, None, :]
     change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
     return np.asarray(change.T @ change)
 
 
 def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Return each joint's factor (4,) of the variance, moved towards that of all joints where its data are few."""
+    """Return each joint's factor (n,) of the variance, moved towards that of all joints where its data are few."""
     total = freedom.sum()
     common = float(factor @ freedom) / total if total > 1.0 else 1.0
     pooled = (factor * freedom + FIT.pooling * common) / (freedom + FIT.pooling)
@@ -281,13 +383,13 @@ def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
 def without_each_pose(solution: Solution, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each pose, what leaving it out shows.
 
-    The residual (n, 4) in Nm of a prediction from the other poses, NaN where they do not suffice; and the part (n,) of
-    the sum of squares that this pose causes, about 4 for a pose with usual errors.
+    The residual (m, n) in Nm of a prediction from the other poses, NaN where they do not suffice; and the part (m,) of
+    the sum of squares that this pose causes, about as many as joints for a pose with usual errors.
     """
     whitened = solution.residual / sigma
     held_out, caused = np.full_like(whitened, np.nan), np.zeros(len(whitened))
     for i, residual in enumerate(whitened):
-        left = np.eye(JOINT_COUNT) - solution.hat[i, :, i, :]
+        left = np.eye(len(residual)) - solution.hat[i, :, i, :]
         if np.linalg.eigvalsh((left + left.T) / 2.0)[0] > 1e-6:
             held_out[i] = np.linalg.solve(left, residual)
             caused[i] = residual @ held_out[i]
@@ -295,7 +397,7 @@ def without_each_pose(solution: Solution, sigma: np.ndarray) -> tuple[np.ndarray
 
 
 def without_outliers(rows: Rows) -> tuple[np.ndarray, tuple[tuple[int, str], ...]]:
-    """Return which poses (n,) fit one arm, and index and reason of each that does not.
+    """Return which poses (m,) fit one arm, and index and reason of each that does not.
 
     Raises DataError if more than a third does not fit.
     """
@@ -307,7 +409,8 @@ def without_outliers(rows: Rows) -> tuple[np.ndarray, tuple[tuple[int, str], ...
         held_out, caused = without_each_pose(solution, used.sigma)
         matters = np.nanmax(np.abs(held_out) / least, axis=1, initial=0.0) > 1.0
         worst = int(np.argmax(caused * matters))
-        if not matters[worst] or caused[worst] < FIT.outlier * max(1.0, float(np.median(caused)) / MEDIAN_CAUSED):
+        usual = rows.layout.joints - MEDIAN_BELOW
+        if not matters[worst] or caused[worst] < FIT.outlier * max(1.0, float(np.median(caused)) / usual):
             return keep, tuple(rejected)
         joint = int(np.argmax(np.abs(held_out[worst] / used.sigma[worst])))
         index = int(np.flatnonzero(keep)[worst])

@@ -6,21 +6,20 @@ in the Nm that its motor is commanded: its unknown torque scale is then part of 
 file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman update).
 """
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import Torque, exact_torque, regressor
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, Line, Station
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector
+from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.limits import WALL, Limits
-from exo_gravity.lab.calibration.pose_fit import COUNT, MOMENT, NATURAL, START, TILT, TYPICAL_MOMENTS, Rows, along_axes
+from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.pose_fit import Rows, layout_of
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,7 @@ class PoseChoice:
     time_share: float = 1.5  #: of the time left for each pose, that the next one may take
     noise: float = 0.03  #: Nm in any pose
     noise_share: float = 0.02  #: of the torque
+    shown: float = 0.03  #: of what noise hides, from which the poses together show an unknown
 
 
 CHOICE = PoseChoice()
@@ -68,63 +68,51 @@ class FrictionSweeps:
 SWEEPS = FrictionSweeps()
 
 
-# deg of each joint, within the paper's ranges: from these a missing pose is suggested.
-GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
-
-
 class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
-    length: (4,) m.
-    moments: (8,) kg m, as in `core.arm.gravity`, with the load.
+    model: of the arm.
+    moments: (k,) kg m, with the load.
     tilt: of the trunk or the stand.
     """
 
-    def __init__(self, length: Vector, moments: Vector, tilt: Tilt, gravity: float) -> None:
+    def __init__(self, model: MomentModel, moments: Vector, tilt: Tilt) -> None:
         moments = np.asarray(moments, dtype=float)
         deviation = PRIOR.share * np.abs(moments) + PRIOR.moment
-        self.length = np.asarray(length, dtype=float)
+        self.model = model
         self.tilt = tilt
-        self.gravity = gravity
-        self._mean = np.tile(moments, (JOINT_COUNT, 1))  # of each joint
-        self._covariance = np.tile(np.diag(deviation**2), (JOINT_COUNT, 1, 1))
-        self._arms = self._as_arms()
+        self._mean = np.tile(moments, (model.count, 1))  # of each joint
+        self._covariance = np.tile(np.diag(deviation**2), (model.count, 1, 1))
+        self._hold = model.holding(self._mean)
 
     @property
     def common_moments(self) -> np.ndarray:
-        """The moments (8,) in kg m as the joints show them on average; M_n is that of joint n."""
-        return np.append(np.diag(self._mean[:, :JOINT_COUNT]), self._mean[:, JOINT_COUNT:].mean(axis=0))
+        """The moments (k,) in kg m as the joints show them; M_n of the paper's arm is that of joint n."""
+        return self.model.common(self._mean)
 
     def torque(self, theta: Sequence[float]) -> Torque:
-        """Return the expected torque (4,) in Nm at `theta` (4,) rad, in plain floats for the control loop."""
-        law = exact_torque
-        return tuple(law(arm, theta, self.tilt)[joint] for joint, arm in enumerate(self._arms))
+        """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""
+        return self._hold(theta, self.tilt)
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expected torque and its standard deviation, both (n, 4) Nm, at `theta` (n, 4) rad.
+        """Return the expected torque and its standard deviation, both (m, n) Nm, at `theta` (m, n) rad.
 
         direction: (3,), gravity's unit vector in the base frame; by default as at present.
         """
-        rows = regressor(theta, self.tilt.direction if direction is None else direction, self.gravity)
+        rows = self.model.rows(theta, self.model.down(self.tilt) if direction is None else np.asarray(direction))
         mean = np.einsum("njk,jk->nj", rows, self._mean)
         variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
         return mean, np.sqrt(np.maximum(variance, 0.0))
 
     def learn(self, theta: Vector, effort: Vector, spread: Vector) -> None:
-        """Take a measured torque `effort` (4,) Nm at `theta` (4,) rad, with its standard error `spread` (4,) Nm."""
-        rows = regressor(theta, self.tilt.direction, self.gravity)[0]
+        """Take a measured torque `effort` (n,) Nm at `theta` (n,) rad, with its standard error `spread` (n,) Nm."""
+        rows = self.model.rows(np.array([theta]), self.model.down(self.tilt))[0]
         for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
             covariance = self._covariance[joint]
             gain = covariance @ row / (row @ covariance @ row + error**2 + PRIOR.unexplained**2)
             self._mean[joint] += gain * (torque - row @ self._mean[joint])
             self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
-        self._arms = self._as_arms()
-
-    def _as_arms(self) -> list[ArmModel]:
-        return [
-            ArmModel.from_moments(self.length, np.maximum(row[:4], 0.0), row[4:], gravity=self.gravity)
-            for row in self._mean
-        ]
+        self._hold = self.model.holding(self._mean)
 
 
 class Itinerary:
@@ -139,7 +127,8 @@ class Itinerary:
         self, limits: Limits, count: int, duration: float, given: Sequence[Station] = (), again: int = 0
     ) -> None:
         self._limits, self._most, self._duration = limits, count, duration
-        self._home, self._candidates = hanging(limits), candidates(limits)
+        self._home = hanging(limits)
+        self._candidates: np.ndarray | None = None  # of the arm of which the torque is guessed
         stations = given or [self._home]
         self._again = again
         self.count, self._given = max(count, len(stations)) + again, iter(stations)
@@ -149,10 +138,10 @@ class Itinerary:
     ) -> Station | None:
         """Return the next of the given stations, then the best of the candidates that can be held and reached.
 
-        taken: (n, 4) rad, the poses measured so far.
-        position: (4,) rad, where the arm is.
+        taken: (m, n) rad, the poses measured so far.
+        position: (n,) rad, where the arm is.
         elapsed: s since the start of the tour.
-        friction: (4,) Nm, 0 if unknown.
+        friction: (n,) Nm, 0 if unknown.
 
         Returns None after the last; raises DataError if no pose can be held.
         """
@@ -161,21 +150,24 @@ class Itinerary:
             return station
         if len(taken) >= self._most:
             return Station(tuple(taken[len(taken) - self._most].tolist()))
-        in_time = np.flatnonzero(self._is_in_time(self._most + self._again - len(taken), position, elapsed))
-        room = self._room(self._candidates[in_time], position, guess, friction)
+        if self._candidates is None:
+            self._candidates = candidates(self._limits, guess.model)
+        way = self._candidates
+        in_time = np.flatnonzero(self._is_in_time(way, self._most + self._again - len(taken), position, elapsed))
+        room = self._room(way[in_time], position, guess, friction)
         if room.max() < 0.0:
             raise DataError("no further pose can be held within max_effort: is it too small for the arm?")
         possible = in_time[room >= min(CHOICE.deviations, math.floor(room.max()))]
-        seen, poses = list(taken) or [self._home.theta], self._candidates[possible]
-        index = possible[next_pose(seen, poses, guess.tilt.direction, guess.common_moments, guess.gravity)]
-        pose = self._candidates[index]
-        self._candidates = np.delete(self._candidates, index, axis=0)  # chosen once, even if a joint sticks there
+        seen, down = list(taken) or [self._home.theta], guess.model.down(guess.tilt)
+        index = possible[next_pose(seen, way[possible], down, guess.common_moments, guess.model)]
+        pose = way[index]
+        self._candidates = np.delete(way, index, axis=0)  # chosen once, even if a joint sticks there
         return Station(tuple(pose.tolist()))
 
-    def _is_in_time(self, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
-        """Return which candidates (n,) leave enough time for the others of the `left` poses and for the way home."""
+    def _is_in_time(self, poses: np.ndarray, left: int, position: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return which of the `poses` (m, n) leave enough time for the others of the `left`, and for the way home."""
         home, way = (
-            np.array([Line(pose, candidate).duration + MOTION.lead for candidate in self._candidates])
+            np.array([Line(pose, candidate).duration + MOTION.lead for candidate in poses])
             for pose in (np.array(self._home.theta), position)
         )
         budget = (self._duration - elapsed - home) / left
@@ -184,15 +176,15 @@ class Itinerary:
         return np.asarray(fits if fits.any() else way + home <= (way + home).min() + 1.0)
 
     def _room(self, poses: np.ndarray, start: np.ndarray, guess: TorqueGuess, friction: Vector) -> np.ndarray:
-        """Return the room (n,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
+        """Return the room (m,) that the motors have to hold `poses`, reach them from `start`, and leave them for home.
 
         It is in standard deviations of the expected torque, below 0 where they have none; on the way home the torque is
-        known. friction: (4,) Nm, against which the arm is moved.
+        known. friction: (n,) Nm, against which the arm is moved.
         """
         shares = np.linspace(0.0, 1.0, CHOICE.waypoints + 1)[1:, None, None]
         sweep = MOTION.amplitude * np.array((-1.0, 1.0))[:, None, None]
         start, home = start + shares * (poses - start), self._limits.home + shares * (poses - self._limits.home)
-        mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, JOINT_COUNT))
+        mean, deviation = guess.torques(np.vstack((start, poses + sweep, home)).reshape(-1, len(self._limits.home)))
         most = CHOICE.effort_share * np.array(self._limits.max_effort) - [
             own or CHOICE.usual_friction for own in friction
         ]
@@ -218,53 +210,60 @@ def friction_stations(limits: Limits) -> list[Station]:
     return [hanging(limits, *sweep) for sweep in zip(speeds, amplitudes, strict=True)]
 
 
-def candidates(limits: Limits) -> np.ndarray:
-    """Return random poses (n, 4) in rad within `limits` in which no link points far upwards.
+def candidates(limits: Limits, model: MomentModel) -> np.ndarray:
+    """Return random poses (m, n) in rad within `limits` in which no link points far upwards.
 
     Above the shoulder gravity tips the arm over: what is wrong with the expected torque grows with each movement.
     """
-    poses = np.random.default_rng(1).uniform(*measurable(limits, MOTION.amplitude), (CHOICE.candidates, JOINT_COUNT))
-    down = np.cos(poses[:, 1:2]) * np.cos(np.stack((poses[:, 2], poses[:, 2] + poses[:, 3]), axis=1))
-    return np.asarray(poses[down.min(axis=1) >= -CHOICE.most_upwards])
+    low, high = measurable(limits, MOTION.amplitude)
+    poses = np.random.default_rng(1).uniform(low, high, (CHOICE.candidates, model.count))
+    home = float(model.upwards(np.array([limits.home]))[0])  # a link may point upwards in every pose
+    return np.asarray(poses[model.upwards(poses) <= max(CHOICE.most_upwards, home)])
 
 
 def measurable(limits: Limits, amplitude: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest pose (4,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
+    """Return the lowest and highest pose (n,) rad around which a sweep of `amplitude` rad stays off the soft walls."""
     margin = WALL.width + amplitude + CHOICE.edge
     return np.array(limits.position_min) + margin, np.array(limits.position_max) - margin
 
 
 def next_pose(
-    taken: Sequence[Vector], candidates: np.ndarray, direction: Vector, moments: Vector, gravity: float
+    taken: Sequence[Vector], candidates: np.ndarray, direction: Vector, moments: Vector, model: MomentModel
 ) -> int:
     """Return the index of the candidate that adds the most information to the poses `taken`, by D-optimality.
 
-    taken: (4,) rad each, none at the start.
-    candidates: (n, 4) rad.
+    taken: (n,) rad each, none at the start.
+    candidates: (m, n) rad.
     direction: (3,), gravity's unit vector in the base frame.
-    moments: (8,) kg m, a guess.
+    moments: (k,) kg m, a guess.
     """
-    seen = _sensitivity(np.reshape(taken, (-1, JOINT_COUNT)), direction, moments, gravity).reshape(-1, COUNT)
-    information = np.diag(NATURAL**-2.0) + seen.T @ seen
-    rows = _sensitivity(candidates, direction, moments, gravity)
-    added = np.eye(JOINT_COUNT) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
+    at = layout_of(model)
+    seen = _sensitivity(np.reshape(taken, (-1, model.count)), direction, moments, model).reshape(-1, at.count)
+    information = np.diag(at.natural**-2.0) + seen.T @ seen
+    rows = _sensitivity(candidates, direction, moments, model)
+    added = np.eye(model.count) + rows @ np.linalg.inv(information) @ rows.transpose(0, 2, 1)
     return int(np.argmax(np.linalg.slogdet(added)[1]))
 
 
-def missing_pose(hidden: np.ndarray, direction: Vector, gravity: float) -> str:
-    """Return, in words, the pose of `GRID` that shows most of the unknowns of which `hidden` (COUNT,) are not known."""
-    poses = np.radians(list(itertools.product(*GRID)))
-    shown = _sensitivity(poses, direction, TYPICAL_MOMENTS, gravity) * NATURAL * hidden
+def missing_pose(hidden: np.ndarray, direction: Vector, model: MomentModel) -> str:
+    """Return, in words, the suggested pose that shows most of the unknowns of which `hidden` (count,) are not known."""
+    poses = model.suggested
+    shown = _sensitivity(poses, direction, model.start, model) * layout_of(model).natural * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
     return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
 
 
-def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, gravity: float) -> np.ndarray:
-    """Return the derivative of the efforts in the poses (n, 4) by the unknowns, by their noise: (n, 4, COUNT)."""
-    unused = np.zeros((len(theta), JOINT_COUNT))  # what was measured
-    down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), len(moments)))
-    rows = Rows(along_axes(theta, gravity), theta, unused, down, no_load, unused, unused)
-    unknowns = START.copy()
-    unknowns[MOMENT] = moments
+def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.ndarray:
+    """Return which of the unknowns (count,) `poses` (m, n) rad could show."""
+    shown = _sensitivity(poses, direction, model.start, model) * layout_of(model).natural
+    return np.asarray(np.sqrt((shown**2).sum(axis=(0, 1))) > CHOICE.shown * math.sqrt(len(poses)))
+
+
+def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, model: MomentModel) -> np.ndarray:
+    """Return the derivative of the efforts in the poses (m, n) by the unknowns, by their noise: (m, n, count)."""
+    at, unused = layout_of(model), np.zeros((len(theta), model.count))  # what was measured
+    down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), at.moments))
+    unknowns = at.start(np.asarray(moments))
+    rows = Rows(model.along(theta), theta, unused, down, no_load, unused, unused, at, unknowns, np.zeros((0, at.count)))
     noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))
-    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(COUNT) < TILT.start))
+    return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(at.count) < at.tilt.start))

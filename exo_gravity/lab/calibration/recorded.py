@@ -16,12 +16,11 @@ import numpy as np
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, Observation, Sweep, average, mean_direction
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
 from exo_gravity.lab.bag.layout import Decoder
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
 
 
@@ -41,7 +40,7 @@ class Detection:
 DETECTION = Detection()
 
 
-def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
+def observations_of(path: Path, arm: AnyArm, with_held: bool = True) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
 
     with_held: False for sweeps alone, which show friction.
@@ -62,7 +61,7 @@ def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> l
     return observations
 
 
-def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
+def recording_of(bag: Bag, arm: AnyArm) -> Recording:
     """Return the recording in `bag` that has the joints of `arm`, with its arrays in their order. Raises DataError."""
     recording = next((r for r in bag.recordings if sorted(r.joint_names) == sorted(arm.joint_names)), None)
     if recording is None:
@@ -71,14 +70,21 @@ def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
     return recording.in_order(arm.joint_names)
 
 
-def _down(bag: Bag, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
+def _down(bag: Bag, arm: AnyArm, times: np.ndarray) -> np.ndarray:
     """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
     if not arm.compensator["use_imu"]:
-        return np.tile(Tilt.of(arm.side).direction, (len(times), 1))
+        return np.tile(_base_direction(arm, Tilt.of(arm.side)), (len(times), 1))
     if not len(bag.tilt):
         raise DataError(f"{bag.path}: no samples of {TILT_TOPIC}, which gravity's direction comes from")
-    components = np.array([tilt.direction for tilt in tilts_of(bag, arm.side)]).T
+    components = np.array([_base_direction(arm, tilt) for tilt in tilts_of(bag, arm.side)]).T
     return np.stack([np.interp(times, bag.tilt[:, 0], component) for component in components], axis=1)
+
+
+def _base_direction(arm: AnyArm, tilt: Tilt) -> tuple[float, float, float]:
+    """Return gravity's direction (3,) in the base frame, which a URDF has in the trunk's axes."""
+    if not arm.by_urdf:
+        return tilt.direction
+    return Tilt.of("left", tilt.pitch, tilt.roll).gravity_in_trunk
 
 
 def tilts_of(bag: Bag, side: str) -> list[Tilt]:
@@ -136,7 +142,7 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
     later = np.minimum(np.searchsorted(time, time + DETECTION.window), len(time) - 1)
     speed = (position[later] - position) / np.maximum(time[later] - time, 1e-3)[:, None]
     is_slow = np.all((np.abs(speed) >= DETECTION.speed[0]) & (np.abs(speed) <= DETECTION.speed[1]), axis=1)
-    way = np.where(is_slow, np.sign(speed) @ 3.0 ** np.arange(JOINT_COUNT), 0.5)
+    way = np.where(is_slow, np.sign(speed) @ 3.0 ** np.arange(speed.shape[1]), 0.5)
     edges = np.flatnonzero(np.diff(way, prepend=np.nan, append=np.nan) != 0.0)
     for low, high in pairwise(edges.tolist()):
         if is_slow[low] and high - low > 4 * MOTION.bins:
@@ -145,7 +151,7 @@ def _runs(recording: Recording, start: float, end: float) -> Iterator[slice]:
 
 def _held(recording: Recording, down: np.ndarray, sweeps: list[Observation]) -> Iterator[Observation]:
     """Yield an observation for every pose that was held, as uncertain as the friction of `sweeps`."""
-    friction = np.full(JOINT_COUNT, DETECTION.unknown_friction)
+    friction = np.full(recording.position.shape[1], DETECTION.unknown_friction)
     if sweeps:
         friction = np.abs(np.median([sweep.friction for sweep in sweeps], axis=0))
     for start, end in still_spans(recording, in_blocks(recording)):

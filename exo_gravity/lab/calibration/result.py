@@ -22,21 +22,23 @@ import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.calibration.identification import FrictionCurve, Identified
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import columns
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.report import html
-from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, JOINT_COLOURS, make_plain
+from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, joint_colours, make_plain
 
 PARAMETERS = "ros__parameters"
 WIDTH = 118  # characters of a comment line
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches
+ROW_HEIGHT, CURVE_HEIGHT = 2.5, 3.2  # inches, of a joint
+MOST_ACROSS = 4  # curves beside each other
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
 
 Value = bool | int | float | str | list[int] | list[float] | list[str]
@@ -63,7 +65,8 @@ class CalibrationResult:
     changes: tuple[Change, ...] = ()  #: written unless there are `refusals`
     lines: tuple[str, ...] = ()  #: what else was found, in sentences
     refusals: tuple[str, ...] = ()  #: why it is not calibrated, in sentences
-    arm: ConfiguredArm | None = None  #: as configured before
+    arm: AnyArm | None = None  #: as configured before
+    model: MomentModel | None = None  #: its moments, as configured before
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
     curves: tuple[FrictionCurve, ...] = ()  #: of each joint
@@ -166,17 +169,19 @@ def _comment(indent: str, note: str) -> str:
     return "".join(f"{indent}# {line}\n" for line in lines)
 
 
-def remainders(found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> tuple[np.ndarray, ...]:
-    """Return measured minus predicted torque (n, 4) in Nm as commanded, and which of the poses (n,) were used.
+def remainders(
+    found: Identified, arm: AnyArm, model: MomentModel, poses: Sequence[Observation]
+) -> tuple[np.ndarray, ...]:
+    """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
 
     Predicted by the old file; by the new one, which holds a motor's constant offset only in a joint with a spring; and
     by a result that was found without that pose.
     """
     theta, direction, measured, _ = columns(poses)
-    loads = np.array([load_moments(arm.robot.length, pose.load_mass, pose.load_lever) for pose in poses])
-    rows = regressor(theta, direction, arm.robot.gravity)
+    loads = np.array([model.load(pose.load_mass, pose.load_lever) for pose in poses])
+    rows = model.rows(theta, direction)
     springs = joint_spring_of(arm.compensator).torques(theta)
-    old = measured - np.einsum("njk,nk->nj", rows, moments_of(arm.robot) + loads) - springs
+    old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
     used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
     return old, found.residual + found.left_offset, found.held_out + found.left_offset, used
 
@@ -199,11 +204,12 @@ def _sections(result: CalibrationResult) -> Iterator[str]:
     if rows and not result.refusals:
         yield html.heading("New values")
         yield html.table(("node", "parameter", "value", "note"), [((), rows)])
-    if found and result.arm:
+    if found and result.arm and result.model:
+        of = result.arm, result.model, result.observations
         line = "Predicted against measured torque: on the line, the file is right"
         caption = f"{line}. What remains in each pose: inside the band, friction holds the arm; outside, it creeps."
-        yield html.picture(html.png_of(torque_figure(found, result.arm, result.observations), DPI), caption)
-        yield html.bullets("Drift to expect", _drift(found, *remainders(found, result.arm, result.observations)))
+        yield html.picture(html.png_of(torque_figure(found, *of), DPI), caption)
+        yield html.bullets("Drift to expect", _drift(found, *remainders(found, *of)))
         values = " ".join(f"{value:.3g}" for value in found.singular_values)
         yield html.bullets("What these poses do not show", [*unknown, f"Singular values of the information: {values}"])
     if result.curves and result.arm:
@@ -220,14 +226,15 @@ def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarr
         yield f"With {friction} the arm creeps {count}."
 
 
-def torque_figure(found: Identified, arm: ConfiguredArm, poses: Sequence[Observation]) -> Figure:
+def torque_figure(found: Identified, arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:
     """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 10.0), layout="constrained")
+    count, colours = len(arm.joint_names), joint_colours(len(arm.joint_names))
+    figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")
     theta, _, effort, spread = columns(poses)
-    *remaining, used = remainders(found, arm, poses)
+    *remaining, used = remainders(found, arm, model, poses)
     numbers = np.arange(1, len(poses) + 1)
-    for joint, (left, right) in enumerate(figure.subplots(4, 2, width_ratios=(1.0, 3.0))):
-        colour, friction = JOINT_COLOURS[joint], found.friction[joint]
+    for joint, (left, right) in enumerate(figure.subplots(count, 2, width_ratios=(1.0, 3.0), squeeze=False)):
+        colour, friction = colours[joint], found.friction[joint]
         measured, old, new, held_out = (column[:, joint] for column in (effort, *remaining))
         left.axline((0.0, 0.0), slope=1.0, color=FAINT, lw=0.8, zorder=0)
         left.plot(measured, measured - old, "o", ms=4.5, mfc="none", color=INK)
@@ -243,33 +250,37 @@ def torque_figure(found: Identified, arm: ConfiguredArm, poses: Sequence[Observa
         )  # fmt: skip
         right.set(xlim=(0.4, len(numbers) + 0.6), ylabel="Remainder (Nm)")
         right.set_xticks(numbers, [])
-        _finish(left, joint, arm.joint_names[joint])
-        _finish(right, joint)
+        _finish(left, colour, arm.joint_names[joint])
+        _finish(right, colour)
     left.set_xlabel("Measured (Nm)")
     rows = [[str(n), *(f"{angle:.0f}" for angle in pose)] for n, pose in zip(numbers, np.degrees(theta), strict=True)]
     ticks = ["\n".join(row if kept else [*row, "left out"]) for row, kept in zip(rows, used, strict=True)]
     right.set_xticks(numbers, ticks, fontsize=8)
-    right.set_xlabel("Pose, with its four angles in degrees")
+    right.set_xlabel("Pose, with its angles in degrees")
     figure.legend(*right.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
 
 
 def friction_figure(curves: Sequence[FrictionCurve], labels: Sequence[str]) -> Figure:
     """Return the friction of each joint over its speed, measured and fitted, less what grows with the torque."""
-    figure = Figure(figsize=(FIGURE_WIDTH, 3.2), layout="constrained")
-    for joint, axis in enumerate(figure.subplots(1, 4, sharey=True)):
+    down, colours = math.ceil(len(curves) / MOST_ACROSS), joint_colours(len(curves))
+    figure = Figure(figsize=(FIGURE_WIDTH, CURVE_HEIGHT * down), layout="constrained")
+    axes = figure.subplots(down, MOST_ACROSS, sharey=True, squeeze=False).ravel()
+    for unused in axes[len(curves) :]:
+        unused.remove()
+    for joint, axis in enumerate(axes[: len(curves)]):
         curve, order = curves[joint], np.argsort(curves[joint].speed)
         of_load = curve.load * curve.carried
-        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=JOINT_COLOURS[joint], label="measured")
+        axis.plot(curve.speed, curve.torque - of_load, "o", ms=4.5, color=colours[joint], label="measured")
         axis.plot(curve.speed[order], (curve.fitted - of_load)[order], color=INK, lw=1.0, label="fitted")
         axis.set_xlabel("Speed (rad/s)")
         axis.legend(frameon=False, fontsize=8)
-        _finish(axis, joint, labels[joint])
+        _finish(axis, colours[joint], labels[joint])
     figure.axes[0].set(ylabel="Friction (Nm)", ylim=(0.0, None))
     return figure
 
 
-def _finish(axis: Axes, joint: int, title: str = "") -> None:
-    axis.set_title(title, fontsize=10, color=JOINT_COLOURS[joint], loc="left", weight="bold")
+def _finish(axis: Axes, colour: str, title: str = "") -> None:
+    axis.set_title(title, fontsize=10, color=colour, loc="left", weight="bold")
     make_plain(axis)
     axis.margins(y=0.12)

@@ -14,19 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT
-from exo_gravity.core.arm.gravity import Torque, load_moments
-from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT, ArmModel
+from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt, angle_between
 from exo_gravity.core.compensation.controller import SampleController
-from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
-from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.numbers import JOINT_COUNT
-from exo_gravity.core.params import Param
+from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
+from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
+from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
@@ -53,7 +55,7 @@ class Tour:
 
     measured: so far. trouble: why it ended early, as a sentence that names joint, value and limit, or ''. done: whether
     the arm hangs again after the last pose. progress: what it does, as a sentence. elapsed: s since the first step.
-    temperature: (4,) degC of the motors, set by who knows it; () if it is not known.
+    temperature: (n,) degC of the motors, set by who knows it; () if it is not known.
     """
 
     def __init__(
@@ -70,24 +72,24 @@ class Tour:
         self._tracker = Tracker(rate, limits.max_effort)
         self._first_tilt = guess.tilt
         self._now = -math.inf
-        self._position = np.zeros(JOINT_COUNT)  # rad, at the end of the present line
+        self._position = np.zeros(guess.model.count)  # rad, at the end of the present line
         self._skipped = 0  # poses
         self._awaits_plan, self._undecided = False, 0.0  # whether a pose is to be chosen, and s since then
         self._plan: tuple[Station | None, str] = (None, "")  # the next pose, or None to go home, and the trouble
-        self._friction = np.zeros(JOINT_COUNT)  # Nm, 0 until it is measured
-        self._unexplained = np.zeros(JOINT_COUNT)  # s
+        self._friction = np.zeros(guess.model.count)  # Nm, 0 until it is measured
+        self._unexplained = np.zeros(guess.model.count)  # s
         self._refreshed = -math.inf
-        self._matrix, self._uncertain = np.eye(JOINT_COUNT), np.zeros(JOINT_COUNT)
+        self._matrix, self._uncertain = np.eye(guess.model.count), np.zeros(guess.model.count)
 
     def wait(self, position: Sequence[float], tilt: Tilt) -> Torque:
-        """Return the expected torque (4,) in Nm at `position` (4,) rad, while the arm is not yet carried."""
+        """Return the expected torque (n,) in Nm at `position` (n,) rad, while the arm is not yet carried."""
         self._guess.tilt = tilt
         return self._guess.torque(position)
 
     def step(self, now: float, position: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> Torque | None:
-        """Return the effort (4,) in Nm at `now` s, None after trouble.
+        """Return the effort (n,) in Nm at `now` s, None after trouble.
 
-        position, velocity: (4,), rad and rad/s. tilt: of the trunk or the stand.
+        position, velocity: (n,), rad and rad/s. tilt: of the trunk or the stand.
         """
         if self.trouble:
             return None
@@ -101,15 +103,16 @@ class Tour:
         self.elapsed += dt
         self._undecided = self._undecided + dt if self._awaits_plan else 0.0
         if now - self._refreshed > REFRESH_PERIOD:
-            self._refreshed, moments = now, self._guess.common_moments[:JOINT_COUNT]
-            self._matrix = LinkInertia.of_moments(self._guess.length, moments, self._load).matrix(position)
+            self._refreshed, model = now, self._guess.model
+            self._matrix = model.matrix(position, self._guess.common_moments, self._load)
             self._uncertain = self._guess.torques(np.array([position]))[1][0]
-        effort = self._tracker.step(dt, position, velocity, expected, tilt.direction, self._matrix)
+        down = self._guess.model.down(tilt)
+        effort = self._tracker.step(dt, position, velocity, expected, down, self._matrix)
         self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
 
     def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
-        """Return what is wrong after `dt` s with the motion, or ''; velocity: (4,) rad/s."""
+        """Return what is wrong after `dt` s with the motion, or ''; velocity: (n,) rad/s."""
         if dt > MAX_GAP:
             return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
         if self._undecided > LONGEST_CHOICE:
@@ -145,7 +148,7 @@ class Tour:
         if not self._awaits_plan:
             return
         try:
-            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, JOINT_COUNT)
+            taken = np.array([measured.theta for measured in self.measured]).reshape(-1, self._guess.model.count)
             self._plan = self._itinerary.next(taken, self._position, self.elapsed, self._guess, self._friction), ""
         except ExoGravityError as error:
             self._plan = (None, str(error))
@@ -203,7 +206,7 @@ class Tour:
         seen, unrest = average(sweeps)
         theta = np.asarray(seen.theta)
         effort = seen.effort + self._guess.torques(theta[None], seen.direction)[0][0]
-        allowed = np.dot(MAX_UNREST, (np.ones(JOINT_COUNT), np.abs(seen.friction), np.abs(effort)))
+        allowed = np.dot(MAX_UNREST, (np.ones(len(effort)), np.abs(seen.friction), np.abs(effort)))
         for name, change, limit in zip(self._limits.joint_names, unrest, allowed, strict=True):
             if change > limit:
                 what = f"{change:.2f} Nm between two passes of a pose, the limit is {limit:.2f}"
@@ -245,6 +248,7 @@ class TourController(SampleController):
 
 
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
+MOMENTS = ("first_moment", "off_axis")  # of the paper's arm
 LIMITS = ("position_min", "position_max", "max_effort")
 BRIDGE = ("rate", *LIMITS)  # as can_bridge's
 DURATION = 230.0  # s of a tour, for which the poses are chosen
@@ -258,18 +262,59 @@ CALIBRATOR = (
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.again", 0, "number of the first poses that are visited again at the end", (0, 100), fixed=True),
     Param("tour.friction", False, "sweep the hanging arm at several speeds, then a few chosen poses", fixed=True),
-    Param("tour.load_mass", 0.0, "weight that hangs on link 4", (0.0, MAX_MASS), "kg", fixed=True),
-    Param("tour.load_lever", 0.0, "its distance from the elbow", (0.0, MAX_LENGTH), "m", fixed=True),
+    Param("tour.load_mass", 0.0, "weight that hangs on the last link", (0.0, MAX_MASS), "kg", fixed=True),
+    Param("tour.load_lever", 0.0, "its distance from the last joint", (0.0, MAX_LENGTH), "m", fixed=True),
 )
+OF_URDF = ("joint_names", "gravity", "use_imu", "tilt_timeout", "law")  # as the compensator's, for an arm from a URDF
+OF_BRIDGE = (*BRIDGE, "motor", "home")
+
+
+def of_urdf(name: str) -> bool:
+    """Return whether the compensator's parameter `name` says how an arm from a URDF is calibrated."""
+    return name in OF_URDF or name.startswith("urdf.")
+
+
+def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
+    """Return the parameters of `calibrator` for an arm with the parameters `given`."""
+    if given.get("law") != URDF_LAW:
+        return CALIBRATOR
+    own = [replace(param, fixed=True) for param in urdf_table(given) if of_urdf(param.name)]
+    known = {param.name for param in own} | {*ARM, *MOMENTS, *BRIDGE}
+    bridge = {param.name: param for param in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if param.name in OF_BRIDGE}
+    others = (param for param in CALIBRATOR if param.name not in known)
+    return tuple(table_for((*own, *bridge.values(), *others), given))
 
 
 def tour_of(values: Mapping[str, Any]) -> Tour:
     """Return the tour that parameter values describe. Raises ParameterError."""
-    limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in LIMITS})
-    load = values["tour.load_mass"], values["tour.load_lever"]
-    moments = np.array((*values["first_moment"], *values["off_axis"])) + load_moments(values["link_length"], *load)
-    guess = TorqueGuess(values["link_length"], moments, Tilt.of(values["side"]), values["gravity"])
+    load, is_urdf = (values["tour.load_mass"], values["tour.load_lever"]), values.get("law") == URDF_LAW
+    given_limits = {name: values[name] for name in ((*LIMITS, "home") if is_urdf else LIMITS)}
+    limits = Limits(tuple(values["joint_names"]), **given_limits)
+    model = urdf_moments(values) if is_urdf else _papers_moments(values)
+    upright = Tilt.of(values.get("side", "left"))  # the root link of a URDF is not mirrored
+    guess = TorqueGuess(model, model.moments + model.load(*load), upright)
     given = friction_stations(limits) if values["tour.friction"] else ()
     count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
     return Tour(limits, guess, itinerary, values["rate"], load)
+
+
+def urdf_arm_of(values: Mapping[str, Any]) -> UrdfArm:
+    """Return the arm from a URDF that parameter values describe, with gains of 1.
+
+    Raises ParameterError, also if the URDF comes from a topic.
+    """
+    if not values["urdf.file"]:
+        raise ParameterError("urdf.file", "", "a file: a calibration does not wait for a topic")
+    arm = arm_from(values, read_urdf(values["urdf.file"]))
+    return arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
+
+
+def urdf_moments(values: Mapping[str, Any]) -> UrdfMoments:
+    """Return the moments of the same arm, with the rotors of its motors. Raises ParameterError."""
+    return UrdfMoments(urdf_arm_of(values), [MOTORS[name].rotor_inertia for name in values["motor"]])
+
+
+def _papers_moments(values: Mapping[str, Any]) -> MomentModel:
+    moments = values["first_moment"], values["off_axis"]
+    return PapersMoments(ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"]))

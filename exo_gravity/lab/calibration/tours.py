@@ -14,24 +14,28 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ModelError, moments_along
-from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, gravity_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.arm import ModelError, moments_along, papers
+from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, moments_of, regressor
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
-from exo_gravity.core.compensation.settings import joint_spring_of, settings_of, wearer_of
+from exo_gravity.core.compensation.laws import URDF_LAW
+from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
-from exo_gravity.core.numbers import COVER, JOINT_COUNT, one_float
+from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
+from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
+from exo_gravity.lab.calibration.tour import urdf_arm_of, urdf_moments
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit, fit_wearer, unrest
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm, ConfiguredArm
 
 MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to relax
 SCALE_POSES = 8  # of each tour of `calibrate scale`
@@ -75,14 +79,14 @@ CHECK = CheckTour()
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
-def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier) if options.earlier else []
     return moments_from(arm, earlier + _observations(options, arm, say, {"tour.poses": options.poses}))
 
 
 def _observations(
-    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = "",
+    options: argparse.Namespace, arm: AnyArm, say: Say, changes: Mapping[str, Any], request: str = "",
     moments: np.ndarray | None = None,
 ) -> list[Observation]:  # fmt: skip
     """Return what a tour measures, or what `options.bag` shows.
@@ -98,10 +102,10 @@ def _observations(
     return live.run_tour(options, nodes, say).complete(options.record)
 
 
-def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses without and with the weight, and solve for scales and moments. Raises ParameterError."""
     mass, lever = options.mass, options.lever
-    load_moments(arm.robot.length.tolist(), mass, lever)
+    model_of(arm).load(mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
     earlier = observations_in(options.earlier) if options.earlier else []
@@ -109,24 +113,40 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
     bare = _observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
-        bare = [one._replace(effort=_held(arm, one)) for one in bare]
+        needed = _needed(arm, bare)
+        bare = [one._replace(effort=effort) for one, effort in zip(bare, needed, strict=True)]
     else:
-        hang = f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
+        hang = _request(arm, mass, lever)
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = _observations(options, arm, say, changes, hang)
     return moments_from(arm, earlier + bare + weighed)
 
 
-def _held(arm: ConfiguredArm, pose: Observation) -> np.ndarray:
-    """Return the torque (4,) in Nm that the file's arm needs in a pose."""
-    springs = joint_spring_of(arm.compensator).torques(np.asarray(pose.theta))
-    return np.asarray(gravity_torque(arm.robot, pose.theta, pose.direction) + springs)
+def _request(arm: AnyArm, mass: float, lever: float) -> str:
+    """Return what a person is asked to hang on the arm."""
+    if arm.by_urdf:
+        return f"Hang {mass:g} kg on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
+    return f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
 
 
-def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+def model_of(arm: AnyArm) -> MomentModel:
+    """Return the moments of an arm as configured. Raises ParameterError."""
+    if arm.by_urdf:
+        return urdf_moments({**arm.compensator, "motor": arm.can_bridge["motor"]})
+    return PapersMoments(papers(arm.robot))
+
+
+def _needed(arm: AnyArm, poses: Sequence[Observation]) -> np.ndarray:
+    """Return the torque (m, n) in Nm that the file's arm needs in the poses."""
+    model, (theta, direction, _, _) = model_of(arm), columns(poses)
+    gravity = model.rows(theta, direction) @ model.moments * np.array(arm.compensator["gain"])
+    return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
+
+
+def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
-    robot, (low, high) = arm.robot, TORQUE_SCALE_BOUNDS
-    found = identify(observations, robot.length, robot.gravity)
+    model, (low, high) = model_of(arm), TORQUE_SCALE_BOUNDS
+    found = identify(observations, model)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
@@ -134,14 +154,14 @@ def moments_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Cal
         for name, value in zip(arm.joint_names, scale, strict=True)
         if not low <= value <= high
     )
-    poses, taken = candidates(arm.limits), [one.theta for one in observations]
-    best = poses[next_pose(taken, poses, observations[-1].direction, moments_of(robot), robot.gravity)]
+    poses, taken = candidates(arm.limits, model), [one.theta for one in observations]
+    best = poses[next_pose(taken, poses, observations[-1].direction, model.moments, model)]
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
-    changes, lines = _changes(arm, found, scale), (*_lines(arm, found), more)
-    return CalibrationResult(changes, lines, impossible, arm, tuple(observations), found)
+    changes, lines = _changes(arm, model, found, scale), (*_lines(arm, found), more)
+    return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
 
 
-def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
+def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
     """Return the file's torque scales (4,) at the temperatures of the poses."""
     bridge = arm.can_bridge
     columns = (bridge[name] for name in ("torque_scale", "torque_scale_slope", "torque_scale_temperature"))
@@ -149,16 +169,27 @@ def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
     return np.array([scale_at(*motor) if math.isfinite(motor[-1]) else motor[0] for motor in motors])
 
 
-def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple[Change, ...]:
-    """Return the new values of the parameter file. What is unknown keeps its value."""
-    node, error = f"{arm.namespace}/compensator", found.error
+def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Iterator[Change]:
+    """Yield the new moments. What is unknown keeps its value."""
+    node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    before = moments_of(arm.robot)
-    moments = np.where(np.isfinite(error), found.moments, before).round(5).tolist()
-    changes = []
+    moments = np.where(np.isfinite(error), found.moments, before)
+    if arm.by_urdf:
+        known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
+        new = urdf_arm_of(arm.compensator).with_moments(moments)
+        for name, values in zip(MOMENT_NAMES, new.change.T, strict=True):
+            yield Change(
+                node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {_row(np.array(arm.compensator[name]))}"
+            )
+        return
     for name, part in MOMENT_PARAMETERS.items():
         note = f"{' '.join(MOMENTS[part])} {unit}, +-{_row(error[part])}, was {_row(before[part])}"
-        changes.append(Change(node, name, moments[part], note))
+        yield Change(node, name, moments[part].round(5).tolist(), note)
+
+
+def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[float]) -> tuple[Change, ...]:
+    """Return the new values of the parameter file."""
+    node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
     changes += [
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
         *_temperature_changes(arm, found),
@@ -169,16 +200,16 @@ def _changes(arm: ConfiguredArm, found: Identified, scale: list[float]) -> tuple
         changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
     if not found.relative:
         known = np.isfinite(found.scale_error)
-        share = np.where(known, found.scale_error / found.scale, ModelError().scale)
+        share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
         changes.append(Change(node, "model_error.scale", share.round(4).tolist(), "share of torque_scale"))
-    if arm.compensator["law"] != "exact":
+    if arm.compensator["law"] not in ("exact", URDF_LAW):
         changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
-        changes.append(Change(node, "gain", [1.0] * 4, "now part of the moments and of torque_scale"))
+        changes.append(Change(node, "gain", [1.0] * len(scale), "now part of the moments and of torque_scale"))
     return tuple(changes)
 
 
-def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+def _temperature_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     """Yield at which temperatures the torque scales are true, and their slopes."""
     node, bridge = f"{arm.namespace}/can_bridge", arm.can_bridge
     if not np.all(np.isfinite(found.temperature)):
@@ -191,7 +222,7 @@ def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Chan
         yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
 
 
-def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
+def _spring_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
     node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
     if not (np.any(found.stiffness) or before.on):
@@ -209,7 +240,7 @@ def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
         yield Change(f"{arm.namespace}/can_bridge", "largest_addition", addition.tolist(), note)
 
 
-def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
+def _lines(arm: AnyArm, found: Identified) -> Iterator[str]:
     """Yield what the parameter file does not hold, in sentences."""
     for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
         yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
@@ -224,18 +255,18 @@ def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
 
 
-def calibrate_check(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Compare the torque that a few poses need with the file's. Raises ParameterError."""
     return checked(arm, _observations(options, arm, say, {"tour.poses": CHECK.poses}))
 
 
-def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
 
     A joint that differs by more than the band of `model_error.torque` is a refusal.
     """
-    held, effort = np.array([_held(arm, one) for one in observations]), columns(observations)[2]
-    error = np.array(settings_of({**arm.compensator, "law": "exact"}).model_error.torque)
+    held, effort = _needed(arm, observations), columns(observations)[2]
+    error = np.array(for_joints(_torque_error(arm), len(arm.joint_names), max))
     size = np.sqrt(np.mean(held**2, axis=0))
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
@@ -250,17 +281,23 @@ def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> Calibrat
         what = f"{abs(less):.1f} +- {band[n]:.1f} % {'less' if less > 0.0 else 'more'} torque"
         sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
         (refusals if abs(less) > band[n] else lines).append(sentence)
-    return CalibrationResult((), tuple(lines), tuple(refusals), arm, tuple(observations))
+    return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 
-def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
+def _torque_error(arm: AnyArm) -> Sequence[float]:
+    """Return the file's `model_error.torque`, or its default, in Nm."""
+    error: Sequence[float] = arm.compensator.get("model_error.torque", ModelError().torque)
+    return error
+
+
+def calibrate_friction(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     return friction_from(arm, _observations(options, arm, say, {"tour.friction": True}))
 
 
-def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
+def friction_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
-    speed = np.array([np.broadcast_to(one.speed, JOINT_COUNT) for one in observations])
+    speed = np.array([np.broadcast_to(one.speed, len(one.theta)) for one in observations])
     effort, friction, spread = (np.array([one[field] for one in observations]).T for field in (2, 3, 4))
     curves = tuple(map(fit_friction, speed.T, friction, spread, effort))
     changes, refusals = [], []
@@ -274,11 +311,17 @@ def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> Ca
         changes.append(Change(f"{arm.namespace}/can_bridge", "", 0, note))
         if fit.coulomb <= 0.0:
             refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
-    return CalibrationResult(tuple(changes), (), tuple(refusals), arm, tuple(observations), curves=curves)
+    return CalibrationResult(tuple(changes), (), tuple(refusals), arm, observations=tuple(observations), curves=curves)
 
 
-def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
-    """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
+def calibrate_wearer(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+    """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError.
+
+    It knows the segments of a person's arm on the links of the paper's arm alone.
+    """
+    if not isinstance(arm, ConfiguredArm):
+        what = "exact: `calibrate wearer` is for the paper's arm; give wearer.body_mass, or wearer.mass and wearer.cog"
+        raise ParameterError(f"{arm.namespace}/compensator law", URDF_LAW, what)
     carried = WEARER.carried if options.carried is None else one_float("carried", options.carried, 0.0, MOST_CARRIED)
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, WEARER.comfortable[0]), np.minimum(arm.high, WEARER.comfortable[1])
@@ -347,7 +390,11 @@ def wearer_from(
         _bridge_line(arm, moments_of(arm.robot) + moments, fit),
     )  # fmt: skip
     return CalibrationResult(
-        _wearer_changes(arm, fit, moments, error, unsure, carried), lines, refusals, arm, tuple(observations)
+        _wearer_changes(arm, fit, moments, error, unsure, carried),
+        lines,
+        refusals,
+        arm,
+        observations=tuple(observations),
     )
 
 

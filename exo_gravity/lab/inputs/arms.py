@@ -5,15 +5,17 @@ An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked 
 unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import yaml
 
 from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import (
     Settings,
@@ -27,30 +29,47 @@ from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
-from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
+from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
+
+MASSES = {"robot.mass", "robot.first_moment"}  # a file with one of them describes the paper's arm
 
 
 @dataclass(frozen=True, eq=False)
-class ConfiguredArm:
-    """One arm of a parameter file, checked."""
+class AnyArm:
+    """One arm of a parameter file, the paper's or one from a URDF; checked."""
 
     namespace: str  #: '/right'
     can_bridge: Mapping[str, Any]  #: all parameter values by name
     compensator: Mapping[str, Any]  #: all parameter values by name
     motors: tuple[JointMotor, ...]
     limits: Limits
-    robot: ArmModel  #: the arm without a wearer
+    robot: Arm  #: the arm without a wearer
     name: str  #: the namespace without slashes, 'arm' for the root namespace
     side: str  #: 'left' or 'right'
-    joint_names: tuple[str, ...]  #: from the shoulder to the elbow
-    low: np.ndarray  #: lower joint limits (4,) in rad
+    joint_names: tuple[str, ...]  #: from the shoulder on
+    low: np.ndarray  #: lower joint limits (n,) in rad
     high: np.ndarray  #: upper joint limits
+
+    @property
+    def by_urdf(self) -> bool:
+        """Whether a URDF describes it."""
+        return bool(self.compensator["law"] == URDF_LAW)
+
+
+@dataclass(frozen=True, eq=False)
+class ConfiguredArm(AnyArm):
+    """One of them that is the paper's."""
+
+    robot: ArmModel
 
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator "):
             return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
+
+
+OneArm = TypeVar("OneArm", bound=AnyArm)
 
 
 class CarriedArm(NamedTuple):
@@ -74,8 +93,7 @@ def carried_arm(nodes: Nodes, namespace: str) -> CarriedArm:
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
     values = node_values(nodes, node, urdf_table(nodes[node]))
     with named(f"{node} "):
-        robot = UrdfArm(read_urdf(values["urdf.file"]), values["joint_names"], values["urdf.hand"])
-        settings = urdf_settings_of(values, robot)
+        settings = urdf_settings_of(values, arm_from(values, read_urdf(values["urdf.file"])))
     return CarriedArm(namespace.strip("/") or "arm", can_bridge, motors, limits, settings)
 
 
@@ -88,7 +106,7 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     node = f"{namespace}/compensator"
     given = nodes.get(node, {})
     if given.get("law") == URDF_LAW:
-        if not {"robot.mass", "robot.first_moment"}.intersection(given):
+        if not MASSES.intersection(given):
             raise ParameterError(f"{node} law", URDF_LAW, "exact: this is for the paper's arm alone")
         # The law `exact` gives the torques of a URDF of this arm.
         kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
@@ -105,21 +123,60 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot, name, side, names, *bounds)
 
 
+def read_any_arm(nodes: Nodes, namespace: str) -> AnyArm:
+    """Return the arm of `namespace` ('/right') in the nodes of a parameter file, also one from a URDF.
+
+    Without a side in its namespace such an arm is a right one. Raises ParameterError.
+    """
+    node = f"{namespace}/compensator"
+    given = nodes.get(node, {})
+    if given.get("law") != URDF_LAW or MASSES.intersection(given):
+        return read_arm(nodes, namespace)
+    arm, side = carried_arm(nodes, namespace), namespace.rpartition("/")[2]
+    names, values = arm.limits.joint_names, node_values(nodes, node, urdf_table(given))
+    if tuple(values["joint_names"]) != names:
+        raise ParameterError(f"{node} joint_names", values["joint_names"], f"those of can_bridge, {list(names)}")
+    bounds = np.array(arm.limits.position_min), np.array(arm.limits.position_max)
+    of_side = side if side in SIDES else SIDES[-1]
+    read = arm.can_bridge, values, arm.motors, arm.limits, arm.settings.robot, arm.name
+    return AnyArm(namespace, *read, of_side, names, *bounds)
+
+
+def any_arms(params: str | Path) -> list[AnyArm]:
+    """Return every arm of a parameter file, also those from a URDF. Raises ParameterError if there is none."""
+    return _arms(params, read_any_arm)
+
+
+def any_arm(params: str | Path, side: str) -> AnyArm:
+    """Return the only arm of `side` in a parameter file, also one from a URDF. Raises ParameterError."""
+    return _only(any_arms(params), params, side)
+
+
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:
-    """Return every arm of a parameter file. Raises ParameterError if there is none."""
-    nodes = load(params)
-    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
-    if not namespaces:
-        raise ParameterError("params", str(params), "a file with a compensator")
-    return [read_arm(nodes, namespace) for namespace in namespaces]
+    """Return every arm of a parameter file. Raises ParameterError if there is none, or one is not the paper's."""
+    return _arms(params, read_arm)
 
 
 def configured_arm(params: str | Path | None = None, side: str = "right") -> ConfiguredArm:
     """Return the only arm of `side` in a parameter file, by default in the packaged exo.yaml. Raises ParameterError."""
     path = params or packaged_config("exo.yaml")
-    found = [arm for arm in configured_arms(path) if arm.side == side]
+    return _only(configured_arms(path), path, side)
+
+
+def _arms(params: str | Path, read: Callable[[Nodes, str], OneArm]) -> list[OneArm]:
+    nodes = load(params)
+    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a compensator")
+    return [read(nodes, namespace) for namespace in namespaces]
+
+
+def _only(arms: Sequence[OneArm], params: str | Path, side: str) -> OneArm:
+    found = [arm for arm in arms if arm.side == side]
     if len(found) != 1:
-        raise ParameterError("params", str(path), f"a file with one compensator whose side is {side}, not {len(found)}")
+        raise ParameterError(
+            "params", str(params), f"a file with one compensator whose side is {side}, not {len(found)}"
+        )
     return found[0]
 
 

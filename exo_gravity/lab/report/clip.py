@@ -19,7 +19,6 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.progress import track
 
-from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.vocabulary import Source
@@ -31,7 +30,7 @@ from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.view.scene import LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes
 from exo_gravity.lab.view.urdf import COLOURS as MATERIALS
-from exo_gravity.lab.view.urdf import ArmDescription, arm_pose, described, joint_names, urdf
+from exo_gravity.lab.view.urdf import Described, described, joint_names, urdf
 
 SIZE, GIF_SIZE = (640, 480), (480, 360)  # pixels
 COLOURS, SAMPLES = 256, 12  # of a GIF, and the frames of which these are
@@ -116,7 +115,7 @@ class Stage:
         self._model = _model(arms, width, height)
         self._dummy = _dummy(arms)
         self._data = mujoco.MjData(self._model)
-        names = [name for four in joint_names(arms) for name in four]
+        names = [name for own in joint_names(arms) for name in own]
         self._at = [int(self._model.joint(name).qposadr[0]) for name in names]
         self._camera = mujoco.MjvCamera()
         self._camera.lookat[:] = np.mean([arm.base for arm in arms], axis=0) - (0.0, 0.0, CAMERA.centre)
@@ -135,7 +134,7 @@ class Stage:
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         for view in views:
-            worn = Shape("wearer", LINE, arm_pose(view.arm, view.theta)[0][1:], LIMB_SIZE, LIMB)  # it shows through
+            worn = Shape("wearer", LINE, view.arm.pose(view.theta)[0][1:], LIMB_SIZE, LIMB)  # it shows through
             for shape in (*arm_shapes(view), worn):
                 _add(self._renderer.scene, shape)
         for shape in self._dummy:
@@ -152,13 +151,15 @@ class Stage:
     def _label(self, draw: ImageDraw.ImageDraw, font: Any, view: ArmView) -> None:
         """Write the torque of each joint at the picture's edge on the arm's side of the trunk, with a line to it."""
         width, height = self._renderer.width, self._renderer.height
-        places = [self._pixel(joint) for joint in arm_pose(view.arm, view.theta)[0][:4]]
+        places = [self._pixel(joint) for joint in view.arm.pose(view.theta)[0][:-1]]
         middle, _ = self._pixel(np.multiply(view.arm.base, (1.0, 0.0, 1.0)))
         is_left, below, line = places[0][0] < middle, 0.16 * height, 1.15 * LINE_HEIGHT * height
-        for name, effort, (x, y) in zip(view.arm.limits.joint_names, view.effort, places, strict=True):
+        names = view.arm.limits.joint_names
+        step = min(2.4 * line, (height - below) / len(names))  # so that the labels of many joints fit, too
+        for n, (name, effort, (x, y)) in enumerate(zip(names, view.effort, places, strict=True)):
             label = f"{name.removeprefix(f'{view.arm.side}_').replace('_', ' ')}\n{shown(effort, 2)} Nm"
-            top = max(below, y - line)
-            below = top + 2.4 * line
+            top = min(max(below, y - line), height - step * (len(names) - n))
+            below = top + step
             at, anchor = ((line / 2, top), "la") if is_left else ((width - line / 2, top), "ra")
             draw.multiline_text(at, label, INK, font, anchor, align="left" if is_left else "right")
             start, _, end, _ = draw.multiline_textbbox(at, label, font, anchor)
@@ -173,7 +174,7 @@ class Stage:
         return self._renderer.width / 2 + across, self._renderer.height / 2 - away @ up * scale
 
 
-def _dummy(arms: Sequence[ArmDescription]) -> list[Shape]:
+def _dummy(arms: Sequence[Described]) -> list[Shape]:
     """Return the wearer without the arms that are worn."""
     middle, worn = np.mean([arm.base for arm in arms], axis=0) * (1.0, 0.0, 1.0), {arm.outward for arm in arms}
     parts = [(ends, size, {1.0, -1.0} if ends[0][1] else {1.0}) for *ends, size in DUMMY]
@@ -185,7 +186,7 @@ def _dummy(arms: Sequence[ArmDescription]) -> list[Shape]:
     ]
 
 
-def _view(arm: ArmDescription, recording: Recording, time: float) -> ArmView:
+def _view(arm: Described, recording: Recording, time: float) -> ArmView:
     """Return what is known of an arm at `time` s."""
     at = min(int(np.searchsorted(recording.time, time)), len(recording.time) - 1)
     rows = (recording.position, recording.velocity, recording.effort)
@@ -209,19 +210,17 @@ def _step(recording: Recording, time: float) -> str:
     return "let down" if recording.carried and time > recording.carried[0][0] else "start-up checks"
 
 
-def _description(bag: Bag, name: str) -> ArmDescription:
+def _description(bag: Bag, name: str) -> Described:
     """Return the arm `name` from the nodes' parameters in a recording. Raises DataError or ParameterError."""
     values = {executable: recorded_of(bag.parameters, name, executable) for executable in ("compensator", "can_bridge")}
     for executable, given in values.items():
         if not given:
             node = node_of(name, executable)
             raise DataError(f"{name}: the recording has no parameters of {node}, which describe the arm")
-    if values["compensator"]["law"] == URDF_LAW:
-        raise DataError(f"{name}: a clip shows the paper's arm alone, not one with law {URDF_LAW}")
     return described(**values)
 
 
-def _model(arms: Sequence[ArmDescription], width: int, height: int) -> Any:
+def _model(arms: Sequence[Described], width: int, height: int) -> Any:
     """Return the description as a MuJoCo model, with its visuals, light and a sky."""
     seen = '<mujoco><compiler discardvisual="false" fusestatic="false"/></mujoco></robot>'
     spec = mujoco.MjSpec.from_string(urdf(arms).replace("</robot>", seen))

@@ -7,8 +7,8 @@ start.
 """
 
 from bisect import bisect_left
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +16,11 @@ from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import settings_of
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.compensation.settings import Settings, settings_of, urdf_settings_of
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.vocabulary import Source
+from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.bag.content import Bag
 from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, joint_shares, observed, share_of, while_between
@@ -41,7 +42,7 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     Raises ParameterError or DataError that says why it is not known.
     """
     values = recorded_of(bag.parameters, recording.name, "compensator")
-    settings = settings_of({**values, "law": "exact"}) if values and values["law"] != URDF_LAW else None
+    settings = _settings_of(values) if values else None
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
@@ -64,6 +65,15 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     if not len(curve.time):
         return None
     return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve), joint_shares(curve))
+
+
+def _settings_of(values: Mapping[str, Any]) -> Settings:
+    """Return the settings of recorded parameter values. Raises ParameterError, also if a URDF is not there any more."""
+    if values["law"] != URDF_LAW:
+        return settings_of({**values, "law": "exact"})
+    if not values["urdf.file"]:
+        raise ParameterError("urdf.file", "", "a file: the URDF came from a topic, which is not recorded")
+    return urdf_settings_of(values, arm_from(values, read_urdf(values["urdf.file"])))
 
 
 def sentence(part: WearerPart, source: Source) -> str:

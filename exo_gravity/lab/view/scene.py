@@ -15,7 +15,7 @@ import numpy as np
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.drive import CARRYING, State
 from exo_gravity.core.safety.limits import WALL
-from exo_gravity.lab.view.urdf import ArmDescription, arm_pose
+from exo_gravity.lab.view.urdf import Described
 
 Colour = tuple[float, float, float, float]
 
@@ -68,10 +68,10 @@ class Shape(NamedTuple):
 class ArmView(NamedTuple):
     """What is known of one arm now."""
 
-    arm: ArmDescription
-    theta: Sequence[float]  #: (4,) rad
-    velocity: Sequence[float]  #: (4,) rad/s
-    effort: Sequence[float]  #: (4,) Nm, as the motors report it
+    arm: Described
+    theta: Sequence[float]  #: (n,) rad
+    velocity: Sequence[float]  #: (n,) rad/s
+    effort: Sequence[float]  #: (n,) Nm, as the motors report it
     state: str  #: of its bridge, '' if not known
     message: str = ""  #: of its bridge
 
@@ -87,7 +87,7 @@ def gravity_shapes(gravity: Vector | None) -> list[Shape]:
 def arm_shapes(view: ArmView) -> list[Shape]:
     """Return what is drawn around one arm: range and torque of each joint, and what the arm's bridge does."""
     limits, shapes = view.arm.limits, []
-    for n, (origin, axis, along) in enumerate(zip(*arm_pose(view.arm, view.theta), strict=False)):
+    for n, (origin, axis, along) in enumerate(zip(*view.arm.pose(view.theta), strict=False)):
         low, high = limits.position_min[n] - view.theta[n], limits.position_max[n] - view.theta[n]
         colour = GREY if low + WALL.width <= 0.0 <= high - WALL.width else RED
         tip = origin + SIZES.range_radius * along

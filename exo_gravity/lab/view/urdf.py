@@ -18,11 +18,13 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.kinematics import frames
+from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits, limits_of
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 
 Point = tuple[float, ...]  # (3,)
 
@@ -47,12 +49,57 @@ TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin tube
 DRAWN_RADIUS = 0.0125  # m, of the carbon tubes (the paper, appendix A)
 MOTOR: dict[str, Any] = {"radius": 0.042, "length": 0.04}  # m, between AK60-6 and AK80-9
 COG_RADIUS = 0.018  # m
+LEAST_MASS = 1e-3  # kg, of a link that has none in its URDF
 CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
 
+class Described:
+    """What a description, and a picture, states about one arm of n joints."""
+
+    side: str  #: 'left' or 'right'
+    limits: Limits  #: names, position, speed and torque limits of the joints
+    damping: Vector  #: (n,) Nm s/rad, 0 for unknown
+    friction: Vector  #: (n,) Nm, 0 for unknown
+
+    @property
+    def outward(self) -> float:
+        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
+        return 1.0 if self.side == "left" else -1.0
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links (n,), and of the frame at the far end of the last one."""
+        count = len(self.limits.joint_names)
+        return (*(f"{self.side}_link_{n}" for n in range(1, count + 1)), f"{self.side}_end")
+
+    @property
+    def base(self) -> Point:
+        """Origin of joint 1 in the trunk's axes, m."""
+        raise NotImplementedError
+
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (n,) rad, in the trunk's axes.
+
+        The origins (n + 1, 3) in m of the joints and the far end, the axes (n, 3) about which the joints turn, and unit
+        vectors (n, 3) along the links.
+        """
+        raise NotImplementedError
+
+    def ways(self) -> np.ndarray:
+        """Return the way (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
+        raise NotImplementedError
+
+    def bodies(self) -> list[tuple[float, Point]]:
+        """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
+
+        Raises ParameterError if a link has no mass.
+        """
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class ArmDescription:
-    """What a description, and a picture, states about one arm."""
+class ArmDescription(Described):
+    """The paper's arm."""
 
     side: str  #: 'left' or 'right'
     robot: ArmModel  #: without a wearer
@@ -63,56 +110,103 @@ class ArmDescription:
     shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
 
     @property
-    def outward(self) -> float:
-        """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
-        return 1.0 if self.side == "left" else -1.0
-
-    @property
     def base(self) -> Point:
         """Origin of joint 1 in the trunk's axes, m."""
         given = tuple(map(float, self.shoulder))
         return given if any(given) else (0.0, self.outward * HALF_BREADTH, 0.0)
 
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (4,) rad."""
+        length = self.robot.length
+        links = frames(length.tolist(), theta)
+        along = _in_trunk(self, [link.along for link in links])
+        axes = _in_trunk(self, [link.axis for link in links]) * self.outward  # a mirror reverses rotations
+        origins = _in_trunk(self, [link.origin for link in links]) + self.base
+        return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+
+    def ways(self) -> np.ndarray:
+        """Return each link's length along it."""
+        _, _, along = self.pose((0.0,) * JOINT_COUNT)
+        return np.asarray(self.robot.length[:, None] * along)
+
+    def bodies(self) -> list[tuple[float, Point]]:
+        """Return mass and centre of gravity of each link.
+
+        Moments across the links (moments.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
+        Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity, also beyond
+        the links, follow from the moments.
+        """
+        robot = self.robot
+        mass = [float(m) for m in (self.mass if robot.by_moments else robot.mass)]
+        if not all(m > 0.0 for m in mass):
+            raise ParameterError("robot.mass", mass, "above 0 kg for each link of a robot description")
+        along = robot.cog
+        if robot.by_moments:
+            carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
+            along = (robot.first_moment - robot.length * carried) / mass
+        a1, a2, a3, a4 = along.tolist()
+        w, z, y3, y4 = (moment / m for moment, m in zip(robot.off_axis, mass, strict=True))
+        out = self.outward
+        centres = (w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)
+        return list(zip(mass, centres, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfDescription(Described):
+    """An arm from a URDF, whose root link has the trunk's axes. It is on the side on which its first joint is."""
+
+    robot: UrdfArm
+    limits: Limits
+    damping: Vector
+    friction: Vector
+
     @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links (4,), and of the frame at the far end of link 4."""
-        return (*(f"{self.side}_link_{n}" for n in range(1, JOINT_COUNT + 1)), f"{self.side}_end")
+    def side(self) -> str:  # type: ignore[override]
+        """'left' or 'right'."""
+        return "left" if self.base[1] > 0.0 else "right"
+
+    @property
+    def base(self) -> Point:
+        """Origin of the first joint in the trunk's axes, m."""
+        x, y, z = self.robot.places(self._zero)[0].tolist()
+        return x, y, z
+
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (n,) rad."""
+        return self.robot.pose(theta)
+
+    def ways(self) -> np.ndarray:
+        """Return the ways between the joints, and to the hand."""
+        return np.diff(self.robot.places(self._zero), axis=0)
+
+    def bodies(self) -> list[tuple[float, Point]]:
+        """Return mass and centre of gravity of each link."""
+        masses, centres = self.robot.bodies()
+        return [(max(mass, LEAST_MASS), tuple(at)) for mass, at in zip(masses.tolist(), centres.tolist(), strict=True)]
+
+    @property
+    def _zero(self) -> list[float]:
+        return [0.0] * len(self.limits.joint_names)
 
 
-def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> ArmDescription:
+def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> Described:
     """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
-    return ArmDescription(
-        compensator["side"],
-        robot_of(compensator),
-        compensator["robot.mass"],
-        limits_of(can_bridge),
-        compensator["friction.viscous"],
-        compensator["friction.coulomb"],
-        compensator["shoulder_from_imu"],
-    )
+    limits, friction = limits_of(can_bridge), (compensator["friction.viscous"], compensator["friction.coulomb"])
+    if compensator["law"] == URDF_LAW:
+        if not compensator["urdf.file"]:
+            raise ParameterError("urdf.file", "", "a file, for a picture: the URDF on a topic is one already")
+        return UrdfDescription(arm_from(compensator, read_urdf(compensator["urdf.file"])), limits, *friction)
+    robot, mass = robot_of(compensator), compensator["robot.mass"]
+    return ArmDescription(compensator["side"], robot, mass, limits, *friction, compensator["shoulder_from_imu"])
 
 
-def arm_pose(arm: ArmDescription, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where `arm` is at `theta` (4,) rad, in the trunk's axes.
-
-    The origins (5, 3) in m of the four joints and the far end, the axes (4, 3) about which the joints turn, and unit
-    vectors (4, 3) along the links.
-    """
-    length = arm.robot.length
-    links = frames(length.tolist(), theta)
-    along = _in_trunk(arm, [link.along for link in links])
-    axes = _in_trunk(arm, [link.axis for link in links]) * arm.outward  # a mirror reverses rotations
-    origins = _in_trunk(arm, [link.origin for link in links]) + arm.base
-    return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
-
-
-def _in_trunk(arm: ArmDescription, points: Sequence[Sequence[float]]) -> np.ndarray:
+def _in_trunk(arm: Described, points: Sequence[Sequence[float]]) -> np.ndarray:
     """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
     x, y, z = np.array(points).T
     return np.stack((y, arm.outward * x, -z), axis=1)
 
 
-def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
+def urdf(arms: Sequence[Described], meshes: str = "") -> str:
     """Return the URDF of one arm a side, with the root link `trunk`.
 
     meshes: address of a folder (package:// or file://) with LINK.stl for every link, each in the frame of its joint and
@@ -136,43 +230,21 @@ def urdf(arms: Sequence[ArmDescription], meshes: str = "") -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
-def joint_names(arms: Sequence[ArmDescription]) -> list[tuple[str, ...]]:
-    """Return the four joint names of each arm; with the side in front if the arms share a name."""
+def joint_names(arms: Sequence[Described]) -> list[tuple[str, ...]]:
+    """Return the joint names of each arm; with the side in front if the arms share a name."""
     names = [arm.limits.joint_names for arm in arms]
-    if len({name for four in names for name in four}) == JOINT_COUNT * len(arms):
+    if len({name for own in names for name in own}) == sum(map(len, names)):
         return names
-    return [tuple(f"{arm.side}_{name}" for name in four) for arm, four in zip(arms, names, strict=True)]
+    return [tuple(f"{arm.side}_{name}" for name in own) for arm, own in zip(arms, names, strict=True)]
 
 
-def _bodies(arm: ArmDescription) -> list[tuple[float, Point]]:
-    """Return mass in kg and centre of gravity (3,) in m of each link, in the frame of its joint.
-
-    Moments across the links (moments.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
-    Y4 of links 3 and 4. An arm given by its moments has the masses `arm.mass`, and its centres of gravity, also beyond
-    the links, follow from the moments. Raises ParameterError if a link has no mass.
-    """
-    robot = arm.robot
-    mass = [float(m) for m in (arm.mass if robot.by_moments else robot.mass)]
-    if not all(m > 0.0 for m in mass):
-        raise ParameterError("robot.mass", mass, "above 0 kg for each link of a robot description")
-    along = robot.cog
-    if robot.by_moments:
-        carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
-        along = (robot.first_moment - robot.length * carried) / mass
-    a1, a2, a3, a4 = along.tolist()
-    w, z, y3, y4 = (moment / m for moment, m in zip(robot.off_axis, mass, strict=True))
-    out = arm.outward
-    centres = (w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)
-    return list(zip(mass, centres, strict=True))
-
-
-def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Element]:
+def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]:
     """Yield the joints and links of one arm."""
-    limits, lengths = arm.limits, arm.robot.length.tolist()
-    _, axes, along = arm_pose(arm, (0.0,) * JOINT_COUNT)
+    limits, ways = arm.limits, arm.ways()
+    _, axes, _ = arm.pose((0.0,) * len(names))
     parent, origin = ROOT, arm.base
-    for n, (mass, centre) in enumerate(_bodies(arm)):
-        end = tuple((lengths[n] * along[n]).tolist())
+    for n, (mass, centre) in enumerate(arm.bodies()):
+        end, length = tuple(ways[n].tolist()), float(np.linalg.norm(ways[n]))
         lower, upper = limits.position_min[n], limits.position_max[n]
         largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
         moving = [_element("axis", xyz=axes[n]), _element("limit", lower=lower, upper=upper, **largest)]
@@ -180,13 +252,14 @@ def _arm(arm: ArmDescription, names: Sequence[str], meshes: str) -> Iterator[Ele
             moving.append(_element("dynamics", damping=arm.damping[n], friction=arm.friction[n]))
         yield _joint(names[n], "revolute", parent, arm.links[n], origin, *moving)
         drawn = []
-        if lengths[n]:
-            middle = tuple((lengths[n] / 2 * along[n]).tolist())
-            drawn.append(_visual("tube", "cylinder", middle, along[n], radius=DRAWN_RADIUS, length=lengths[n]))
-        if n + 1 < JOINT_COUNT:
+        if length:
+            middle, along = tuple((ways[n] / 2).tolist()), ways[n] / length
+            drawn.append(_visual("tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=length))
+        if n + 1 < len(names):
             drawn.append(_visual("motor", "cylinder", end, axes[n + 1], **MOTOR))
         drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
-        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, lengths[n], sideways=n == 0))
+        is_sideways = abs(ways[n][1]) > abs(ways[n][2])
+        yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, length, is_sideways))
         parent, origin = arm.links[n], end
     yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
     yield _element("link", name=arm.links[-1])

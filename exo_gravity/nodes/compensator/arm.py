@@ -27,7 +27,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, Reason, WeighingPhase, words
-from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
@@ -52,11 +52,9 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm
     table = settings.urdf_table(given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
-    arm = UrdfArm(_description(node, values), values["joint_names"], values["urdf.hand"])
+    arm = arm_from(values, _description(node, values))
     for note in arm.notes:
         node.get_logger().warning(note)
-    if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
-        arm.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
     return table, values, lambda values: settings.urdf_settings_of(values, arm), arm
 
 

@@ -26,7 +26,7 @@ from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
-from exo_gravity.lab.view.urdf import ROBOT_MODEL, ROOT, ArmDescription, described, joint_names, urdf
+from exo_gravity.lab.view.urdf import ROBOT_MODEL, ROOT, Described, described, joint_names, urdf
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Statuses, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
@@ -63,7 +63,7 @@ class RobotModel(Node):
         self._statuses = Statuses(self)
         self._arms: dict[str, ViewedArm] = {}  # by namespace
         self._views: list[tuple[ViewedArm, ArmView]] = []
-        self._described: dict[ViewedArm, ArmDescription] = {}
+        self._described: dict[ViewedArm, Described] = {}
         self._problem = ""  # of the description
         self._tilt = Latest(self, Vector3Stamped, PITCH_YAW, lambda m: gravity_in_trunk(m.vector.y, m.vector.x))
         self._diagnostics = Diagnostics(self)
@@ -126,7 +126,7 @@ class ViewedArm:
     """The arm in `namespace` ('/right', '' for the root): its description and its newest joint states."""
 
     def __init__(self, node: Node, namespace: str) -> None:
-        self.description: ArmDescription | None = None  #: None until both nodes have answered
+        self.description: Described | None = None  #: None until both nodes have answered
         #: Why there is no description or no reading, '' if nothing is wrong
         self.problem = f"waiting for the parameters of {namespace}/{COMPENSATOR} and {namespace}/{BRIDGE}"
         self.states_topic = f"{namespace}/joint_states"

@@ -32,7 +32,7 @@ from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, NONE, Adapts, NoEstimate, Reason, WearerState
-from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
@@ -192,9 +192,7 @@ class WearerNode(Node):
             if not text:
                 self._listen(values["urdf.topic"])
                 return None
-            self._urdf = UrdfArm(text, values["joint_names"], values["urdf.hand"])
-            if values.get("command_interface") != "multi_array":  # can_bridge reports the arm's own joints alone
-                self._urdf.follow(values["joint_names"], [0.0] * len(values["joint_names"]))
+            self._urdf = arm_from(values, text)
         return urdf_settings_of(values, self._urdf)
 
     def _listen(self, topic: str) -> None:

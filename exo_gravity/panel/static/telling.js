@@ -68,7 +68,8 @@ function usually(arm, name, state, moving) {
   const [refusal] = list(bridge.refusal);
   if (name === "disabled" && refusal) return { why: waitText(arm, refusal, bridge, true), todo: t("then.enable") };
   const [wait] = list(bridge["waiting for"]);
-  if (!wait || wait === "pose") return texts(name);
+  if (!wait || wait === "pose")
+    return name === "inactive" ? { why: t("sentence.inactive"), todo: t("todo.disabled") } : texts(name);
   const reason = wait === "efforts" ? reasonText(compensator) : "";
   return { why: join([waitText(arm, wait, bridge, false), reason]), todo: "" };
 }

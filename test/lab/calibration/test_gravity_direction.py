@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import LENGTH, Device
+from bench.calibration.random_device import PAPERS, Device
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, with_mounting
@@ -35,7 +35,7 @@ def test_an_imu_that_is_two_degrees_off_does_no_harm_and_is_found(seed):
     device = Device(seed)
     measured = leant(np.random.default_rng(seed).normal(size=3), np.radians(2.0))
     observations = [one._replace(direction=measured) for one in device.tour(tuple(DOWN), 8, 8)]
-    found = identify(observations, LENGTH)
+    found = identify(observations, PAPERS)
     error = np.abs(found.moments - device.moments)
     assert np.all(error < np.maximum(3.0 * found.error, 0.01 * device.moments.max()))
     direction = measured + np.cross(found.tilt, measured)
@@ -82,7 +82,7 @@ def tours(device, pitches):
 @pytest.mark.parametrize("seed", range(2))
 def test_two_leans_of_the_stand_show_the_heading_of_the_imu_and_one_does_not(seed):
     device = Device(seed)
-    one, two = (identify(tours(device, pitches), LENGTH) for pitches in ((0.07, 0.07), (0.07, -0.09)))
+    one, two = (identify(tours(device, pitches), PAPERS) for pitches in ((0.07, 0.07), (0.07, -0.09)))
     error = np.sqrt(np.diag(two.tilt_covariance))
     assert abs(two.tilt[2] - HEADING) < 3.0 * error[2] and error[2] < np.radians(1.0)
     assert np.sqrt(one.tilt_covariance[2, 2]) > np.radians(2.0)

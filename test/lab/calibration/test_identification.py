@@ -11,6 +11,7 @@ from bench.calibration.random_device import (
     CODE,
     LEANING,
     LENGTH,
+    PAPERS,
     UPRIGHT,
     WEIGHT,
     Device,
@@ -22,14 +23,15 @@ from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.pose_fit import FIT, TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.pose_fit import FIT
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 
 @pytest.fixture(scope="module")
 def twenty():
     """Twenty devices, and the result of a tour of each."""
-    return [(device, identify(device.tour(), LENGTH)) for device in map(Device, range(100, 120))]
+    return [(device, identify(device.tour(), PAPERS)) for device in map(Device, range(100, 120))]
 
 
 def share_covered(found_of_devices):
@@ -59,7 +61,7 @@ def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tou
             one._replace(effort=device.offset + (one.effort - device.offset) * factor[int(one.load_mass > 0.0)])
             for one in device.tour(bare=8, weighed=8)
         ]
-        found.append((device, identify(observations, LENGTH)))
+        found.append((device, identify(observations, PAPERS)))
     assert 0.90 <= share_covered(found) <= 0.99
 
 
@@ -76,7 +78,7 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
         assert np.nanmax(np.abs(found.held_out)) < 0.15
         assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 3.0 * np.linalg.norm(found.residual)
     observations = Device(1).tour()
-    found, without = identify(observations, LENGTH), identify(observations[1:], LENGTH)
+    found, without = identify(observations, PAPERS), identify(observations[1:], PAPERS)
     direction = LEANING + np.cross(without.tilt, LEANING)
     predicted = regressor(observations[0].theta, direction / np.linalg.norm(direction))[0] @ without.moments
     predicted = predicted / without.scale + without.offset
@@ -85,9 +87,9 @@ def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good
 
 def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torque_is_right():
     device = Device(3)
-    found = identify(device.tour(bare=12, weighed=0), LENGTH)
+    found = identify(device.tour(bare=12, weighed=0), PAPERS)
     assert found.relative and "common factor" in found.unknown[0] and found.singular_values[-1] < 1e-3
-    weighed = identify(Device(3).tour(), LENGTH)
+    weighed = identify(Device(3).tour(), PAPERS)
     assert not weighed.relative and weighed.singular_values[-1] > 1.0 and "common factor" not in weighed.unknown[0]
     assert np.prod(found.scale[1:]) == pytest.approx(1.0, abs=1e-5)
     factor = found.moments[1] / device.moments[1]
@@ -99,14 +101,14 @@ def test_without_a_weight_moments_and_scales_are_relative_but_the_commanded_torq
 def test_a_light_weight_leaves_moments_and_scales_as_uncertain_as_each_other():
     device = Device(3)
     light = [device.observe(theta, weight=(0.05, 0.25)) for theta in best(LEANING, 4, WEIGHT)]
-    found = identify(device.tour(weighed=0) + light, LENGTH)
+    found = identify(device.tour(weighed=0) + light, PAPERS)
     assert found.scale_error[1] > 0.01 * found.scale[1]
     assert found.error[2] / found.moments[2] == pytest.approx(found.scale_error[2] / found.scale[2], rel=0.2)
 
 
 def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
     device = Device(4)
-    found = identify(device.tour(UPRIGHT), LENGTH)
+    found = identify(device.tour(UPRIGHT), PAPERS)
     assert "M1, W, torque scale 1: joint 1 carries nothing" in found.unknown[0]
     unseen = [MOMENTS.index("M1"), MOMENTS.index("W")]
     assert np.all(np.isinf(found.error[unseen])) and np.isinf(found.scale_error[0])
@@ -118,14 +120,14 @@ def test_with_an_upright_stand_joint_1_is_not_known_and_said_to_be():
 def test_the_first_moment_is_never_negative_and_its_error_stays_honest(seed, tilt, error):
     device = Device(seed)
     device.moments[0] = -0.003
-    found = identify(device.tour(Tilt.of("right", *tilt).direction), LENGTH)
+    found = identify(device.tour(Tilt.of("right", *tilt).direction), PAPERS)
     assert found.moments[0] == 0.0 and found.error[0] >= error
 
 
 def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_is_right_all_the_same():
     device, off = Device(5), np.array((0.0, 0.0, 0.0, np.radians(5.0)))
     observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
-    found = identify(observations, LENGTH)
+    found = identify(observations, PAPERS)
     turned = np.arctan2(*(device.moments[[7, 3]])) + off[3]
     assert np.arctan2(found.moments[7], found.moments[3]) == pytest.approx(turned, abs=0.02)
     assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
@@ -133,10 +135,10 @@ def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_i
 
 def test_a_weight_shows_an_error_of_joint_3s_zero():
     observations = [o._replace(theta=np.subtract(o.theta, (0.0, 0.0, 0.05, 0.0))) for o in Device(17).tour()]
-    found = identify(observations, LENGTH)
+    found = identify(observations, PAPERS)
     said = next(sentence for sentence in found.unknown if "The weight shows joint 3's zero" in sentence)
     assert float(said.split("zero ")[1].split()[0]) == pytest.approx(np.degrees(0.05), abs=1.0)
-    assert not any("The weight shows" in sentence for sentence in identify(Device(17).tour(), LENGTH).unknown)
+    assert not any("The weight shows" in sentence for sentence in identify(Device(17).tour(), PAPERS).unknown)
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
@@ -144,7 +146,7 @@ def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
     device = Device(16)
 
     def uncertain(poses):
-        return np.log(identify([device.observe(theta) for theta in poses], LENGTH).error).sum()
+        return np.log(identify([device.observe(theta) for theta in poses], PAPERS).error).sum()
 
     chosen = uncertain(best(LEANING, 10))
     drawn = [uncertain(rng.permutation(CANDIDATES)[:10]) for _ in range(5)]
@@ -183,7 +185,7 @@ def test_an_arm_simulated_by_mujoco_is_found_from_slow_passes_in_both_directions
     observations = [held(bare, np.array(theta), guess) for theta in best(LEANING, 8)]
     guess = guess + load_moments(LENGTH, *WEIGHT)
     observations += [held(weighed, np.array(theta), guess, WEIGHT) for theta in best(LEANING, 4, WEIGHT)]
-    found = identify(observations, LENGTH)
+    found = identify(observations, PAPERS)
     true = moments_of(ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, *beside)))
     wrong = np.abs(found.moments - true)
     assert np.all((wrong < 0.02 * true.max()) | (wrong < 2.0 * found.error))

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import LEANING, LENGTH, Device, best
+from bench.calibration.random_device import LEANING, PAPERS, Device, best
 from exo_gravity.core.arm.gravity import regressor
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import check_physical, identify
-from exo_gravity.lab.calibration.pose_fit import COUNT
+from exo_gravity.lab.calibration.pose_fit import layout_of
 from exo_gravity.lab.calibration.poses import missing_pose
 
 SLIPS = {
@@ -26,7 +26,7 @@ def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
     observations = device.tour(bare=10)
     for index, error in slips.items():
         observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
-    found = identify(observations, LENGTH)
+    found = identify(observations, PAPERS)
     assert {index for index, _ in found.rejected} == set(slips)
     for index, reason in found.rejected:
         assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
@@ -42,17 +42,17 @@ def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words)
         error = np.eye(4)[k % 4] * (-1) ** k  # Nm
         observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
     with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
-        identify(observations, LENGTH)
+        identify(observations, PAPERS)
 
 
 def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
     device = Device(8)
     observations = [device.observe(theta) for theta in best(LEANING, 2)]
     with pytest.raises(DataError, match="2 poses do not show"):
-        identify(observations, LENGTH)
+        identify(observations, PAPERS)
     for _ in range(3):
         try:
-            found = identify(observations, LENGTH)
+            found = identify(observations, PAPERS)
             break
         except DataError as error:
             assert "poses do not show" in str(error) or "is not known better than" in str(error)
@@ -63,8 +63,8 @@ def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_wi
 
 @pytest.mark.parametrize(("moment", "joint"), [(1, 1), (2, 2), (3, 3)])
 def test_the_missing_pose_shows_the_moment_that_is_missing(moment, joint):
-    hidden = np.arange(COUNT) == moment
-    pose = missing_pose(hidden, LEANING, 9.8)
+    hidden = np.arange(layout_of(PAPERS).count) == moment
+    pose = missing_pose(hidden, LEANING, PAPERS)
     theta = np.radians([float(angle) for angle in pose.split("[")[1].split("]")[0].split(",")])
     assert np.abs(regressor(theta, LEANING, 9.8)[0, joint, moment]) > 0.8 * 9.8
 
@@ -80,11 +80,11 @@ def test_the_missing_pose_shows_the_moment_that_is_missing(moment, joint):
 )
 def test_moments_that_no_arm_has_are_refused_with_what_to_check(changes, words):
     moments, error = np.array((0.1, 0.2, 0.2, 0.03, 0.0, 0.0, 0.0, 0.0)), np.full(8, 0.001)
-    check_physical(moments, error, np.ones(4), np.array(LEANING), 9.8)
+    check_physical(moments, error, np.ones(4), np.array(LEANING), PAPERS)
     for index, (value, uncertain) in changes.items():
         moments[index], error[index] = value, uncertain
     with pytest.raises(DataError, match=words):
-        check_physical(moments, error, np.ones(4), np.array(LEANING), 9.8)
+        check_physical(moments, error, np.ones(4), np.array(LEANING), PAPERS)
 
 
 def scaled(factor):
@@ -113,4 +113,4 @@ def with_nan():
 )
 def test_impossible_observations_are_refused_with_what_to_check(observations, words):
     with pytest.raises(DataError, match=words):
-        identify(observations(), LENGTH)
+        identify(observations(), PAPERS)

@@ -1,0 +1,207 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""What a calibration needs of an arm: its torque, linear in k moments, and which of them it takes for known.
+
+The paper's arm has the eight moments of `core.arm.gravity`; any other those of `UrdfArm.base`, which a QR decomposition
+of its regressor leaves. Both are first moments in kg m.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import MOMENTS, Torque, exact_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.hardware.urdf_arm import UrdfArm
+
+Holder = Callable[[Sequence[float], Tilt], Torque]
+# kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
+TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
+# deg of each joint, within the paper's ranges: from these a missing pose is suggested.
+GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
+SUGGESTED = 600  # poses at random, from which one is suggested for another arm
+STEP = 10.0  # deg, of their angles
+
+
+class MomentModel(Protocol):
+    """An arm of n joints, whose torque is linear in k moments."""
+
+    count: int  #: n
+    names: tuple[str, ...]  #: of the moments (k,)
+    moments: np.ndarray  #: (k,) kg m, as far as known
+    start: np.ndarray  #: (k,) kg m, from which the fit begins
+    gravity: float  #: m/s^2
+    angles: tuple[tuple[int, int], ...]  #: of a weight, as in `pose_fit.FitLayout`
+    compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
+    positive: tuple[int, ...]  #: numbers of the moments that are at least 0
+    optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
+    shows_tilt: bool  #: whether gravity's direction is fitted, too
+    expects_scales: bool  #: whether a torque scale is expected to be near that of the file
+    suggested: np.ndarray  #: (m, n) rad, from which a missing pose is taken
+
+    def down(self, tilt: Tilt) -> np.ndarray:
+        """Return gravity's unit vector (3,) in the base frame."""
+        ...
+
+    def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
+        ...
+
+    def along(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
+        ...
+
+    def load(self, mass: float, lever: float) -> np.ndarray:
+        """Return the moments (k,) of `mass` kg on the last link, `lever` m from its joint. Raises ParameterError."""
+        ...
+
+    def holding(self, moments: np.ndarray) -> Holder:
+        """Return what returns the torque (n,) in Nm of one pose. moments: (n, k), what each joint shows."""
+        ...
+
+    def common(self, moments: np.ndarray) -> np.ndarray:
+        """Return the moments (k,) that the joints show together, of those (n, k) that each shows."""
+        ...
+
+    def matrix(self, theta: Sequence[float], moments: np.ndarray, load: tuple[float, float]) -> np.ndarray:
+        """Return an approximate mass matrix (n, n) in kg m^2. moments: (k,). load: kg, m."""
+        ...
+
+    def upwards(self, theta: np.ndarray) -> np.ndarray:
+        """Return the sine (m,) of the largest angle above the horizontal of a link, at `theta` (m, n) rad."""
+        ...
+
+
+class PapersMoments:
+    """The paper's arm. arm: of which the moments are known, and the lengths."""
+
+    count = JOINT_COUNT
+    names: tuple[str, ...] = MOMENTS
+    start = np.array((0.0, *TYPICAL_MOMENTS[1:]))
+    angles: tuple[tuple[int, int], ...] = (2, 6), (3, 7), (3, 5)  # from M3 to Y3, from M4 to Y4, and from M4 to Z
+    compared: tuple[int, ...] = 1, 2, 3  # joint 1 carries nothing while its axis is vertical
+    positive: tuple[int, ...] = (0,)  # M1, the least certain
+    optional: tuple[int, ...] = 0, 4, 8, 12  # M1, W, scale and offset of joint 1
+    shows_tilt, expects_scales = True, False
+    suggested = np.radians(list(itertools.product(*GRID)))
+
+    def __init__(self, arm: ArmModel) -> None:
+        self.length, self.gravity, self.moments = arm.length, arm.gravity, moments_of(arm)
+
+    def down(self, tilt: Tilt) -> np.ndarray:
+        """Return gravity's unit vector (3,) in the arm's base frame."""
+        return np.array(tilt.direction)
+
+    def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return `core.arm.gravity.regressor`."""
+        return regressor(theta, direction, self.gravity)
+
+    def along(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torque (m, 4, 8, 3) in Nm per kg m with gravity along each axis of the base frame."""
+        return np.stack([regressor(theta, axis, self.gravity) for axis in np.eye(3)], axis=-1)
+
+    def load(self, mass: float, lever: float) -> np.ndarray:
+        """Return the moments (8,) of `mass` kg on link 4, `lever` m from the elbow. Raises ParameterError."""
+        return load_moments(self.length.tolist(), mass, lever)
+
+    def holding(self, moments: np.ndarray) -> Holder:
+        """Return the exact law in plain floats, of an arm for each joint."""
+        along, across = np.maximum(moments[:, :JOINT_COUNT], 0.0), moments[:, JOINT_COUNT:]
+        pairs = zip(along, across, strict=True)
+        arms = [ArmModel.from_moments(self.length, *pair, gravity=self.gravity) for pair in pairs]
+        return lambda theta, tilt: tuple(exact_torque(arm, theta, tilt)[joint] for joint, arm in enumerate(arms))
+
+    def common(self, moments: np.ndarray) -> np.ndarray:
+        """Return the mean of the joints; M_n is that of joint n."""
+        return np.append(np.diag(moments[:, :JOINT_COUNT]), moments[:, JOINT_COUNT:].mean(axis=0))
+
+    def matrix(self, theta: Sequence[float], moments: np.ndarray, load: tuple[float, float]) -> np.ndarray:
+        """Return the mass matrix (4, 4) in kg m^2 of an arm with these moments."""
+        return LinkInertia.of_moments(self.length, moments[:JOINT_COUNT], load).matrix(theta)
+
+    def upwards(self, theta: np.ndarray) -> np.ndarray:
+        """Return the sine (m,) of the largest angle of links 3 and 4 above the horizontal of an upright trunk."""
+        down = np.cos(theta[:, 1:2]) * np.cos(np.stack((theta[:, 2], theta[:, 2] + theta[:, 3]), axis=1))
+        return np.asarray(-down.min(axis=1))
+
+
+class UrdfMoments:
+    """An arm from a URDF, of which gravity's direction is taken as measured.
+
+    arm: with gains of 1.
+    rotors: (n,) kg m^2, inertia of the motors' rotors at the joints.
+
+    Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
+    """
+
+    angles: tuple[tuple[int, int], ...] = ()
+    positive: tuple[int, ...] = ()
+    optional: tuple[int, ...] = ()
+    shows_tilt, expects_scales = False, True
+
+    def __init__(self, arm: UrdfArm, rotors: Sequence[float]) -> None:
+        if not arm.moves_alone:
+            listed = list(arm.names)
+            raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
+        self.arm, self.gravity, self.moments = arm, arm.gravity, arm.moments
+        self._rotors = np.diag(rotors)
+        self.count, self.start = len(arm.names), self.moments
+        numbers = [n for n, _ in arm.base]
+        self.names = tuple(f"{arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))
+        self.compared = tuple(range(self.count))
+        low, high = arm.ranges
+        poses = np.random.default_rng(1).uniform(low, high, (SUGGESTED, self.count))
+        self.suggested = np.radians(STEP * np.round(np.degrees(poses) / STEP))
+        self._loaded: dict[tuple[float, float], UrdfArm] = {(0.0, 0.0): arm}
+
+    def down(self, tilt: Tilt) -> np.ndarray:
+        """Return gravity's unit vector (3,) in the root link's axes."""
+        return np.array(tilt.gravity_in_trunk)
+
+    def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return `UrdfArm.regressor`."""
+        return self.arm.regressor(theta, direction)
+
+    def along(self, theta: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the root link."""
+        return np.stack([self.arm.regressor(theta, axis) for axis in np.eye(3)], axis=-1)
+
+    def load(self, mass: float, lever: float) -> np.ndarray:
+        """Return the moments (k,) of `mass` kg on the way from the last joint to the hand. Raises ParameterError."""
+        return np.asarray(self._with(mass, lever).moments - self.moments) if mass else np.zeros(len(self.names))
+
+    def holding(self, moments: np.ndarray) -> Holder:
+        """Return what multiplies the regressor of one pose with the moments of each joint."""
+
+        def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
+            rows = self.arm.regressor(np.array([theta]), tilt.magnitude * self.down(tilt))[0]
+            return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
+
+        return torque
+
+    def common(self, moments: np.ndarray) -> np.ndarray:
+        """Return what the joint shows that carries the moment with its own link."""
+        return np.array([moments[n, k] for k, (n, _) in enumerate(self.arm.base)])
+
+    def matrix(self, theta: Sequence[float], moments: np.ndarray, load: tuple[float, float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 by the URDF, with the load."""
+        return self._with(*load).links.matrix(theta) + self._rotors
+
+    def upwards(self, theta: np.ndarray) -> np.ndarray:
+        """Return the sine (m,) of the largest angle of a link above the plane across the root link's z axis."""
+        ways = np.diff([self.arm.places(pose) for pose in theta], axis=1)
+        length = np.linalg.norm(ways, axis=2)
+        rise = np.divide(ways[:, :, 2], length, out=np.full_like(length, -1.0), where=length > 0.0)
+        return np.asarray(rise.max(axis=1))
+
+    def _with(self, mass: float, lever: float) -> UrdfArm:
+        key = mass, lever
+        if key not in self._loaded:
+            none = [0.0] * (self.count - 1)
+            self._loaded[key] = self.arm.with_wearer([*none, mass], [*none, lever])
+        return self._loaded[key]

@@ -1,0 +1,213 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""The calibration of arms from URDFs whose masses are wrong: what MuJoCo needs of the true arm is the judge."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+
+from bench.calibration.tour import player_of
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, UrdfArm
+from exo_gravity.lab.calibration.live import tour_parameters
+from exo_gravity.lab.calibration.poses import candidates, next_pose
+from exo_gravity.lab.calibration.result import page_of, write_changes
+from exo_gravity.lab.calibration.tour import urdf_moments
+from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
+from exo_gravity.lab.inputs.arms import AnyArm, any_arm, carried_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.sim.urdf import UrdfConfig
+
+from ...support.chains import random_chain
+from ...support.urdf_oracle import MujocoArm
+
+SHIPPED = ("elbow", "three_joints", "seven_joints")
+DOWN = gravity_in_trunk(0.0, 0.0)
+UPRIGHT = 9.80665 * DOWN
+MEDIAN, WORST = 0.01, 0.03  # of the peak torque
+POSES = 12
+NOISE = 0.004  # Nm, standard deviation of a pose's effort: half a code of an AK60-6
+OFF = 0.2  # share by which each mass of the file's URDF is wrong
+
+
+def with_wrong_masses(text: str, seed: int) -> str:
+    """Return a URDF in which each mass is 20 % too large or too small."""
+    random, root = np.random.default_rng(seed), ElementTree.fromstring(text)
+    for mass in root.iter("mass"):
+        mass.set("value", str(float(mass.get("value", "")) * random.choice((1.0 - OFF, 1.0 + OFF))))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+class Truth:
+    """The arm of a URDF by MuJoCo, with a weight of some kg at some m from its last joint."""
+
+    def __init__(self, text: str, names: Sequence[str], weight: tuple[float, float] = (0.0, 0.0)) -> None:
+        none = (0.0,) * (len(names) - 1)
+        held = {"wearer_mass": (*none, weight[0]), "wearer_cog": (*none, weight[1])}
+        self._model, _ = UrdfConfig(text=text, joint_names=names, hand="hand", **held).models()
+        self._model.opt.gravity = UPRIGHT
+        self._data = mujoco.MjData(self._model)
+
+    def torque(self, theta: Sequence[float] | np.ndarray) -> np.ndarray:
+        """What holds the arm, (n,) Nm."""
+        self._data.qpos[:] = theta
+        mujoco.mj_forward(self._model, self._data)
+        return self._data.qfrc_bias.copy()
+
+
+@dataclass
+class Bench:
+    """An arm of config whose file has a wrong URDF. params: that file; text: the true URDF."""
+
+    params: Path
+    arm: AnyArm
+    text: str
+
+    @classmethod
+    def of(cls, name: str, folder: Path) -> Bench:
+        text = packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")
+        wrong, params = folder / "wrong.urdf", folder / "params.yaml"
+        wrong.write_text(with_wrong_masses(text, 0))
+        nodes = load(packaged_config(f"{name}.yaml"))
+        nodes["/right/compensator"]["urdf.file"] = str(wrong)
+        params.write_text(text_of(nodes))
+        return cls(params, any_arm(params, "right"), text)
+
+    def observed(self, scales: np.ndarray, weight: tuple[float, float] = (0.0, 0.0)) -> list[Observation]:
+        """What a tour through the best poses would show of motors with these true torque scales (n,)."""
+        model, random = model_of(self.arm), np.random.default_rng(4)
+        poses, taken = candidates(self.arm.limits, model), [np.array(self.arm.limits.home)]
+        truth = Truth(self.text, self.arm.joint_names, weight)
+        while len(taken) < POSES:
+            taken.append(poses[next_pose(taken, poses, DOWN, model.moments + model.load(*weight), model)])
+        seen = []
+        for theta in taken:
+            effort = truth.torque(theta) / scales + random.normal(0.0, NOISE, len(theta))
+            spread = np.full(len(theta), NOISE)
+            seen.append(Observation(theta, DOWN, effort, spread, spread, *weight, temperature=(30.0,) * len(theta)))
+        return seen
+
+    def errors(self, params: Path, scales: np.ndarray) -> tuple[float, float]:
+        """The median and the largest error of the true torque in 300 poses by the file `params`, of the peak."""
+        new, random = carried_arm(load(params), "/right"), np.random.default_rng(9)
+        poses, truth = (
+            random.uniform(self.arm.low, self.arm.high, (300, len(scales))),
+            Truth(self.text, self.arm.joint_names),
+        )
+        true = np.array([truth.torque(pose) for pose in poses])
+        law = np.array([new.settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
+        given = law / np.array(new.can_bridge["torque_scale"]) * scales
+        off = np.abs(given - true).max(axis=1) / np.abs(true).max()
+        return float(np.median(off)), float(off.max())
+
+    def calibrated(self, observations: Sequence[Observation]) -> Path:
+        """The file that these observations give."""
+        result, output = moments_from(self.arm, observations), self.params.with_name("new.yaml")
+        assert result.refusals == ()
+        assert "Predicted against measured torque" in page_of(result, "gravity", str(self.params))
+        write_changes(self.params, output, result.changes, "calibrate gravity")
+        return output
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_masses_that_are_a_fifth_off_are_found_to_one_percent_of_the_torque(name: str, tmp_path: Path) -> None:
+    bench = Bench.of(name, tmp_path)
+    right = np.ones(len(bench.arm.joint_names))
+    before, _ = bench.errors(bench.params, right)
+    after, worst = bench.errors(bench.calibrated(bench.observed(right)), right)
+    assert before > 5.0 * MEDIAN
+    assert after < MEDIAN and worst < WORST
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_known_weight_shows_wrong_torque_scales(name: str, tmp_path: Path) -> None:
+    bench, lever = Bench.of(name, tmp_path), {"seven_joints": 0.08}.get(name, 0.2)
+    scales = np.resize((0.85, 1.1, 0.95), len(bench.arm.joint_names))
+    seen = [*bench.observed(scales), *bench.observed(scales, (1.0, lever))]
+    after, worst = bench.errors(bench.calibrated(seen), scales)
+    assert after < MEDIAN and worst < WORST
+
+
+def test_a_joint_that_turns_the_wrong_way_is_refused(tmp_path: Path) -> None:
+    bench = Bench.of("elbow", tmp_path)
+    wrong = [one._replace(effort=-np.asarray(one.effort)) for one in bench.observed(np.ones(1))]
+    with pytest.raises(DataError, match=r"joint 1 needs -.* times the torque of the URDF: must be from 0\.3 to 3"):
+        moments_from(bench.arm, wrong)
+
+
+def test_poses_that_do_not_show_a_moment_are_refused_and_the_missing_one_is_named(tmp_path: Path) -> None:
+    bench = Bench.of("three_joints", tmp_path)
+    same = bench.observed(np.ones(3))[:1] * 4
+    with pytest.raises(DataError, match=r"4 poses do not show abduction 2.*: add the pose \["):
+        moments_from(bench.arm, same)
+
+
+def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refused(tmp_path: Path) -> None:
+    bench = Bench.of("three_joints", tmp_path)
+    values = {**bench.arm.compensator, "motor": bench.arm.can_bridge["motor"]}
+    none = dict.fromkeys(MOMENT_NAMES, [0.0] * 2)
+    with pytest.raises(ParameterError, match=r"urdf\.file = '': must be a file: a calibration does not wait"):
+        urdf_moments({**values, "urdf.file": ""})
+    with pytest.raises(ParameterError, match=r"joint_names = .*: must be all joints that move the arm's links"):
+        urdf_moments({**values, **none, "joint_names": ["abduction", "elbow"]})
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7, 9])
+def test_the_moments_of_any_chain_give_mujocos_torque(count: int) -> None:
+    text, names = random_chain(count, seed=count)
+    arm, truth, random = UrdfArm(text, names, "hand"), MujocoArm(text, names), np.random.default_rng(count)
+    changed = with_wrong_masses(text, count)
+    other = arm.with_moments(UrdfArm(changed, names, "hand").moments)
+    rows, moments, base = arm.regressor, arm.moments, MujocoArm(changed, names)
+    for _ in range(20):
+        theta, tilt = random.uniform(-3.0, 3.0, count), Tilt.of("left", *random.uniform(-1.0, 1.0, 2))
+        down = np.array(tilt.gravity_in_trunk)
+        np.testing.assert_allclose(
+            rows(theta[None], down)[0] @ moments, truth.torque(theta, 9.80665 * down), atol=1e-10
+        )
+        np.testing.assert_allclose(other.torque(theta, tilt), base.torque(theta, 9.80665 * down), atol=1e-9)
+
+
+def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
+    model, tilt, theta = model_of(Bench.of("three_joints", tmp_path).arm), Tilt.of("left"), [0.3, 0.5, 0.7]
+    torque = model.holding(np.tile(model.moments, (model.count, 1)))
+    expected, done, interval = torque(theta, tilt), threading.Event(), sys.getswitchinterval()
+
+    def choose() -> None:
+        while not done.is_set():
+            model.along(model.suggested[:20])
+
+    sys.setswitchinterval(1e-6)
+    thread = threading.Thread(target=choose)
+    thread.start()
+    try:
+        assert {torque(theta, tilt) for _ in range(3_000)} == {expected}
+    finally:
+        done.set()
+        thread.join()
+        sys.setswitchinterval(interval)
+
+
+@pytest.mark.thorough
+def test_a_tour_of_the_elbow_finds_its_moments_and_its_friction(tmp_path: Path) -> None:
+    bench = Bench.of("elbow", tmp_path)
+    for changes in ({"tour.poses": 6}, {"tour.friction": True}):
+        player = player_of(tour_parameters(bench.params, bench.arm, changes), tmp_path / "nodes.yaml")
+        assert player.play().fault is None and player.tour.trouble == "" and player.tour.done
+        if "tour.poses" in changes:
+            after, worst = bench.errors(bench.calibrated(player.tour.measured), np.ones(1))
+            assert after < MEDIAN and worst < WORST
+        else:
+            (curve,) = friction_from(bench.arm, player.tour.measured).curves
+            assert abs(curve.fitted[-1] - 0.4 - 0.05 * curve.speed[-1]) < 0.03
