@@ -35,7 +35,8 @@ class JointOrderTuning:
     kg, and 0.18 to 0.7 times in 51 exchanged ones.
     """
 
-    parallel: float = 0.5  #: of the outer joint's stiffness, that turning the inner one shows; at right angles 0.15
+    parallel: float = 0.25  #: of the outer joint's stiffness, by which turning the inner one may show another one
+    sooner: float = 0.9  #: of the outer joint's time, from which on the inner joint is the quicker one
     least: float = 0.05  #: Nm/rad of gravity's stiffness; a fifth of that of a bare forearm
     rounds: int = 2  #: of pushes: two joints that seem exchanged are pushed again, and the times averaged
 
@@ -91,8 +92,8 @@ class JointOrder:
         stiffness = self._stiffness(pushed) if pushed else np.empty((0, 0))
         for inner, outer in combinations(pushed, 2):
             own, shared = stiffness[outer, outer], stiffness[outer, inner]
-            are_parallel = own >= JOINT_ORDER.least and shared >= JOINT_ORDER.parallel * own
-            if are_parallel and self._time(inner) < self._time(outer):
+            are_parallel = own >= JOINT_ORDER.least and abs(shared - own) <= JOINT_ORDER.parallel * own
+            if are_parallel and self._time(inner) < JOINT_ORDER.sooner * self._time(outer):
                 return inner, outer
         return ()
 
