@@ -85,7 +85,7 @@ def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Wat
         stack.callback(launcher.stop)
         begin = time.monotonic()
         launcher.start()
-        nodes = [node for node in load(launched) if kind != "one process" or not node.endswith("/compensator")]
+        nodes = [node for node in load(launcher.params) if kind != "one process" or not node.endswith("/compensator")]
         pids = {node.lstrip("/"): launcher.process(node).pid for node in nodes}
         for namespace in namespaces:
             for part, *command in _peer_commands(kind, params, namespace, rate):
