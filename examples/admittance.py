@@ -3,7 +3,7 @@
 
     wearer_efforts -> admittance -> speed -> position loop -> speed -> velocity loop -> assist_efforts
 
-`python examples/admittance.py my.yaml /right` runs it as a node at 100 Hz, beside the nodes of a
+`python examples/admittance.py my.yaml /right` runs it as a node at 100 Hz, alongside the nodes of a
 parameter file. The compensator adds its efforts once `assist.max_effort` is not 0, in Zero-G at a support of 1: only
 then is the wearer's torque what they mean to do, and not the weight that is left to them.
 
@@ -54,7 +54,7 @@ class Tuning:
     """How the arm answers its wearer."""
 
     assistance: float = 1.0  #: Nm of the motors for each Nm of the wearer: 1 halves the inertia that they feel
-    coasting: float = 1.0  #: s, time constant with which an arm slows down once nobody pushes it
+    coasting: float = 1.0  #: s, time constant with which an arm that nobody pushes slows down
     stiffness: float = 3.0  #: 1/s, of the position loop: speed for each rad that the arm is behind
     reach: float = 0.1  #: rad that the wanted angle may be ahead of the arm
     fastest: float = 1.5  #: rad/s that is wanted at most

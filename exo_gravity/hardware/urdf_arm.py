@@ -83,6 +83,16 @@ def arm_from(values: Mapping[str, Any], text: str) -> UrdfArm:
     return arm.corrected(np.transpose([values[name] for name in MOMENT_NAMES]))
 
 
+def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
+    """Return the same arm from the file `urdf.file`. Raises ParameterError, also if it comes from a topic.
+
+    why: ends the sentence that it must be a file.
+    """
+    if not values["urdf.file"]:
+        raise ParameterError("urdf.file", "", f"a file{why}")
+    return arm_from(values, read_urdf(values["urdf.file"]))
+
+
 class UrdfArm:
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
@@ -265,13 +275,11 @@ class UrdfArm:
         the first moments of that link. The rest are columns of the regressor, from which a QR decomposition in random
         poses leaves out those that depend on others (M. Gautier, ICRA 1990).
         """
-        random, across = np.random.default_rng(0), []
+        across = []
         for n, joint in enumerate(self._joints):
             if self._bare.inertias[joint].mass:
                 across += [(n, way) for way in self._across(n)]
-        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
-        down = random.normal(size=(BASE_POSES, 3))
-        columns = np.concatenate([self._columns(pose, way, across) for pose, way in zip(poses, down, strict=True)])
+        columns = np.concatenate([self._columns(*one, across) for one in self._sampled(0)])
         size = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
         return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
 
@@ -286,12 +294,9 @@ class UrdfArm:
     @property
     def moments(self) -> np.ndarray:
         """The moments (k,) in kg m of `base`, of all that the arm holds."""
-        random = np.random.default_rng(1)
-        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
-        down = random.normal(size=(BASE_POSES, 3))
-        columns = [self._columns(pose, way, self.base) for pose, way in zip(poses, down, strict=True)]
-        pairs = zip(poses.tolist(), down.tolist(), strict=True)
-        torque = [np.divide(self._holding(pose, way, ZERO), self.gain) for pose, way in pairs]
+        sampled = self._sampled(1)
+        columns = [self._columns(*one, self.base) for one in sampled]
+        torque = [np.divide(self._holding(pose.tolist(), way.tolist(), ZERO), self.gain) for pose, way in sampled]
         return np.asarray(np.linalg.lstsq(np.concatenate(columns), np.concatenate(torque), rcond=None)[0])
 
     def with_moments(self, moments: np.ndarray) -> UrdfArm:
@@ -353,6 +358,12 @@ class UrdfArm:
             self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
             frames = [self._data.oMi[joint] for joint in self._joints]
             return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
+
+    def _sampled(self, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return poses (n,) rad at random, each with a vector (3,) of gravity in m/s^2."""
+        random = np.random.default_rng(seed)
+        poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
+        return list(zip(poses, random.normal(size=(BASE_POSES, 3)), strict=True))
 
     def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""

@@ -150,7 +150,7 @@ def budget_worn(
             chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
         own, with_all = map(np.concatenate, zip(*chunks, strict=True))
         theta, added = points[:, :count], with_all - own
-        if any(tissue.joint_stiffness):
+        if tissue.on:
             added = added + tissue.torques(theta)
         return own + spring.torques(theta), added
 

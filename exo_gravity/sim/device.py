@@ -250,8 +250,8 @@ class SimulatedDevice:
             on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
             self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
-        at_once = [motor.damps_at_once(pull) for motor, pull in zip(self.motors, torque, strict=True)]
-        prompt = list(map(operator.mul, damping, at_once))
+        each = zip(damping, self.motors, torque, strict=True)
+        prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
         self.arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
         self._steps += count
 

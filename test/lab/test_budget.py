@@ -4,12 +4,10 @@
 import functools
 import math
 
-import mujoco
 import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
@@ -27,7 +25,8 @@ from exo_gravity.lab.budget import (
 )
 from exo_gravity.lab.inputs.arms import any_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.sim.urdf import UrdfConfig
+
+from ..support.urdf_oracle import WornMujocoArm
 
 LINKS = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LINKS, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -162,14 +161,8 @@ def test_the_budget_of_an_arm_from_a_urdf_is_what_mujoco_needs_in_its_worst_pose
     found = arm_budget(arm, Wearer(75.0), 1.0, 0.0, 0.5)
     load = Wearer(75.0).on_links(arm.robot.length, arm.compensator["wearer.links"])
     text = packaged_config("arms/elbow.urdf").read_text(encoding="utf-8")
-    config = UrdfConfig(text=text, joint_names=["elbow"], hand="hand", wearer_mass=load.mass, wearer_cog=load.cog)
-    model, _ = config.models((0.5, 0.0, 0.0, 0.0))
-    model.opt.gravity = (0.0, 0.0, -STANDARD_GRAVITY)
-    data, needs = mujoco.MjData(model), []
-    for angle in np.linspace(arm.low[0], arm.high[0], 500):
-        data.qpos[:] = angle
-        mujoco.mj_forward(model, data)
-        needs.append(abs(float(data.qfrc_bias[0])))
+    oracle = WornMujocoArm(text, ["elbow"], load.mass, load.cog, (0.5, 0.0, 0.0, 0.0))
+    needs = [abs(float(oracle.torque([angle])[0])) for angle in np.linspace(arm.low[0], arm.high[0], 500)]
     (joint,) = found.joints
     assert joint.torque == pytest.approx(max(needs), rel=1e-4)
     assert "1 elbow" in "\n".join(table_lines(found))

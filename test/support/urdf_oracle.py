@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Gravity torques of a URDF by MuJoCo, to compare Pinocchio's with."""
+"""Gravity torques of a URDF by MuJoCo, to compare Pinocchio's with: of the bare arm, and of one that is worn."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from exo_gravity.sim.urdf import UrdfConfig
+
+UPRIGHT = (0.0, 0.0, -9.80665)  # m/s^2
 UNUSED = ("visual", "collision")
 
 
@@ -47,3 +50,29 @@ class MujocoArm:
         self._data.qpos[self._positions] = theta
         mujoco.mj_forward(self._model, self._data)
         return self._data.qfrc_bias[self._speeds].copy()
+
+
+class WornMujocoArm:
+    """The arm that `joint_names` (n,) move in the URDF `text`, with all that it holds.
+
+    mass, cog: of the wearer's segment on each link, (n,) kg and (n,) m. payload: kg, and (3,) m, in the link `hand`.
+    """
+
+    def __init__(
+        self,
+        text: str,
+        joint_names: Sequence[str],
+        mass: Sequence[float],
+        cog: Sequence[float],
+        payload: Sequence[float] = (0.0,) * 4,
+    ) -> None:
+        config = UrdfConfig(text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog)
+        self._model, _ = config.models(payload)
+        self._model.opt.gravity = UPRIGHT
+        self._data = mujoco.MjData(self._model)
+
+    def torque(self, theta: Sequence[float] | np.ndarray) -> np.ndarray:
+        """Return what holds the arm at `theta` (n,) rad on an upright base, (n,) Nm."""
+        self._data.qpos[:] = theta
+        mujoco.mj_forward(self._model, self._data)
+        return self._data.qfrc_bias.copy()

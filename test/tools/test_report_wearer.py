@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -17,9 +16,9 @@ from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.report import trial_report, wearer_share
 from exo_gravity.lab.trial.recording import Recording
-from exo_gravity.sim.urdf import UrdfConfig
 
 from ..support.synthetic_bags import bag_of
+from ..support.urdf_oracle import WornMujocoArm
 
 pytest.importorskip("matplotlib")
 LENGTH = (0.05, 0.13, 0.30, 0.30)
@@ -92,16 +91,7 @@ def test_the_share_of_each_joint_of_a_seven_joint_arm_is_found_and_its_page_show
     mass, cog = [0.0, 0.0, 1.5, 0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.12, 0.0, 0.1, 0.0, 0.0]
     pose = [0.6, 0.5, 0.3, 0.9, 0.2, 0.3, -0.2]
 
-    def needed(worn):
-        config = UrdfConfig(text=text, joint_names=names, hand="hand", wearer_mass=worn, wearer_cog=cog)
-        model, _ = config.models()
-        model.opt.gravity = 9.80665 * gravity_in_trunk(0.0, 0.0)
-        data = mujoco.MjData(model)
-        data.qpos[:] = pose
-        mujoco.mj_forward(model, data)
-        return data.qfrc_bias.copy()
-
-    effort = needed([(1.0 - share) * m for m in mass])
+    effort = WornMujocoArm(text, names, [(1.0 - share) * m for m in mass], cog).torque(pose)
     rows = [np.tile(row, (len(TIME), 1)) for row in (pose, [0.0] * 7, effort, effort)]
     recording = Recording("right", tuple(names), TIME, *rows, carried=((1.0, 7.0),))
     values = {**given, "wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 1.0}

@@ -16,7 +16,7 @@ Skin, muscles and capsule of a relaxed joint pull it towards a rest angle, in th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -79,9 +79,11 @@ class Tissue:
     joint_rest: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT, "angle at which they rest", (-np.pi, np.pi), "rad", expert=True
     )
+    on: bool = field(init=False, repr=False, compare=False)  #: whether any joint has one
 
     def __post_init__(self) -> None:
         check_owned(self)
+        object.__setattr__(self, "on", any(self.joint_stiffness))
 
     def torque(self, theta: Sequence[float]) -> tuple[float, ...]:
         """Return the torque (n,) in Nm that holds the relaxed joints at `theta` (n,) rad."""

@@ -132,7 +132,7 @@ class Settings:
             raise ParameterError("joint_spring.stiffness", list(self.joint_spring.stiffness), expected)
         for name in ("wearer_first_moment", "wearer_off_axis"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        if any(self.tissue.joint_stiffness) and len(self.tissue.joint_stiffness) != len(self.robot.scale):
+        if self.tissue.on and len(self.tissue.joint_stiffness) != len(self.robot.scale):
             stiffness = list(self.tissue.joint_stiffness)
             raise ParameterError("wearer.joint_stiffness", stiffness, f"{len(self.robot.scale)} numbers")
         self._carry(self.robot)
@@ -203,7 +203,7 @@ class Settings:
         torque = law.torque(theta, tilt)
         if self.joint_spring.on:
             torque = tuple(map(operator.add, torque, self.joint_spring.torque(theta)))
-        if self.mode == "zero_g" and any(self.tissue.joint_stiffness):
+        if self.mode == "zero_g" and self.tissue.on:
             share = self.support_now
             torque = tuple([tau + share * own for tau, own in zip(torque, self.tissue.torque(theta), strict=True)])
         return torque, reason

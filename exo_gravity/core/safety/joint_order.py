@@ -6,9 +6,9 @@ for hardly any torque. What differs is the inertia. Of two joints with parallel 
 all that the other one turns, and the link between them, so under a push that rises at the same rate it is slower.
 Friction only delays when a joint breaks loose: the time counts from then on.
 
-Which joints have parallel axes, the efforts tell that the controller asks for while joints are pushed: the outer joint
-needs the same torque whichever of the two is turned. So no parameter describes the arm, and where gravity turns
-neither joint, nothing is compared. Of the paper's arm these are joints 3 and 4. Exchanges of joints whose axes are not
+The efforts that the controller asks for while joints are pushed tell which axes are parallel: the outer joint needs the
+same torque whichever of the two is turned. So no parameter describes the arm, and where gravity turns neither joint,
+nothing is compared. Of the paper's arm these are joints 3 and 4. Exchanges of joints whose axes are not
 parallel are not looked for.
 
 A wearer who holds the outer joint firmly makes it slow, too.
@@ -87,7 +87,7 @@ class JointOrder:
 
     @property
     def exchanged(self) -> tuple[int, ...]:
-        """Two joints of which the inner one is quicker, from 0 on; () if there are none."""
+        """An inner and an outer joint, from 0 on, of which the inner one is quicker; () if there is no such pair."""
         pushed = [i for i, (times, ends) in enumerate(zip(self._times, self._ends, strict=True)) if times and ends]
         stiffness = self._stiffness(pushed) if pushed else np.empty((0, 0))
         for inner, outer in combinations(pushed, 2):
@@ -100,7 +100,8 @@ class JointOrder:
     @property
     def fault(self) -> Fault:
         """The fault of the two joints that are exchanged."""
-        (inner, outer), times = self.exchanged, [f"{1000.0 * self._time(i):.0f} ms" for i in self.exchanged]
+        inner, outer = pair = self.exchanged
+        times = [f"{1000.0 * self._time(i):.0f} ms" for i in pair]
         reason = (
             f"{self._names[inner]} moved sooner than {self._names[outer]}, which it carries: {' and '.join(times)} "
             "under the same push: let the arm hang freely and relaxed, or correct can_id of these two motors"

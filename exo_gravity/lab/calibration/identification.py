@@ -32,7 +32,7 @@ from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
@@ -105,10 +105,10 @@ class Identified:
     tilt: np.ndarray  #: (3,) rad in the base frame, rotation of gravity from the measured to the true direction
     tilt_covariance: np.ndarray  #: (3, 3); one lean of the stand does not show the turn about gravity, two do
     stiffness: np.ndarray  #: (n,) Nm/rad of the springs across the joints, 0 where the poses ask for none
-    stiffness_error: np.ndarray  #: (n,), standard errors, 0 where there is none
+    stiffness_error: np.ndarray  #: (n,), standard errors, 0 where no spring was fitted
     rest: np.ndarray  #: (n,) rad, where they are slack: a joint with a spring has its offset in it
     slope: np.ndarray  #: (n,) 1/K of the scales over the motors' temperatures, 0 where the poses ask for none
-    slope_error: np.ndarray  #: (n,), standard errors, 0 where there is none
+    slope_error: np.ndarray  #: (n,), standard errors, 0 where no slope was fitted
     temperature: np.ndarray  #: (n,) degC, mean of the motors, at which `scale` is true; NaN where not known
 
     @property
@@ -200,7 +200,7 @@ def check_physical(
     for joint in np.flatnonzero((scale < low) | (scale > high)):
         expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
         raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
-    if model.names == MOMENTS:
+    if isinstance(model, PapersMoments):
         _check_papers_arm(moments, error, direction, model)
     else:
         _check_like(moments, direction, model)
@@ -242,7 +242,7 @@ def _unknown(
     if relative:
         yield f"A common factor of all torque scales and moments: hang a known weight on link {model.count}."
     names = ", ".join(name for name, is_hidden in zip(_names(model), hidden, strict=False) if is_hidden)
-    if model.names == MOMENTS:
+    if isinstance(model, PapersMoments):
         if names:
             yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
         yield from _zeros(unknowns, covariance, at)

@@ -52,10 +52,6 @@ class MomentModel(Protocol):
         """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
         ...
 
-    def along(self, theta: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
-        ...
-
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (k,) of `mass` kg on the last link, `lever` m from its joint. Raises ParameterError."""
         ...
@@ -75,6 +71,11 @@ class MomentModel(Protocol):
     def upwards(self, theta: np.ndarray) -> np.ndarray:
         """Return the sine (m,) of the largest angle above the horizontal of a link, at `theta` (m, n) rad."""
         ...
+
+
+def along_axes(model: MomentModel, theta: np.ndarray) -> np.ndarray:
+    """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
+    return np.stack([model.rows(theta, axis) for axis in np.eye(3)], axis=-1)
 
 
 class PapersMoments:
@@ -100,10 +101,6 @@ class PapersMoments:
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return `core.arm.gravity.regressor`."""
         return regressor(theta, direction, self.gravity)
-
-    def along(self, theta: np.ndarray) -> np.ndarray:
-        """Return the torque (m, 4, 8, 3) in Nm per kg m with gravity along each axis of the base frame."""
-        return np.stack([regressor(theta, axis, self.gravity) for axis in np.eye(3)], axis=-1)
 
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (8,) of `mass` kg on link 4, `lever` m from the elbow. Raises ParameterError."""
@@ -166,10 +163,6 @@ class UrdfMoments:
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return `UrdfArm.regressor`."""
         return self.arm.regressor(theta, direction)
-
-    def along(self, theta: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the root link."""
-        return np.stack([self.arm.regressor(theta, axis) for axis in np.eye(3)], axis=-1)
 
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (k,) of `mass` kg on the way from the last joint to the hand. Raises ParameterError."""

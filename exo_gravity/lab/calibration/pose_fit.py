@@ -19,92 +19,48 @@ joint gets a factor of its own, estimated from its residuals and pooled with the
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
 
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
 # kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K: a combination of unknowns that may be wrong by this much is not known.
 NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FitLayout:
-    """Where each of the unknowns stands.
+    """Where each of the unknowns of an arm stands."""
 
-    joints, moments: how many the arm has.
-    angles: of a weight, the numbers of the moment along a link and of that across it.
-    """
-
-    joints: int
-    moments: int
-    angles: tuple[tuple[int, int], ...]
-
-    @cached_property
-    def sizes(self) -> tuple[int, ...]:
-        """Of moments, scales, offsets, angles, tilt, springs and slopes."""
-        return self.moments, self.joints, self.joints, len(self.angles), 3, self.joints, self.joints
-
-    @cached_property
-    def slices(self) -> tuple[slice, ...]:
-        """Of the same."""
-        ends = np.cumsum((0, *self.sizes)).tolist()
-        return tuple(map(slice, ends[:-1], ends[1:]))
+    moment: slice  #: kg m
+    scale: slice  #: logarithms
+    offset: slice  #: Nm
+    angle: slice  #: rad
+    tilt: slice  #: rad, the rotation vector of gravity in the base frame
+    spring: slice  #: Nm/rad
+    slope: slice  #: 1/K, of the torque scale over the motor's temperature
+    joints: int  #: how many the arm has
+    angles: tuple[tuple[int, int], ...]  #: of a weight, the numbers of the moment along a link and of that across it
+    natural: np.ndarray  #: `NATURAL` of each unknown, (count,)
 
     @property
-    def moment(self) -> slice:
-        """Kg m."""
-        return self.slices[0]
-
-    @property
-    def scale(self) -> slice:
-        """Logarithms."""
-        return self.slices[1]
-
-    @property
-    def offset(self) -> slice:
-        """Nm."""
-        return self.slices[2]
-
-    @property
-    def angle(self) -> slice:
-        """Rad."""
-        return self.slices[3]
-
-    @property
-    def tilt(self) -> slice:
-        """Rad, the rotation vector of gravity in the base frame."""
-        return self.slices[4]
-
-    @property
-    def spring(self) -> slice:
-        """Nm/rad."""
-        return self.slices[5]
-
-    @property
-    def slope(self) -> slice:
-        """1/K, of the torque scale over the motor's temperature."""
-        return self.slices[6]
+    def moments(self) -> int:
+        """How many the arm has."""
+        return int(self.moment.stop)
 
     @property
     def count(self) -> int:
         """How many unknowns there are."""
-        return sum(self.sizes)
+        return int(self.slope.stop)
 
     @property
     def extras(self) -> tuple[int, ...]:
         """The unknowns that are 0 unless the poses ask for them."""
         return tuple(range(self.spring.start, self.slope.stop))
-
-    @cached_property
-    def natural(self) -> np.ndarray:
-        """`NATURAL` of each unknown, (count,)."""
-        return np.repeat(NATURAL, self.sizes)
 
     def start(self, moments: np.ndarray) -> np.ndarray:
         """Return the unknowns (count,) with these moments, and nothing else."""
@@ -113,7 +69,12 @@ class FitLayout:
 
 def layout_of(model: MomentModel) -> FitLayout:
     """Return where the unknowns of an arm stand."""
-    return FitLayout(model.count, len(model.names), model.angles)
+    joints = model.count
+    sizes = len(model.names), joints, joints, len(model.angles), 3, joints, joints
+    ends = np.cumsum((0, *sizes)).tolist()
+    moment, scale, offset, angle, tilt, spring, slope = map(slice, ends[:-1], ends[1:])
+    natural = np.repeat(NATURAL, sizes)
+    return FitLayout(moment, scale, offset, angle, tilt, spring, slope, joints, model.angles, natural)
 
 
 @dataclass(frozen=True)
@@ -247,7 +208,7 @@ def rows_of(observations: Sequence[Observation], model: MomentModel) -> Rows:
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
     scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
     anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, product / EXACT))
-    along, sigma = model.along(theta), np.hypot(spread, FIT.least_spread)
+    along, sigma = along_axes(model, theta), np.hypot(spread, FIT.least_spread)
     temperature = temperatures(observations)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
     return Rows(along, theta, warmth, direction, load, effort, sigma, at, at.start(model.start), anchor)

@@ -38,7 +38,7 @@ WIDTH = 118  # characters of a comment line
 DPI = 130
 FIGURE_WIDTH = 11.0  # inches
 ROW_HEIGHT, CURVE_HEIGHT = 2.5, 3.2  # inches, of a joint
-MOST_ACROSS = 4  # curves beside each other
+MOST_ACROSS = 4  # curves in a row
 SMALL_FRICTION = 0.2  # of the friction that was measured: a well-run-in gear
 
 Value = bool | int | float | str | list[int] | list[float] | list[str]

@@ -21,13 +21,13 @@ from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
-from exo_gravity.core.errors import ExoGravityError, ParameterError
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
-from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
+from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 
@@ -299,20 +299,14 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     return Tour(limits, guess, itinerary, values["rate"], load)
 
 
-def urdf_arm_of(values: Mapping[str, Any]) -> UrdfArm:
-    """Return the arm from a URDF that parameter values describe, with gains of 1.
+def urdf_moments(values: Mapping[str, Any]) -> UrdfMoments:
+    """Return the moments of the arm from a URDF that parameter values describe, with the rotors of its motors.
 
     Raises ParameterError, also if the URDF comes from a topic.
     """
-    if not values["urdf.file"]:
-        raise ParameterError("urdf.file", "", "a file: a calibration does not wait for a topic")
-    arm = arm_from(values, read_urdf(values["urdf.file"]))
-    return arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
-
-
-def urdf_moments(values: Mapping[str, Any]) -> UrdfMoments:
-    """Return the moments of the same arm, with the rotors of its motors. Raises ParameterError."""
-    return UrdfMoments(urdf_arm_of(values), [MOTORS[name].rotor_inertia for name in values["motor"]])
+    arm = arm_in_file(values, ": a calibration does not wait for a topic")
+    rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
+    return UrdfMoments(arm.scaled([1.0] * len(values["joint_names"]), values["gravity"]), rotors)
 
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:

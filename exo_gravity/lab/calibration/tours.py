@@ -28,12 +28,12 @@ from exo_gravity.hardware.urdf_arm import MOMENT_NAMES
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
-from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.pose_fit import columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tour import urdf_arm_of, urdf_moments
+from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit, fit_wearer, unrest
 from exo_gravity.lab.inputs.arms import AnyArm, ConfiguredArm
 
@@ -104,8 +104,8 @@ def _observations(
 
 def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses without and with the weight, and solve for scales and moments. Raises ParameterError."""
-    mass, lever = options.mass, options.lever
-    model_of(arm).load(mass, lever)
+    mass, lever, model = options.mass, options.lever, model_of(arm)
+    model.load(mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
     earlier = observations_in(options.earlier) if options.earlier else []
@@ -113,7 +113,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     bare = _observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
-        needed = _needed(arm, bare)
+        needed = _needed(arm, model, bare)
         bare = [one._replace(effort=effort) for one, effort in zip(bare, needed, strict=True)]
     else:
         hang = _request(arm, mass, lever)
@@ -136,9 +136,9 @@ def model_of(arm: AnyArm) -> MomentModel:
     return PapersMoments(papers(arm.robot))
 
 
-def _needed(arm: AnyArm, poses: Sequence[Observation]) -> np.ndarray:
+def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np.ndarray:
     """Return the torque (m, n) in Nm that the file's arm needs in the poses."""
-    model, (theta, direction, _, _) = model_of(arm), columns(poses)
+    theta, direction, _, _ = columns(poses)
     gravity = model.rows(theta, direction) @ model.moments * np.array(arm.compensator["gain"])
     return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
 
@@ -162,7 +162,7 @@ def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> Calibratio
 
 
 def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
-    """Return the file's torque scales (4,) at the temperatures of the poses."""
+    """Return the file's torque scales (n,) at the temperatures of the poses."""
     bridge = arm.can_bridge
     columns = (bridge[name] for name in ("torque_scale", "torque_scale_slope", "torque_scale_temperature"))
     motors = zip(*columns, found.temperature.tolist(), strict=True)
@@ -174,9 +174,9 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
     moments = np.where(np.isfinite(error), found.moments, before)
-    if arm.by_urdf:
+    if isinstance(model, UrdfMoments):
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-        new = urdf_arm_of(arm.compensator).with_moments(moments)
+        new = model.arm.with_moments(moments)
         for name, values in zip(MOMENT_NAMES, new.change.T, strict=True):
             yield Change(
                 node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {_row(np.array(arm.compensator[name]))}"
@@ -265,7 +265,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
 
     A joint that differs by more than the band of `model_error.torque` is a refusal.
     """
-    held, effort = _needed(arm, observations), columns(observations)[2]
+    held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
     error = np.array(for_joints(_torque_error(arm), len(arm.joint_names), max))
     size = np.sqrt(np.mean(held**2, axis=0))
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough

@@ -143,12 +143,12 @@ def read_any_arm(nodes: Nodes, namespace: str) -> AnyArm:
 
 
 def any_arms(params: str | Path) -> list[AnyArm]:
-    """Return every arm of a parameter file, also those from a URDF. Raises ParameterError if there is none."""
+    """Return every arm of a parameter file, including those from a URDF. Raises ParameterError if there is none."""
     return _arms(params, read_any_arm)
 
 
 def any_arm(params: str | Path, side: str) -> AnyArm:
-    """Return the only arm of `side` in a parameter file, also one from a URDF. Raises ParameterError."""
+    """Return the only arm of `side` in a parameter file, which may come from a URDF. Raises ParameterError."""
     return _only(any_arms(params), params, side)
 
 

@@ -76,7 +76,6 @@ class MomentumObserver:
         self._whole = s.worn(s.loaded)
         self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
         self._wearer, self._tissue = s.worn(s.robot.massless(s.loaded.gravity)), s.tissue
-        self._has_tissue = any(s.tissue.joint_stiffness)
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
         self._spring = s.joint_spring
         friction = s.terms.friction
@@ -112,7 +111,7 @@ class MomentumObserver:
         rubbing, friction = self._friction(velocity, effort)
         momentum, coriolis = self._links.momentum(theta, velocity, turning)
         held = tuple(map(operator.add, gravity, self._spring.torque(theta))) if self._spring.on else gravity
-        if self._has_tissue:
+        if self._tissue.on:
             held = tuple(map(operator.add, held, self._tissue.torque(theta)))
         unexplained = [tau + rub + c - h for tau, rub, c, h in zip(effort, rubbing, coriolis, held, strict=True)]
         dt, self._time = now - self._time, now

@@ -24,7 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT, Vector
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import Limits, limits_of
-from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
+from exo_gravity.hardware.urdf_arm import UrdfArm, arm_in_file
 
 Point = tuple[float, ...]  # (3,)
 
@@ -193,9 +193,8 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
     """Return the arm that the parameters of its two nodes describe, or raise ParameterError."""
     limits, friction = limits_of(can_bridge), (compensator["friction.viscous"], compensator["friction.coulomb"])
     if compensator["law"] == URDF_LAW:
-        if not compensator["urdf.file"]:
-            raise ParameterError("urdf.file", "", "a file, for a picture: the URDF on a topic is one already")
-        return UrdfDescription(arm_from(compensator, read_urdf(compensator["urdf.file"])), limits, *friction)
+        arm = arm_in_file(compensator, ", for a picture: the URDF on a topic is one already")
+        return UrdfDescription(arm, limits, *friction)
     robot, mass = robot_of(compensator), compensator["robot.mass"]
     return ArmDescription(compensator["side"], robot, mass, limits, *friction, compensator["shoulder_from_imu"])
 

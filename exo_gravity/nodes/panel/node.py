@@ -225,7 +225,7 @@ class Arms:
 
 
 async def answer_of(client: Client, request: Any, timeout: float = TIMING.call_timeout) -> Any:
-    """Send `request` at once; return the response. Raises ExoGravityError if there is none within `timeout` s."""
+    """Send `request` at once; return the response. Raises ExoGravityError if none comes within `timeout` s."""
     sent = client.call_async(request)
     deadline = time.monotonic() + (timeout if client.service_is_ready() else TIMING.absent_timeout)
     while not sent.done():

@@ -52,7 +52,7 @@ class BudgetWatch:
         names: of the joints (n,).
         """
         if settings.law == URDF_LAW:
-            self.result = Reason(Budget.UNKNOWN, "unknown: the budget is for the paper's arm alone")
+            self.result = Reason(Budget.UNKNOWN, "unknown: it is watched for the paper's arm alone")
             return
         self._bridge.update()
         if self._job is not None:

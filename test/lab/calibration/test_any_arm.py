@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -20,6 +19,7 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, UrdfArm
 from exo_gravity.lab.calibration.live import tour_parameters
+from exo_gravity.lab.calibration.moment_model import along_axes
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.result import page_of, write_changes
 from exo_gravity.lab.calibration.tour import urdf_moments
@@ -27,14 +27,12 @@ from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_f
 from exo_gravity.lab.inputs.arms import AnyArm, any_arm, carried_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.ros_yaml import text_of
-from exo_gravity.sim.urdf import UrdfConfig
 
 from ...support.chains import random_chain
-from ...support.urdf_oracle import MujocoArm
+from ...support.urdf_oracle import MujocoArm, WornMujocoArm
 
 SHIPPED = ("elbow", "three_joints", "seven_joints")
 DOWN = gravity_in_trunk(0.0, 0.0)
-UPRIGHT = 9.80665 * DOWN
 MEDIAN, WORST = 0.01, 0.03  # of the peak torque
 POSES = 12
 NOISE = 0.004  # Nm, standard deviation of a pose's effort: half a code of an AK60-6
@@ -49,21 +47,10 @@ def with_wrong_masses(text: str, seed: int) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-class Truth:
-    """The arm of a URDF by MuJoCo, with a weight of some kg at some m from its last joint."""
-
-    def __init__(self, text: str, names: Sequence[str], weight: tuple[float, float] = (0.0, 0.0)) -> None:
-        none = (0.0,) * (len(names) - 1)
-        held = {"wearer_mass": (*none, weight[0]), "wearer_cog": (*none, weight[1])}
-        self._model, _ = UrdfConfig(text=text, joint_names=names, hand="hand", **held).models()
-        self._model.opt.gravity = UPRIGHT
-        self._data = mujoco.MjData(self._model)
-
-    def torque(self, theta: Sequence[float] | np.ndarray) -> np.ndarray:
-        """What holds the arm, (n,) Nm."""
-        self._data.qpos[:] = theta
-        mujoco.mj_forward(self._model, self._data)
-        return self._data.qfrc_bias.copy()
+def true_arm(text: str, names: Sequence[str], weight: tuple[float, float] = (0.0, 0.0)) -> WornMujocoArm:
+    """The arm of a URDF with a weight of some kg at some m from its last joint."""
+    none = (0.0,) * (len(names) - 1)
+    return WornMujocoArm(text, names, (*none, weight[0]), (*none, weight[1]))
 
 
 @dataclass
@@ -88,7 +75,7 @@ class Bench:
         """What a tour through the best poses would show of motors with these true torque scales (n,)."""
         model, random = model_of(self.arm), np.random.default_rng(4)
         poses, taken = candidates(self.arm.limits, model), [np.array(self.arm.limits.home)]
-        truth = Truth(self.text, self.arm.joint_names, weight)
+        truth = true_arm(self.text, self.arm.joint_names, weight)
         while len(taken) < POSES:
             taken.append(poses[next_pose(taken, poses, DOWN, model.moments + model.load(*weight), model)])
         seen = []
@@ -101,10 +88,8 @@ class Bench:
     def errors(self, params: Path, scales: np.ndarray) -> tuple[float, float]:
         """The median and the largest error of the true torque in 300 poses by the file `params`, of the peak."""
         new, random = carried_arm(load(params), "/right"), np.random.default_rng(9)
-        poses, truth = (
-            random.uniform(self.arm.low, self.arm.high, (300, len(scales))),
-            Truth(self.text, self.arm.joint_names),
-        )
+        poses = random.uniform(self.arm.low, self.arm.high, (300, len(scales)))
+        truth = true_arm(self.text, self.arm.joint_names)
         true = np.array([truth.torque(pose) for pose in poses])
         law = np.array([new.settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
         given = law / np.array(new.can_bridge["torque_scale"]) * scales
@@ -186,7 +171,7 @@ def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_pa
 
     def choose() -> None:
         while not done.is_set():
-            model.along(model.suggested[:20])
+            along_axes(model, model.suggested[:20])
 
     sys.setswitchinterval(1e-6)
     thread = threading.Thread(target=choose)
