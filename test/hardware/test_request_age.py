@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
@@ -28,7 +30,7 @@ class Line:
         """Let `duration` s pass, or less: until the replies are late; return how old the newest one is then."""
         end = self.now + duration
         while self.now < end and not self.requests.late:
-            if self.requests.may_send(self.now):
+            if self.requests.may_send(self.now, self.cycle):
                 self.requests.sent(self.now, 1)
                 self.asked += 1
                 if not lost(self.asked):
@@ -55,7 +57,7 @@ def test_a_queue_that_is_there_at_once_is_found_and_forgotten_once_it_is_gone():
     assert line.requests.late > AGE.longest
     for _ in range(20):  # what was under way arrives
         line.now += CYCLE
-        line.requests.may_send(line.now)
+        line.requests.may_send(line.now, line.cycle)
     assert not line.requests.late
     line.run(1.0)
     assert not line.requests.late
@@ -76,6 +78,19 @@ def test_lost_frames_are_no_queue_and_hold_up_few_commands(rate, delay):
     line.run(60.0, delay=lambda now: delay, lost=lambda count: count % 16 == 0)  # 6 %: 3 % each way
     assert not line.requests.late
     assert line.asked > 0.9 * 60.0 * rate
+
+
+def test_lost_frames_and_a_late_computer_together_do_not_make_a_motor_silent():
+    chance, requests = random.Random(1), Requests()
+    now = replied = silence = 0.0
+    for _ in range(500 * 60):  # 6 % of the commands get no reply, and one cycle in 50 begins 20 ms late
+        now += 0.002 + (0.02 if chance.random() < 0.02 else 0.0)
+        if requests.may_send(now, 0.002):
+            requests.sent(now, 1)
+            if chance.random() > 0.06:
+                silence, replied = max(silence, now - replied), now
+                requests.replied(now + 0.0003)
+    assert silence < 0.05
 
 
 def test_a_motor_that_does_not_reply_is_still_asked_in_every_cycle_and_replies_that_come_back_are_no_queue():

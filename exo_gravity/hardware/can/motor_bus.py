@@ -162,7 +162,7 @@ class MotorBus:
         for joint, own in enumerate(self._ports):
             due = self._frames(joint, now)
             if due and self.replies[joint]:
-                is_held_back = not self._requests[joint].may_send(now)
+                is_held_back = not self._requests[joint].may_send(now, deadline - now)
                 if is_held_back and drive.send[joint] in (Send.COMMAND, Send.POLL):
                     continue
                 self._requests[joint].sent(now, len(due))

@@ -10,6 +10,7 @@ pause tells them apart: a motor that is sent nothing still replies to all that i
         no reply for `quiet`                                    those commands were lost, and are forgotten
         replies, which show a queue as long as `longest`        twice within `again`: the replies are `late`, a fault
         replies at once                                         the device stood still: no queue, and nothing is wrong
+        a cycle that begins `late`                              nothing is known of that time: the motor is asked again
 
 While replies are late, a motor is sent a command only if no more are under way than `longest` holds: a queue that our
 own commands fill gets no longer.
@@ -28,9 +29,10 @@ class ReplyAge:
     fewest: int = 3  #: commands under way: at a low rate one or two may be longer than `longest`
     quiet: float = 0.02  #: s without a reply that show that none is under way; an adapter's longest timer is 0.016 s
     looks: int = 3  #: cycles of it at least
-    #: s at most that pass between two looks: where more have, the whole computer may have stood still, and the replies
-    #: that wait are no older than others
-    look: float = 0.025
+    late: float = 0.015  #: s; a pause and a computer that is late by 0.02 s together would make a motor silent
+    #: s beyond a period that pass between two looks at most: where more have, this process or the whole computer stood
+    #: still, and the replies that wait are no older than others
+    look: float = 0.005
     #: least spread of a queue's replies, as a share of their commands'. A line that is slower than the commands, or as
     #: fast, spreads replies like them; a device that stood still answers all at once
     spread: float = 0.5
@@ -57,15 +59,21 @@ class Requests:
         self._replies: list[float] = []  # when they arrived in the pause
         self._suspected = -math.inf  # when replies last showed a long queue
         self._looks = 0  # cycles without a command since the last reply
-        self._replied = self._paused = -math.inf  # when the last reply arrived, and when the pause began
+        self._replied = -math.inf  # when the last reply arrived
+        self._asked_in_vain = 0  # commands since the last reply
+        self._due = math.inf  # when the next cycle was to begin, at the latest
+        self._period = 0.0  # s
 
-    def may_send(self, now: float) -> bool:
-        """Return whether the motor is to be sent a command in this cycle."""
+    def may_send(self, now: float, period: float) -> bool:
+        """Return whether the motor is to be sent a command in this cycle, which lasts `period` s."""
+        is_late = now - self._due >= AGE.late
+        self._due, self._period = now + period, period
         now = self._run(now)
         if self._sent:
             self._looks += 1
-            since = self._replies[-1] if self._replies else self._paused
-            if self._looks >= AGE.looks and now - since >= AGE.quiet:
+            if is_late:
+                self._sent = []
+            elif self._looks >= AGE.looks and now - self._replied >= AGE.quiet:
                 self._forget()
             return not self._sent
         if len(self._open) < AGE.fewest or now - self._open[0] <= AGE.longest:
@@ -75,9 +83,9 @@ class Requests:
             if self._looks >= AGE.looks and now - self._replied >= AGE.quiet:
                 self._forget()
             return not self._open
-        if now - self._replied >= AGE.quiet:
-            return True  # it does not reply at all
-        self._sent, self._replies, self._looks, self._paused = list(self._open), [], 0, now
+        if is_late or self._asked_in_vain or now - self._replied >= AGE.quiet:
+            return True  # nothing is known, or it does not reply: a pause would only make it silent for longer
+        self._sent, self._replies, self._looks = list(self._open), [], 0
         return False
 
     def sent(self, now: float, frames: int) -> None:
@@ -85,12 +93,13 @@ class Requests:
         self.last = now
         now = self._run(now)
         self._open.extend([now] * frames)
+        self._asked_in_vain += frames
 
     def replied(self, now: float) -> float:
         """Note a reply; return when the motor was last asked, or `now` if it never was: the reading is no newer."""
         asked = now if self.last == -math.inf else self.last
         now = self._run(now)
-        self._replied, self._looks = now, 0
+        self._replied, self._looks, self._asked_in_vain = now, 0, 0
         if self._open:
             self._open.popleft()
         if not self._open:
@@ -107,7 +116,7 @@ class Requests:
 
     def _run(self, now: float) -> float:
         """Return the time in s for which this process has run until `now`."""
-        self._ran += min(AGE.look, max(0.0, now - self._seen))
+        self._ran += min(self._period + AGE.look, max(0.0, now - self._seen))
         self._seen = now
         return self._ran
 
