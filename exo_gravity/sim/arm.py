@@ -17,11 +17,12 @@ MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
 """
 
+import copy
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJoCo's search for a display
 import mujoco
@@ -191,6 +192,7 @@ class SimulatedArm:
         own = self.config
         columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
         self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
+        self._has_load_friction, self._has_stribeck = bool(self._load_share.any()), bool(self._stribeck.any())
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
 
@@ -212,19 +214,33 @@ class SimulatedArm:
         self.model, self._turning_model = self.config.models(payload)
         self.data = mujoco.MjData(self.model)
         self._turning_data = mujoco.MjData(self._turning_model)
+        self._viscous = self.model.dof_damping.copy()
+        self._look_at_data()
+
+    def _look_at_data(self) -> None:
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
-        self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
+        self._damping = self.model.dof_damping
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SimulatedArm":
+        """Return an arm in the same state, which moves on its own."""
+        other = object.__new__(type(self))
+        memo[id(self)] = other
+        vars(other).update(copy.deepcopy(vars(self), memo))
+        other._look_at_data()
+        return other
 
     @property
     def positions(self) -> list[float]:
         """Joint angles (n,) in rad."""
-        return list(self._theta.tolist())
+        positions: list[float] = self._theta.tolist()
+        return positions
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (n,) in rad/s."""
-        return list(self._velocity.tolist())
+        velocities: list[float] = self._velocity.tolist()
+        return velocities
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad."""
@@ -265,10 +281,10 @@ class SimulatedArm:
             torque = self._velocity * damping + torque
         self._torque[:] = torque
         constant = self._coulomb
-        if self._load_share.any():
+        if self._has_load_friction:
             constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
             self.model.dof_frictionloss[:] = constant
-        if not (self._turns or self._stribeck.any()):
+        if not (self._turns or self._has_stribeck):
             mujoco.mj_step(self.model, self.data, count)
             return
         for _ in range(count):
