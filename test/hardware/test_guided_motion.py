@@ -15,7 +15,8 @@ from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_arm import TrunkReading
 
-from .compensated_arm import PEAK, POSE, CompensatedArm
+from ..support.copies import prepared
+from .compensated_arm import PEAK, POSE, CompensatedArm, compensated_arm
 from .test_guided_changes import CLAMPED, HALVED, ONE_G, RAISED, SAFE_SPEED
 
 HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
@@ -83,7 +84,7 @@ def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll)
     ids=["mode", "gain, mode and max_effort"],
 )
 def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(changes):
-    arm = CompensatedArm(pose=RAISED, limit=PEAK, has_wearer=False, mode="one_g")
+    arm = compensated_arm(pose=RAISED, limit=PEAK, has_wearer=False, mode="one_g")
     for change in changes:
         arm.change(**change)
         arm.run(0.3)
@@ -91,9 +92,10 @@ def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(change
     assert arm.driven < SAFE_SPEED
 
 
+@prepared
 def loaded(mass: float, pose: Sequence[float]) -> CompensatedArm:
     """Return a carried arm in `pose` with a load in its hand."""
-    arm = CompensatedArm(pose=pose, limit=PEAK)
+    arm = compensated_arm(pose=pose, limit=PEAK)
     arm.person.hand = Holding(pose)
     arm.device.arm.carry(mass)
     arm.change(payload_mass=mass)
