@@ -111,7 +111,7 @@ def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_ma
 def test_an_arm_whose_frames_are_lost_now_and_then_is_carried_on():
     arm = compensated_arm()
     arm.wire.loss, arm.wire.batch = 0.03, 0.001
-    arm.run(20.0)
+    arm.run(8.0)
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     assert arm.top_speed < 0.05
 

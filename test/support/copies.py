@@ -9,27 +9,30 @@ import functools
 from collections.abc import Callable
 from queue import SimpleQueue
 from threading import Thread
-from types import GeneratorType, MappingProxyType
+from types import GeneratorType, MappingProxyType, ModuleType
 from typing import Any, ParamSpec, TypeVar
 from unittest.mock import patch
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN
+from exo_gravity.hardware.urdf_arm import UrdfArm
 
 Arm = TypeVar("Arm")
 Given = ParamSpec("Given")
 
 # What `copy` cannot copy. The loop's thread is not started in virtual time, its queue is empty between two cycles, and
-# of the start gate no course is under way once the arm is carried.
+# of the checks before a start none is under way while an arm is carried, or is off. What has a name here is shared.
 UNCOPIED: dict[type, Any] = {
     MappingProxyType: lambda proxy: (MappingProxyType, (dict(proxy),)),
     SimpleQueue: lambda queue: (SimpleQueue, ()),
     Thread: lambda thread: (Thread, ()),
     GeneratorType: lambda course: (iter, ((),)),
+    ModuleType: lambda module: "shared",
+    UrdfArm: lambda arm: "shared",
 }
 
 
 def copied(arm: Arm) -> Arm:
-    """Return a carried arm in the state of `arm`, which goes on apart from it.
+    """Return an arm in the state of `arm`, with what is returned beside it, which goes on apart from it.
 
     Functions that are bound to a part of the arm go along; a nested function or a lambda that captured a part does not.
     """
@@ -41,7 +44,6 @@ def prepared(make: Callable[Given, Arm]) -> Callable[Given, Arm]:
     """Return a function that gives arms as `make` does, each a copy of the first one with the same arguments."""
     first = functools.cache(make)
 
-    @functools.wraps(make)
     def another(*args: Given.args, **kwargs: Given.kwargs) -> Arm:
         return copied(first(*args, **kwargs))
 
