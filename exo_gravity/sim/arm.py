@@ -192,9 +192,18 @@ class SimulatedArm:
         own = self.config
         columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
         self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
-        self._has_load_friction, self._has_stribeck = bool(self._load_share.any()), bool(self._stribeck.any())
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SimulatedArm":
+        """Return an arm in the same state, which moves on its own."""
+        other = object.__new__(type(self))
+        memo[id(self)] = other
+        vars(other).update(copy.deepcopy(vars(self), memo))
+        joints = slice(len(self._theta))
+        other._theta, other._velocity = other.data.qpos[joints], other.data.qvel[joints]
+        other._torque, other._damping = other.data.qfrc_applied, other.model.dof_damping
+        return other
 
     def carry(self, mass: float, cog: Sequence[float] = ZERO) -> None:
         """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.
@@ -214,33 +223,19 @@ class SimulatedArm:
         self.model, self._turning_model = self.config.models(payload)
         self.data = mujoco.MjData(self.model)
         self._turning_data = mujoco.MjData(self._turning_model)
-        self._viscous = self.model.dof_damping.copy()
-        self._look_at_data()
-
-    def _look_at_data(self) -> None:
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
-        self._damping = self.model.dof_damping
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "SimulatedArm":
-        """Return an arm in the same state, which moves on its own."""
-        other = object.__new__(type(self))
-        memo[id(self)] = other
-        vars(other).update(copy.deepcopy(vars(self), memo))
-        other._look_at_data()
-        return other
+        self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
 
     @property
     def positions(self) -> list[float]:
         """Joint angles (n,) in rad."""
-        positions: list[float] = self._theta.tolist()
-        return positions
+        return list(self._theta.tolist())
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (n,) in rad/s."""
-        velocities: list[float] = self._velocity.tolist()
-        return velocities
+        return list(self._velocity.tolist())
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad."""
@@ -281,10 +276,10 @@ class SimulatedArm:
             torque = self._velocity * damping + torque
         self._torque[:] = torque
         constant = self._coulomb
-        if self._has_load_friction:
+        if self._load_share.any():
             constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
             self.model.dof_frictionloss[:] = constant
-        if not (self._turns or self._has_stribeck):
+        if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
             return
         for _ in range(count):

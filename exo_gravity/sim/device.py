@@ -236,22 +236,20 @@ class SimulatedDevice:
             self.arm.move_base(*self.arm.config.felt(self.side, state))
 
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
-        now = self.time
-        if now >= min(self._power_returns):
-            for joint, returns in enumerate(self._power_returns):
-                if now >= returns:
-                    self._power_returns[joint] = math.inf
-                    self.motors[joint].unplugged = False
+        for joint, returns in enumerate(self._power_returns):
+            if self.time >= returns:
+                self._power_returns[joint] = math.inf
+                self.motors[joint].unplugged = False
         at = zip(self.motors, theta, velocity, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
-        elapsed = now - self._script_start
+        elapsed = self.time - self._script_start
         given = self.wearer.torque(elapsed, theta, velocity)
         self._follow_trunk(elapsed)
         damping = [motor.damping for motor in self.motors]
         if self.truth:
             on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
-            self.truth.note(now, theta, velocity, torque, damping, given, self._frames, step, on)
+            self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
         each = zip(damping, self.motors, torque, strict=True)
         prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
         self.arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
