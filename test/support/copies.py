@@ -10,7 +10,7 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from threading import Thread
 from types import GeneratorType, MappingProxyType, ModuleType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, cast
 from unittest.mock import patch
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN
@@ -42,7 +42,7 @@ def copied(arm: Arm) -> Arm:
 
 def prepared(make: Callable[Given, Arm]) -> Callable[Given, Arm]:
     """Return a function that gives arms as `make` does, each a copy of the first one with the same arguments."""
-    first = functools.cache(make)
+    first = cast(Callable[Given, Arm], functools.cache(make))
 
     def another(*args: Given.args, **kwargs: Given.kwargs) -> Arm:
         return copied(first(*args, **kwargs))
