@@ -27,7 +27,8 @@ panel:  # the simulated right arm and the operator's page, until Ctrl-C
 test:  # the tests, 13 minutes on two cores
 	@$(SETUP) @test
 	$(BIN)/python -m pytest --ignore test/bench -n auto --dist loadfile -m "not (real_time or browser or thorough)"
-	$(BIN)/python -m pytest test/hardware test/nodes -m "real_time and not thorough"
+	$(BIN)/python -m pytest $$(grep -rl mark.real_time --include='test_*.py' test/hardware test/nodes) \
+		-m "real_time and not thorough"
 
 test-all: test  # the same, then the longer ones: studies, browser, 13 poses, video, SROS2
 	.ci/test-long

@@ -6,6 +6,7 @@ imports nothing that looks at arms from outside.
 """
 
 import ast
+import functools
 import importlib
 import subprocess
 import sys
@@ -18,7 +19,6 @@ from .support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "exo_gravity"
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
 TORQUE_NODES = ("nodes.can_bridge", "nodes.compensator", "nodes.imu", "nodes.ros")
 PATH = ("core", "hardware", *TORQUE_NODES)
 # Each part by the beginnings of the module names that it may import; the longest part that fits a module counts.
@@ -55,17 +55,23 @@ def module_of(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix("__init__").rstrip(".")
 
 
-MODULES = {module_of(path): path for path in TREES}
+MODULES = {module_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
 def is_in(module: str, part: str) -> bool:
     return module == part or module.startswith(f"{part}.")
 
 
+@functools.cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+@functools.cache
 def imported(module: str) -> set[str]:
     """Return the modules that a module imports, also inside functions; ours without the package's name."""
     names: set[str] = set()
-    for node in ast.walk(TREES[MODULES[module]]):
+    for node in ast.walk(tree(module)):
         if isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -75,8 +81,9 @@ def imported(module: str) -> set[str]:
     return {name.removeprefix("exo_gravity.") for name in names}
 
 
-IMPORTED = {module: imported(module) for module in MODULES}
-OURS = {module: {name for name in names if name in MODULES} for module, names in IMPORTED.items()}
+def ours(module: str) -> set[str]:
+    """Return those of them that are ours."""
+    return {name for name in imported(module) if name in MODULES}
 
 
 def breaches(rule: Callable[[str], set[str]], part: str = "") -> dict[str, set[str]]:
@@ -90,13 +97,13 @@ def test_a_module_imports_only_what_its_part_may() -> None:
         parts = [part for part in MAY_IMPORT if is_in(module, part)]
         allowed = MAY_IMPORT[max(parts, key=len)] if parts else ()
         known = EXCEPTIONS.get(module, set())
-        return {name for name in OURS[module] if not any(is_in(name, part) for part in allowed)} - known
+        return {name for name in ours(module) if not any(is_in(name, part) for part in allowed)} - known
 
     assert not breaches(forbidden)
 
 
 def test_no_exception_is_left_that_no_module_needs() -> None:
-    assert not {module: names - OURS[module] for module, names in EXCEPTIONS.items() if names - OURS[module]}
+    assert not {module: names - ours(module) for module, names in EXCEPTIONS.items() if names - ours(module)}
 
 
 @pytest.mark.parametrize("part", ROOMS)
@@ -107,7 +114,7 @@ def test_no_import_leads_upward_within(part: str) -> None:
         return module.removeprefix(f"{part}.").partition(".")[0]
 
     def upward(module: str) -> set[str]:
-        inside = {room(name) for name in OURS[module] if name.startswith(f"{part}.")}
+        inside = {room(name) for name in ours(module) if name.startswith(f"{part}.")}
         return set() if module == part else inside & set(rooms[rooms.index(room(module)) + 1 :])
 
     assert not breaches(upward, part)
@@ -115,27 +122,27 @@ def test_no_import_leads_upward_within(part: str) -> None:
 
 def test_core_imports_only_numpy_and_the_standard_library_without_clock_and_processes() -> None:
     def forbidden(module: str) -> set[str]:
-        roots = {name.partition(".")[0] for name in IMPORTED[module] - OURS[module]}
+        roots = {name.partition(".")[0] for name in imported(module) - ours(module)}
         return roots - {"numpy", *sys.stdlib_module_names} | roots & {"time", "socket", "subprocess", "threading"}
 
     assert not breaches(forbidden, "core")
 
 
 def test_no_module_imports_itself_by_a_circle() -> None:
-    below = {module: names - {module} for module, names in OURS.items()}
+    below = {module: ours(module) - {module} for module in MODULES}
     while leaves := {module for module, needs in below.items() if not needs & below.keys()}:
         below = {module: needs for module, needs in below.items() if module not in leaves}
     assert not below
 
 
 def test_only_nodes_import_rclpy() -> None:
-    users = {module for module, names in IMPORTED.items() if any(is_in(name, "rclpy") for name in names)}
+    users = {module for module in MODULES if any(is_in(name, "rclpy") for name in imported(module))}
     assert not [module for module in users if not is_in(module, "nodes")]
 
 
 def test_only_tools_print() -> None:
     def prints(module: str) -> set[str]:
-        calls = (node.func for node in ast.walk(TREES[MODULES[module]]) if isinstance(node, ast.Call))
+        calls = (node.func for node in ast.walk(tree(module)) if isinstance(node, ast.Call))
         return {call.id for call in calls if isinstance(call, ast.Name)} & {"print"}
 
     assert not [module for module in breaches(prints) if not is_in(module, "tools")]
@@ -164,7 +171,8 @@ def test_the_library_has_the_names_that_others_import(module: str, names: str) -
     assert not [missing for missing in names.split() if not hasattr(library, missing)]
 
 
-@pytest.mark.parametrize("module", ["tools.trial", "tools.report", "lab.trial.analysis", "nodes.panel.node"])
-def test_what_serves_real_arms_needs_no_simulator(module: str) -> None:
-    program = f"import sys; sys.modules['mujoco'] = None; import exo_gravity.{module}"
+def test_what_serves_real_arms_needs_no_simulator() -> None:
+    modules = ("tools.trial", "tools.report", "lab.trial.analysis", "nodes.panel.node")
+    imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
+    program = f"import sys; sys.modules['mujoco'] = None; {imports}"
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)

@@ -17,11 +17,12 @@ MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
 """
 
+import copy
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJoCo's search for a display
 import mujoco
@@ -193,6 +194,16 @@ class SimulatedArm:
         self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "SimulatedArm":
+        """Return an arm in the same state, which moves on its own."""
+        other = object.__new__(type(self))
+        memo[id(self)] = other
+        vars(other).update(copy.deepcopy(vars(self), memo))
+        joints = slice(len(self._theta))
+        other._theta, other._velocity = other.data.qpos[joints], other.data.qvel[joints]
+        other._torque, other._damping = other.data.qfrc_applied, other.model.dof_damping
+        return other
 
     def carry(self, mass: float, cog: Sequence[float] = ZERO) -> None:
         """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.

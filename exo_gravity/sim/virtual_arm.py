@@ -121,15 +121,14 @@ class VirtualArm:
         sensor: what reads it.
         compensator: that of the controller.
         """
-
-        def take(delay: float) -> None:
-            self.catch_up()
-            if reading := sensor(self.now, self.device.trunk):
-                self.clock.later(delay, partial(self.tell, compensator, reading, self.now))
-
-        take(0.0)
+        self._read_trunk(sensor, compensator, 0.0)
         self.clock.run(0.0)
-        self.clock.every(period, partial(take, period))
+        self.clock.every(period, partial(self._read_trunk, sensor, compensator, period))
+
+    def _read_trunk(self, sensor: TrunkSensor, compensator: Compensator, delay: float) -> None:
+        self.catch_up()
+        if reading := sensor(self.now, self.device.trunk):
+            self.clock.later(delay, partial(self.tell, compensator, reading, self.now))
 
     def tell(self, compensator: Compensator, reading: TrunkReading, taken: float) -> None:
         """Deliver a reading of the trunk, which was taken at `taken` s, to compensator and safety machine."""

@@ -9,7 +9,6 @@ frames take turns by arbitration, and collide where two senders use one ID (`arb
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
 import random
 from collections import deque
@@ -38,7 +37,7 @@ class VirtualClock:
         self._nanoseconds = round(start * 1e9)
         self.slept = 0.0  # s, with the whole computer
         self._events: list[tuple[int, int, Callable[[], None]]] = []  # a heap: when, in which order, what
-        self._order = itertools.count()
+        self._order = 0  # of the next event
 
     def monotonic(self) -> float:
         """Return the time in s."""
@@ -54,19 +53,14 @@ class VirtualClock:
 
     def later(self, delay: float, function: Callable[[], None]) -> None:
         """Call `function` in `delay` s."""
-        heapq.heappush(self._events, (self._after(delay), next(self._order), function))
+        heapq.heappush(self._events, (self._after(delay), self._order, function))
+        self._order += 1
 
     def every(self, period: float, function: Callable[[], None]) -> Callable[[], None]:
         """Call `function` every `period` s; return a function that ends it."""
-        is_ended: list[bool] = []
-
-        def call() -> None:
-            if not is_ended:
-                function()
-                self.later(period, call)
-
-        self.later(period, call)
-        return lambda: is_ended.append(True)
+        repetition = Repetition(self, period, function)
+        self.later(period, repetition)
+        return repetition.end
 
     def stall(self, duration: float) -> None:
         """Let `duration` s pass in which nothing happens: it is all late then."""
@@ -85,6 +79,24 @@ class VirtualClock:
 
     def _after(self, duration: float) -> int:
         return self._nanoseconds + max(0, math.ceil(duration * 1e9))
+
+
+class Repetition:
+    """A function that a clock calls every `period` s, until it is ended."""
+
+    def __init__(self, clock: VirtualClock, period: float, function: Callable[[], None]) -> None:
+        self._clock, self._period, self._function = clock, period, function
+        self._is_ended = False
+
+    def __call__(self) -> None:
+        """Call the function, and plan the next call."""
+        if not self._is_ended:
+            self._function()
+            self._clock.later(self._period, self)
+
+    def end(self) -> None:
+        """Call it no more."""
+        self._is_ended = True
 
 
 class End(Protocol):

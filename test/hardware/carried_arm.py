@@ -88,6 +88,12 @@ class CarriedArm(DirectController, VirtualArm):
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self.truth = self.device.truth = TruthRecords()
 
+    def see_out(self) -> None:
+        """Run after an event until the arm is down, for 12 s at most; one that is carried 4 s later is carried on."""
+        self.run(4.0)
+        if self.safety.state is not State.ACTIVE:
+            self.run_until(lambda: self.loop.is_off, 8.0)
+
     @property
     def caused(self) -> Driven:
         """What the motors caused."""

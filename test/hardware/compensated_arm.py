@@ -22,6 +22,7 @@ from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
+from ..support.copies import prepared
 from ..support.simulated_device import joints_of, make_device
 
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
@@ -110,3 +111,6 @@ class CompensatedArm(DirectController, VirtualArm):
         """Change the compensator's settings live."""
         self.settings = replace(self.settings, **settings)
         self.compensator.apply(self.settings)
+
+
+compensated_arm = prepared(CompensatedArm)

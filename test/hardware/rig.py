@@ -27,6 +27,7 @@ from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.virtual_arm import VirtualArm
 from exo_gravity.sim.virtual_time import Wire
 
+from ..support.copies import prepared
 from ..support.simulated_device import drive_of, joints_of, make_device
 
 MOTORS_OF_ARM = joints_of((MIT,) * 4)
@@ -184,17 +185,23 @@ class CarriedArm:
         self._arm = arm = self.rig.loop_with(
             self.controller,
             replace(self.rig.arm.limits, sign_check_torque=0.0),
-            note=self.drives.append,
+            note=self._note,
             **options,
         )
         self.clock, self.wire, self.bus, self.safety, self.loop = arm.clock, arm.wire, arm.bus, arm.safety, arm.loop
         self.run = arm.run
-        self.controller.is_carried = lambda: self.safety.state in (State.RAMPING_IN, State.ACTIVE)
+        self.controller.is_carried = self._is_carried
         arm.enable()
         self.run_until(lambda: self.safety.fault or (self.rig.is_raised and self.safety.state is State.ACTIVE))
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self.controller.is_raised = True
         self.rig.top_speed = 0.0
+
+    def _note(self, drive: Drive) -> None:
+        self.drives.append(drive)
+
+    def _is_carried(self) -> bool:
+        return self.safety.state in (State.RAMPING_IN, State.ACTIVE)
 
     def run_until(self, condition: Callable[[], object], timeout: float = 60.0) -> None:
         """Run the loop until `condition()` holds."""
@@ -203,3 +210,6 @@ class CarriedArm:
     def assert_let_down(self) -> None:
         self.run_until(lambda: self.loop.is_off)
         self.rig.assert_let_down()
+
+
+raised_arm = prepared(CarriedArm)

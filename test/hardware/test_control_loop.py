@@ -15,7 +15,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop, NoController
 
 from ..support.simulated_device import frame
-from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig
+from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig, raised_arm
 from .wires import Responder
 
 OPPOSED_SPEED = 0.5  # rad/s, of 6 unopposed
@@ -26,7 +26,7 @@ def fail(*_: object) -> None:
 
 
 def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
-    arm = CarriedArm()
+    arm = raised_arm()
     assert arm.loop.stop()
     arm.rig.assert_let_down()
     assert not arm.drives[-1].powered
@@ -34,7 +34,7 @@ def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
 
 
 def test_an_arm_is_let_down_after_its_computer_was_suspended():
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.clock.slept += 0.9  # less may be a thread that was not run
     arm.run(0.1)
     assert arm.safety.state is State.ACTIVE
@@ -46,7 +46,7 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
 
 @pytest.mark.parametrize("error", [ValueError("garbled line"), OSError("no device")])
 def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.wire.break_down(error)
     arm.run_until(lambda: arm.wire.opened == 2)
     assert arm.safety.fault.code == "bus_error"
@@ -55,7 +55,7 @@ def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_agai
 
 
 def test_a_bus_that_stays_away_is_tried_again_and_the_torque_continues_from_what_the_motors_hold():
-    arm = CarriedArm()
+    arm = raised_arm()
     held = arm.drives[-1].effort[1]
     arm.wire.refusal = BusError("no such device")
     arm.wire.break_down(OSError("no such device"))
@@ -74,7 +74,7 @@ def test_a_bus_that_stays_away_is_tried_again_and_the_torque_continues_from_what
 
 
 def test_a_controller_that_fails_at_samples_never_stops_the_control():
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.controller.failures["take"] = ZeroDivisionError("division by zero")
     before = arm.loop.cycles
     arm.run(0.2)
@@ -84,7 +84,7 @@ def test_a_controller_that_fails_at_samples_never_stops_the_control():
 
 
 def test_failing_efforts_let_the_arm_down():
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.controller.failures["efforts"] = RuntimeError("no middleware")
     arm.run(2 * CYCLE)
     assert arm.safety.fault.code == "internal_error"
@@ -95,7 +95,7 @@ def test_failing_efforts_let_the_arm_down():
 
 def test_an_arm_whose_owner_stands_still_is_let_down():
     """Services, the lease and the look at the watchdog are the owner's: without it no one could let the arm down."""
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.loop.attended = arm.clock.monotonic()
     arm.run(0.9 * LONGEST_ABSENCE)
     arm.loop.attended = arm.clock.monotonic()
@@ -107,7 +107,7 @@ def test_an_arm_whose_owner_stands_still_is_let_down():
 
 
 def test_an_owner_that_waits_until_its_arm_is_down_causes_no_fault():
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.loop.attended = arm.clock.monotonic()
     arm.safety.disable(arm.clock.monotonic())
     arm.assert_let_down()
@@ -142,7 +142,7 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
 
 
 def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down():
-    arm = CarriedArm()
+    arm = raised_arm()
     arm.safety.step = fail
     while arm.loop.cycle():
         pass
@@ -202,7 +202,7 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     ids=["EXIT at 10 Hz", "6 Nm at 500 Hz, echoed"],
 )
 def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: bytes, period: float, echoes: bool):
-    arm = CarriedArm(echoes)
+    arm = raised_arm(echoes)
     assert arm.bus.foreign_commands == 0
     arm.wire.repeat(frame(2, data), period)
     arm.run_until(lambda: arm.safety.fault)
@@ -215,7 +215,7 @@ def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: byte
 
 @pytest.mark.parametrize("echoes", [False, True])
 def test_our_own_frames_are_never_foreign(echoes: bool):
-    arm = CarriedArm(echoes)
+    arm = raised_arm(echoes)
     arm.run(1.0)
     assert arm.bus.foreign_commands == 0
     assert arm.safety.state is State.ACTIVE

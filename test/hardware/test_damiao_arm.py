@@ -34,6 +34,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 
+from ..support.copies import prepared
 from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm, stall
 
 NAMES = ("DM-J4340", "DM-J8009", "DM-J4340", "DM-J4310")
@@ -51,6 +52,15 @@ def joint_of(name: str, can_id: int) -> JointMotor:
 def arm_of(names: tuple[str, ...] = NAMES, **options: float) -> CarriedArm:
     joints = [joint_of(name, 1 + i) for i, name in enumerate(names)]
     return CarriedArm(joints, [simulated(joint) for joint in joints], PEAK, **options)
+
+
+@prepared
+def raised_arm() -> CarriedArm:
+    """Return an arm that the wearer has raised to `POSE` and left to the motors."""
+    arm = arm_of()
+    arm.carry()
+    arm.raise_to(POSE)
+    return arm
 
 
 def damiao_of(arm: CarriedArm, joint: int) -> DamiaoMotor:
@@ -104,11 +114,9 @@ EVENTS_HERE = {**EVENTS, "loop stalls for 300 ms": stall(0.3)}
 
 @pytest.mark.parametrize("event", EVENTS_HERE)
 def test_whatever_the_firmware_drops_the_motors_drive_no_joint(event: str) -> None:
-    arm = arm_of()
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm()
     EVENTS_HERE[event](arm)
-    arm.run_until(lambda: arm.loop.is_off, 12.0)
+    arm.see_out()
     caused = arm.caused
     speed, energy = (DRIVEN, ENERGY) if "stalls" in event else UNKNOWN_LOSS
     assert caused.speed < speed and caused.energy < energy, caused
@@ -118,9 +126,7 @@ def test_whatever_the_firmware_drops_the_motors_drive_no_joint(event: str) -> No
 
 
 def test_motors_that_let_go_in_a_stall_are_switched_on_again_and_lower_the_arm() -> None:
-    arm = arm_of()
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm()
     arm.clock.stall(0.3)
     assert arm.run_until(lambda: arm.device.motors[0].dips and arm.safety.fault, 0.1)
     assert arm.run_until(lambda: all(motor.entered for motor in arm.device.motors), 0.05)
@@ -129,9 +135,7 @@ def test_motors_that_let_go_in_a_stall_are_switched_on_again_and_lower_the_arm()
 
 
 def test_a_motor_that_lets_go_says_so_where_its_torque_is_too_small_to_tell() -> None:
-    arm = arm_of()
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm()
     assert abs(arm.device.motors[0].torque(arm.device.arm.positions[0], 0.0)) < 0.2  # Nm
     damiao_of(arm, 0).write(TIMEOUT, 20)  # 1 ms, shorter than a cycle
     assert arm.run_until(lambda: arm.safety.fault, 0.05)
@@ -177,9 +181,7 @@ FOREIGN = {
 
 @pytest.mark.parametrize("command", FOREIGN)
 def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> None:
-    arm = arm_of()
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm()
     FOREIGN[command](arm)
     arm.run_until(lambda: arm.loop.is_off, 30.0)
     assert arm.safety.fault and arm.safety.fault.code is FaultCode.FOREIGN_COMMAND
@@ -217,9 +219,7 @@ def test_a_motor_that_is_set_otherwise_after_it_was_asked_is_found_out_before_th
 
 
 def test_a_motor_with_an_error_is_never_switched_on_again() -> None:
-    arm = arm_of()
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm()
     arm.device.motors[1].error = 0xA
     arm.run(10.0)
     fault = arm.safety.fault

@@ -7,7 +7,7 @@ import pytest
 from exo_gravity.core.safety.drive import FaultCode, State
 
 from ..support.active_wearer import attach, lift, reach, shake, throw
-from .rig import POSE, CarriedArm
+from .rig import POSE, raised_arm
 
 MOVED = 0.6  # rad/s that the motors may cause,
 # and ms that they may exceed it: when a fast hand lets go, damping is still bounded by its speed for a cycle or two.
@@ -24,7 +24,7 @@ WEARERS = {
 
 @pytest.mark.parametrize("wearer", WEARERS.values(), ids=WEARERS)
 def test_an_arm_that_is_let_down_neither_fights_nor_throws_its_wearer(wearer):
-    carried = CarriedArm()
+    carried = raised_arm()
     arm, motors, behave = carried.rig.device.arm, carried.rig.device.motors, wearer()
     seen = []  # whether a hand was on the arm, its velocities, and the motors' torques
 
@@ -48,7 +48,7 @@ def test_an_arm_that_is_let_down_neither_fights_nor_throws_its_wearer(wearer):
 
 
 def test_the_arm_comes_down_after_the_wearer_let_go():
-    carried = CarriedArm()
+    carried = raised_arm()
     carried.safety.trip(FaultCode.COMMAND_STALE, "for this test", carried.clock.monotonic())
     attach(carried.rig.device, lift(1, 0.5, 1.0), 0.1)
     carried.run_until(lambda: carried.loop.is_off)

@@ -14,6 +14,7 @@ from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 
+from ..support.copies import prepared
 from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
@@ -38,6 +39,15 @@ class FirmwareArm(CarriedArm):
         super().__init__(joints, [SimulatedMotor(joint, usual) for joint in joints], PEAK, remembered, bitrate)
 
 
+@prepared
+def raised_arm(name: str) -> FirmwareArm:
+    """Return an arm that the wearer has raised to `POSE` and left to motors with the firmware of this name."""
+    arm = FirmwareArm(FIRMWARES[name])
+    arm.carry()
+    arm.raise_to(POSE)
+    return arm
+
+
 @FIRMWARE
 def test_an_arm_is_switched_on_and_off_without_a_collision(name: str) -> None:
     arm = FirmwareArm(FIRMWARES[name], bitrate=1_000_000)
@@ -53,9 +63,7 @@ def test_an_arm_is_switched_on_and_off_without_a_collision(name: str) -> None:
 
 @FIRMWARE
 def test_an_arm_is_held_and_let_down(name: str) -> None:
-    arm = FirmwareArm(FIRMWARES[name])
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm(name)
     arm.run(3.0)
     assert arm.caused.speed < 0.05
     arm.safety.disable(arm.now)
@@ -86,11 +94,9 @@ OTHERS = [(name, event) for name in FIRMWARES if name != "v3_query" for event in
 )
 def test_whatever_the_firmware_drops_the_motors_drive_no_joint(name: str, event: str) -> None:
     """A motor that has lost its torque lets its joint fall; what counts is what motors drive, then and afterwards."""
-    arm = FirmwareArm(FIRMWARES[name])
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm(name)
     EVENTS[event](arm)
-    arm.run_until(lambda: arm.loop.is_off, 12.0)
+    arm.see_out()
     caused = arm.caused
     speed, energy = (DRIVEN, ENERGY) if "stalls" in event else UNKNOWN_LOSS
     assert caused.speed < speed and caused.energy < energy, caused
@@ -109,9 +115,7 @@ def test_a_board_in_query_reply_mode_is_not_started_and_the_reason_is_told() -> 
 
 
 def test_a_motor_with_an_encoder_error_is_never_switched_on_again() -> None:
-    arm = FirmwareArm(FIRMWARES["ak"])
-    arm.carry()
-    arm.raise_to(POSE)
+    arm = raised_arm("ak")
     arm.device.motors[1].error = 5
     arm.run(10.0)
     assert arm.safety.fault and arm.safety.fault.code is FaultCode.MOTOR_ERROR

@@ -13,9 +13,11 @@ from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
 
-from .compensated_arm import PEAK, POSE, CompensatedArm
+from ..support.copies import prepared
+from .compensated_arm import PEAK, POSE, CompensatedArm, compensated_arm
 from .test_guided_changes import CLAMPED, HALVED, ONE_G, RAISED, SAFE_SPEED
 
 HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
@@ -64,13 +66,30 @@ def test_an_empty_cuff_that_is_carried_again_rises_slowly():
     assert arm.driven < SAFE_SPEED
 
 
+class Imu:
+    """An IMU that reads what it is told to."""
+
+    def __init__(self) -> None:
+        self.reading = UPRIGHT
+
+    def __call__(self, now: float, state: TrunkState) -> TrunkReading:
+        return self.reading
+
+
+@prepared
+def put_down_with_imu() -> tuple[CompensatedArm, Imu]:
+    """Return an arm that was carried and let down, and its IMU."""
+    imu = Imu()
+    arm = CompensatedArm(pose=HANGING, limit=PEAK, has_wearer=False, imu=imu, mode="one_g")
+    put_down(arm)
+    return arm, imu
+
+
 @pytest.mark.parametrize("roll", [-30.0, 30.0])
 def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
-    read = [UPRIGHT]
-    arm = CompensatedArm(pose=HANGING, limit=PEAK, has_wearer=False, imu=lambda now, state: read[0], mode="one_g")
-    put_down(arm)
+    arm, imu = put_down_with_imu()
     for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
-        read[0] = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
+        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
         arm.run(0.05)
     carry_again(arm)
     arm.run(6.0)
@@ -83,7 +102,7 @@ def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll)
     ids=["mode", "gain, mode and max_effort"],
 )
 def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(changes):
-    arm = CompensatedArm(pose=RAISED, limit=PEAK, has_wearer=False, mode="one_g")
+    arm = compensated_arm(pose=RAISED, limit=PEAK, has_wearer=False, mode="one_g")
     for change in changes:
         arm.change(**change)
         arm.run(0.3)
@@ -91,9 +110,10 @@ def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(change
     assert arm.driven < SAFE_SPEED
 
 
+@prepared
 def loaded(mass: float, pose: Sequence[float]) -> CompensatedArm:
     """Return a carried arm in `pose` with a load in its hand."""
-    arm = CompensatedArm(pose=pose, limit=PEAK)
+    arm = compensated_arm(pose=pose, limit=PEAK)
     arm.person.hand = Holding(pose)
     arm.device.arm.carry(mass)
     arm.change(payload_mass=mass)

@@ -10,7 +10,7 @@ import pytest
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.hardware.can.request_age import AGE, Requests
 
-from .compensated_arm import CYCLE, CompensatedArm
+from .compensated_arm import CYCLE, compensated_arm
 
 SPEED = 0.6  # rad/s
 
@@ -104,7 +104,7 @@ def test_a_motor_that_does_not_reply_is_still_asked_in_every_cycle_and_replies_t
 
 
 def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_matters():
-    arm = CompensatedArm()
+    arm = compensated_arm()
     begin, carry = arm.now, arm.wire.carry
 
     def queue(sender, message, *sent):
@@ -124,20 +124,20 @@ def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_ma
 
 
 def test_an_arm_whose_frames_are_lost_now_and_then_is_carried_on():
-    arm = CompensatedArm()
+    arm = compensated_arm()
     arm.wire.loss, arm.wire.batch = 0.03, 0.001
-    arm.run(20.0)
+    arm.run(8.0)
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     assert arm.top_speed < 0.05
 
 
 def test_a_reading_is_as_old_as_the_command_that_it_answers():
-    arm = CompensatedArm()
+    arm = compensated_arm()
     assert arm.run_until(lambda: all(arm.now - sample.time >= 0.0002 for sample in arm.bus.samples), 0.1)
 
 
 def test_a_send_that_fails_once_is_a_lost_frame_and_a_bus_that_fails_for_longer_a_fault():
-    arm = CompensatedArm()
+    arm = compensated_arm()
     end = arm.bus._ports[0]._bus
     send, failing = end.send, []
 

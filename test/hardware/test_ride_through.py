@@ -13,6 +13,7 @@ from exo_gravity.sim import VirtualWearer
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript
 
+from ..support.copies import prepared
 from .compensated_arm import CYCLE, WEARER, CompensatedArm
 
 RAISED, ZERO_G = (0.0, 1.3, 0.0, 0.3), (0.3, 0.45, 0.10, 0.4)  # rad
@@ -71,6 +72,9 @@ class RidingArm(CompensatedArm):
         return float(np.abs(self.torques - gravity_torque(self.links, np.array(self.positions))).max())
 
 
+riding_arm = prepared(RidingArm)
+
+
 def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down():
     arm = RidingArm(pose=ZERO_G, wearer=True)
     arm.gap(0.15)
@@ -82,7 +86,7 @@ def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down
 
 
 def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
-    arm = RidingArm()
+    arm = riding_arm()
     position = arm.device.arm.positions
     arm.move(np.add(position, (0.0, -0.5, 0.0, 0.5)).tolist(), 1.25)
     arm.run(0.45)
@@ -95,7 +99,7 @@ def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
 
 
 def test_efforts_of_a_late_tilt_are_damped_at_once_and_withdrawn_ones_let_the_arm_down_at_once():
-    arm = RidingArm()
+    arm = riding_arm()
     arm.is_held = True
     arm.run(2 * CYCLE)
     assert arm.safety.state is State.ACTIVE
@@ -110,7 +114,7 @@ def test_efforts_of_a_late_tilt_are_damped_at_once_and_withdrawn_ones_let_the_ar
 
 
 def test_a_bus_that_is_silent_for_a_moment_lets_the_arm_down_and_one_press_carries_it_on():
-    arm = RidingArm()
+    arm = riding_arm()
     arm.device.bus_silent = True
     arm.run(0.08)
     arm.device.bus_silent = False
@@ -125,7 +129,7 @@ def test_a_bus_that_is_silent_for_a_moment_lets_the_arm_down_and_one_press_carri
 
 
 def test_a_loop_that_stood_still_for_longer_than_the_time_out_carries_on():
-    arm = RidingArm()
+    arm = riding_arm()
     for _ in range(4):
         arm.clock.stall(0.06)
         arm.run(0.3)

@@ -13,7 +13,7 @@ from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import Drive, State
 
-from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig
+from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig, raised_arm
 
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
 CAUSED_SPEED = 0.6  # rad/s that motors may cause
@@ -43,7 +43,7 @@ def carried_again(arm: CarriedArm) -> None:
 def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     wire_format: WireFormat, duration: float, clears: bool
 ) -> None:
-    arm = CarriedArm(wire_format=wire_format)
+    arm = raised_arm(wire_format=wire_format)
     arm.rig.switch_supply(False)
     arm.run(duration)
     assert arm.safety.fault.code == "motor_silent"
@@ -67,7 +67,7 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
 @pytest.mark.parametrize(("first", "others"), [(3.0, 9.0), (7.4, 7.6)])
 def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat, first: float, others: float) -> None:
     """The way down is over before the last motor returns: that must not decide what the first one applies."""
-    arm = CarriedArm(wire_format=wire_format)
+    arm = raised_arm(wire_format=wire_format)
     arm.rig.switch_supply(False)
     arm.run(0.5)
     watch = OnWatch(arm.rig)
@@ -80,7 +80,7 @@ def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat
 
 @FORMATS
 def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_power(wire_format: WireFormat) -> None:
-    arm = CarriedArm(wire_format=wire_format)
+    arm = raised_arm(wire_format=wire_format)
     arm.rig.device.bus_silent = True
     arm.run(16.0)
     assert arm.safety.state is State.FAULT and arm.safety.is_unreached
@@ -94,7 +94,7 @@ def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_powe
 
 
 def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others() -> None:
-    arm = CarriedArm()
+    arm = raised_arm()
     motor = arm.rig.device.motors[2]
     motor.unplugged = True
     arm.run(0.1)
@@ -111,7 +111,7 @@ def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
     wire_format: WireFormat, away: float
 ) -> None:
     """A command switches a V3 board on: while it does not reply, none is sent that would carry its joint."""
-    arm = CarriedArm(wire_format=wire_format)
+    arm = raised_arm(wire_format=wire_format)
     motor, device_arm = arm.rig.device.motors[1], arm.rig.device.arm
     motor.unplugged = True
     arm.run(away)
@@ -142,7 +142,7 @@ def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFo
 
 
 def test_the_last_resort_leaves_motors_off_whose_supply_returns() -> None:
-    arm = CarriedArm()
+    arm = raised_arm()
 
     def fail(*_: object) -> Drive:
         raise ZeroDivisionError

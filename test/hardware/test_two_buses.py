@@ -29,7 +29,7 @@ from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down
 from exo_gravity.sim.virtual_time import TICK, Played, VirtualBus, Wire
 
 from ..support.simulated_device import drive_of
-from .rig import CYCLE, LIMITS, SAFE_SPEED, ArmOnWires, CarriedArm, VirtualRig
+from .rig import CYCLE, LIMITS, SAFE_SPEED, ArmOnWires, CarriedArm, VirtualRig, raised_arm
 from .test_watchdog_decisions import LET_DOWN
 from .wires import Responder
 
@@ -80,7 +80,7 @@ class TwoBusRig(VirtualRig):
 
 
 def carried(wire_format: WireFormat = MIT) -> CarriedArm:
-    return CarriedArm(wire_format=wire_format, kind=TwoBusRig)
+    return raised_arm(wire_format=wire_format, kind=TwoBusRig)
 
 
 def halves(arm: CarriedArm) -> TwoBusRig:

@@ -30,7 +30,7 @@ from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, B
 from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 
-from ..hardware.rig import CarriedArm
+from ..hardware.rig import raised_arm
 from ..support.keys import broken
 from ..support.waiting import wait_until
 
@@ -292,7 +292,7 @@ def test_the_bridge_knows_efforts_of_a_late_tilt(node, exchange, held):
 @pytest.fixture
 def operated(node):
     """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
-    arm = CarriedArm()
+    arm = raised_arm()
     operator = Operator(node, lambda: arm.loop, arm.clock)
 
     def run(seconds, holding=""):

@@ -22,7 +22,7 @@ from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.compensator.node import CompensatorNode
 
-from ..hardware.rig import LIMITS, CarriedArm
+from ..hardware.rig import LIMITS, raised_arm
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU
 from ..support.waiting import wait_until
@@ -100,7 +100,7 @@ def test_an_arm_whose_compensator_has_failed_is_let_down_as_one_whose_compensato
         return JointState(header=message.header, name=message.name, effort=torque[-1])
 
     exchange = EffortExchange(node, LIMITS, lambda: arm and arm.loop, answer)
-    arm = CarriedArm()
+    arm = raised_arm()
     torque.append(arm.rig.carrying)
     exchange.take(arm.clock.monotonic(), arm.loop.samples)
     arm.loop.controller = exchange

@@ -88,10 +88,11 @@ def nodes(prepare, tmp_path):
     print("\n".join(nodes.log))
 
 
-def test_no_request_to_a_standard_service_ends_a_node_or_lets_the_arm_down(nodes, probe: RosProbe):
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 6), marks=pytest.mark.thorough)], ids=str)
+def test_no_request_to_a_standard_service_ends_a_node_or_lets_the_arm_down(nodes, probe: RosProbe, seeds: range):
     probe.get_carried()
     probe.states.clear()
-    for seed in range(5):
+    for seed in seeds:
         for node in NODES:
             for kind, name, request in requests(seed):
                 for _ in range(2):

@@ -127,7 +127,8 @@ class SimulatedMotor:
     @property
     def damping(self) -> float:
         """Damping in Nm s/rad that the motor applies to the joint."""
-        return self._command.kd * self._scale * self.strength if self.entered else 0.0
+        kd = self._command.kd if self.entered else 0.0
+        return kd * self._scale * self.strength if kd else 0.0
 
     @property
     def _scale(self) -> float:
@@ -266,7 +267,7 @@ class SimulatedMotor:
         The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale` and `strength`, clamped to the peak
         torque.
         """
-        if self.unplugged:
+        if self._is_unplugged:
             self._forget()  # also what another thread was just changing when the power went
         if not self.entered:
             return 0.0
