@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.sim.judge import RATED_TORQUE, RESOLUTION
+from exo_gravity.sim.judge import USUAL, resolution
 
 from .actions import Steps, compensator, in_turn, pause, send_signal, wearer
 from .fault_case import PROCESS_REACTION, FaultCase
@@ -45,7 +45,7 @@ REACH: Steps = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], l
 def within_max_effort(records: np.ndarray) -> str:
     """Return which joint was held with more than the rated torque, by default `max_effort`, damping apart; or ''."""
     effort = np.abs(records["torque"] + records["damping"] * records["velocity"]).max(axis=0)
-    beyond = np.flatnonzero(effort > np.array(RATED_TORQUE) + RESOLUTION)
+    beyond = np.flatnonzero(effort > np.array([motor.rated_torque for motor in USUAL]) + resolution())
     return ", ".join(f"motor {joint + 1} holds with {effort[joint]:.1f} Nm" for joint in beyond)
 
 
