@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The arms that come with the package, as studies play them in virtual time: the files of config, and what a wearer does.
+"""The arms that come with the package, as studies play them in virtual time: their files, and what a wearer does.
 
 The simulated arm is the one that the compensator assumes. Its friction is the study's, and its motors are of the
 study's kind.
@@ -13,6 +13,7 @@ from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
 from exo_gravity.core.arm.wearer import LinkLoad, Wearer
+from exo_gravity.core.motors.ak import FAMILY
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits, limits_of
 from exo_gravity.lab.inputs.arms import CarriedArm, carried_arm, node_values
@@ -67,6 +68,11 @@ class PlayedArm:
     def motors(self) -> tuple[JointMotor, ...]:
         """Its motors."""
         return self.carried.motors
+
+    @property
+    def is_ak(self) -> bool:
+        """Whether its motors are AK motors, which come with boards of several formats."""
+        return all(motor.spec.family == FAMILY for motor in self.motors)
 
     @property
     def has_imu(self) -> bool:

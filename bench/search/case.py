@@ -129,7 +129,10 @@ def one_of(**choices: tuple[Any, ...]) -> Draw:
 
 def reach(random: random.Random, arm: PlayedArm) -> Values:
     """Draw a pose (n,) rad and the time to reach it in s."""
-    return {"pose": list(pose(random, arm.farthest, arm.nearest(arm.farthest))), "duration": round(random.uniform(1.0, 2.0), 2)}
+    return {
+        "pose": list(pose(random, arm.farthest, arm.nearest(arm.farthest))),
+        "duration": round(random.uniform(1.0, 2.0), 2),
+    }
 
 
 def pose(random: random.Random, farthest: Pose, least: Pose) -> Pose:

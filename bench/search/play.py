@@ -77,4 +77,5 @@ def _play(stage: Stage, case: Case) -> float:
     stage.run(DESCENT, lambda: stage.safety.state in off and not stage.device.powered)
     stage.run(1.0)
     stage.arm.catch_up()
+    stage.arm.check_controller()
     return begin

@@ -137,7 +137,7 @@ class Stage:
             limits = replace(limits, sign_check_torque=0.0)
         self.wire = LossyWire([motor.can_id for motor in configured.motors])
         self.clock = self.wire.clock
-        self.compensator = Compensator(self.settings)
+        self.compensator = Compensator(self.settings, configured.limits.joint_names)
         self.controller = FailingController(DirectController(self.compensator, limits), self.clock)
         self.arm = VirtualArm(self.device, self.controller, configured.motors, limits, case.rate, self.wire)
         self.safety = self.arm.safety
