@@ -13,7 +13,7 @@ from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeVar
 
 from exo_gravity.core.arm.wearer import LinkLoad, Wearer
-from exo_gravity.core.motors.ak import FAMILY
+from exo_gravity.core.motors.ak import V3_RANGES
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits, limits_of
 from exo_gravity.lab.inputs.arms import CarriedArm, carried_arm, node_values
@@ -70,9 +70,9 @@ class PlayedArm:
         return self.carried.motors
 
     @property
-    def is_ak(self) -> bool:
-        """Whether its motors are AK motors, which come with boards of several formats."""
-        return all(motor.spec.family == FAMILY for motor in self.motors)
+    def has_v3(self) -> bool:
+        """Whether its motors also come with V3 boards."""
+        return all(motor.spec.name in V3_RANGES for motor in self.motors)
 
     @property
     def has_imu(self) -> bool:

@@ -19,7 +19,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.hardware.control_loop import Controller
@@ -133,7 +133,7 @@ class OrdinaryArm:
     ) -> None:
         self.result = Result()
         settings = replace(arm.carried.settings, tilt_timeout=TILT_TIMEOUT)
-        motors = on_boards(arm.motors, MIT_V3 if is_v3 else MIT) if arm.is_ak else arm.motors
+        motors = on_boards(arm.motors, MIT_V3) if is_v3 else arm.motors
         boards = [motor_of(joint, equipment.electronics) for joint in motors]
         self.device = SimulatedDevice(arm.device_arm(equipment.friction), boards)
         self._side, self._robot, self._day = settings.side, settings.loaded, day_of(arm)

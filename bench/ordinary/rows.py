@@ -53,7 +53,7 @@ class Row:
     def name(self) -> str:
         """What is played."""
         arm = "" if self.arm == PAPER else f"{self.arm}, "
-        board = f"{'V3' if self.is_v3 else 'V1/V2'}, " if ARMS[self.arm].is_ak else ""
+        board = f"{'V3' if self.is_v3 else 'V1/V2'}, " if ARMS[self.arm].has_v3 else ""
         imu = f"; IMU: {self.driver}" if self.driver else ""
         return f"{arm}{self.equipment.name}; {board}{self.rate:g} Hz{imu}"
 
@@ -72,6 +72,6 @@ def all_rows() -> list[Row]:
         rows.append(Row(PAPER, EQUIPMENT[number % 4], is_v3, rate, driver))
     for number, arm in enumerate(OTHERS):
         for turn, equipment in enumerate(EQUIPMENT):
-            is_v3 = ARMS[arm].is_ak and turn % 2 == 1
+            is_v3 = ARMS[arm].has_v3 and turn % 2 == 1
             rows.append(Row(arm, equipment, is_v3, (V3_RATES if is_v3 else RATES)[(number + turn) % 3], ""))
     return rows
