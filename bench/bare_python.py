@@ -12,7 +12,6 @@ import signal
 import sys
 import time
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.power import SwitchingOn
@@ -35,9 +34,9 @@ def main() -> None:
     def cycle() -> None:
         now = time.monotonic()
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        effort = arm.law([joint.position for joint in bus.samples]) if all_replied else NO_TORQUE
+        effort = arm.law([joint.position for joint in bus.samples]) if all_replied else arm.no_torque
         send = switching.step() if all_replied else (Send.POLL,) * len(bus.replies)
-        bus.exchange(Drive(effort, NO_TORQUE, send, all_replied), now + REPLY_SHARE * period)
+        bus.exchange(Drive(effort, arm.no_torque, send, all_replied), now + REPLY_SHARE * period)
 
     try:
         run_paced(period, cycle, stopping)

@@ -22,7 +22,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.power import SwitchingOn
@@ -36,7 +35,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool]) -> threading.Thread:
     """Return the thread that commands the motors and publishes what they reply."""
-    bus, newest = arm.open(), {"effort": NO_TORQUE}
+    bus, newest = arm.open(), {"effort": arm.no_torque}
     switching = SwitchingOn(bus.replies)
 
     def on_effort_commands(message: JointState) -> None:
@@ -49,7 +48,7 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
         all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
         drive = Drive(
             newest["effort"],
-            NO_TORQUE,
+            arm.no_torque,
             switching.step() if all_replied else (Send.POLL,) * len(bus.replies),
             all_replied,
         )

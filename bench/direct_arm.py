@@ -20,7 +20,8 @@ from exo_gravity.lab.inputs.parameter_file import can_options, load
 class DirectArm:
     """The arm in the namespace `namespace` (e.g. /right), with the parameters of its `can_bridge` and `compensator`.
 
-    joint_names: from shoulder to elbow. motors: in the same order. interface, channel, options: of the CAN bus.
+    joint_names: from base to hand. motors: in the same order. no_torque: (n,) Nm. interface, channel,
+    options: of the CAN bus.
     """
 
     def __init__(self, params: str | Path, namespace: str) -> None:
@@ -28,6 +29,7 @@ class DirectArm:
         arm = carried_arm(nodes, namespace)
         self.joint_names = arm.limits.joint_names
         self.motors = arm.motors
+        self.no_torque = (0.0,) * len(arm.motors)
         self.interface, self.channel = str(arm.can_bridge["can.interface"]), str(arm.can_bridge["can.channel"])
         self.options = can_options(nodes[f"{namespace}/can_bridge"])
         address = self.interface, self.channel, self.options

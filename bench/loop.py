@@ -3,7 +3,7 @@
 
 The kinds of loop: the package's nodes, the same nodes with SCHED_FIFO threads, can_bridge and compensator of an arm in
 one process, one Python process without ROS, and bare rclpy. All run on the same simulated device, which a virtual
-wearer moves to and fro, with the same law and rate.
+wearer moves to and fro, with the same law and rate. The arms are those of a file in config.
 """
 
 from __future__ import annotations
@@ -28,7 +28,13 @@ from .direct_arm import DirectArm
 from .node_log import NodeLog
 from .timing import LoopTiming, analyse, split_cycles
 
-POSES = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]  # rad; on the way between them the torque changes every cycle
+ONE_ARM, BOTH_ARMS, SEVEN_JOINTS = "sim.yaml", "sim_both.yaml", "seven_joints.yaml"
+PAPERS = [0.5, 1.0, 0.9, 1.0], [-0.3, 0.4, 0.2, 0.3]
+POSES = {  # rad; on the way between them the torque changes every cycle
+    ONE_ARM: PAPERS,
+    BOTH_ARMS: PAPERS,
+    SEVEN_JOINTS: ([0.7, 0.9, 0.5, 1.0, 0.6, 0.4, 0.4], [0.2, 0.3, -0.3, 0.3, -0.5, -0.3, -0.3]),
+}
 MOVE = 2.0  # s from one pose to the other: slow enough that the safety machine adds no damping
 START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
@@ -64,16 +70,17 @@ class LoopRun:
         return self.stolen > QUIET or self.others > QUIET_OTHERS
 
 
-def run_loop(kind: str, rate: float, both_arms: bool, seconds: float, watch: Watch | None = None) -> LoopRun:
+def run_loop(kind: str, rate: float, file: str, seconds: float, watch: Watch | None = None) -> LoopRun:
     """Run one `kind` of loop: 'nodes', 'fifo', 'one process', 'python' or 'rclpy'.
 
+    file: of the arms, one of POSES.
     watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
     that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
     """
     with tempfile.TemporaryDirectory() as folder_name, pinned(), contextlib.ExitStack() as stack:
         folder = Path(folder_name)
-        params, simulators = write_parameters(folder, rate, both_arms, seconds, THREAD_PRIORITY.get(kind, 0))
-        namespaces = ["/right", "/left"] if both_arms else ["/right"]
+        params, simulators = write_parameters(folder, rate, file, seconds, THREAD_PRIORITY.get(kind, 0))
+        namespaces = [node.removesuffix("/simulator") for node in load(simulators)]
         arms = [DirectArm(params, namespace) for namespace in namespaces]
         recordings = [folder / f"{namespace.strip('/')}.npz" for namespace in namespaces]
         listeners = [
@@ -112,14 +119,12 @@ def _timings(arm: DirectArm, recording: Path, times: Windows, rate: float) -> li
     return [analyse(part, arm.motors, arm.law, 1.0 / rate) for part in cycles]
 
 
-def write_parameters(
-    folder: Path, rate: float, both_arms: bool, seconds: float, thread_priority: int
-) -> tuple[Path, Path]:
+def write_parameters(folder: Path, rate: float, file: str, seconds: float, thread_priority: int) -> tuple[Path, Path]:
     """Write a parameter file of all nodes, and one of the simulators alone; return their paths."""
     script = folder / "to_and_fro.yaml"
-    steps = [{"move": pose, "over": MOVE} for pose in POSES] * int((seconds + 5.0) / (2 * MOVE) + 1)
+    steps = [{"move": pose, "over": MOVE} for pose in POSES[file]] * int((seconds + 5.0) / (2 * MOVE) + 1)
     script.write_text(yaml.safe_dump({"name": "to_and_fro", "steps": steps}), encoding="utf-8")
-    content = yaml.safe_load(packaged_config("sim_both.yaml" if both_arms else "sim.yaml").read_text(encoding="utf-8"))
+    content = yaml.safe_load(packaged_config(file).read_text(encoding="utf-8"))
     for name, entry in content.items():
         values = entry["ros__parameters"]
         if name.endswith("/can_bridge"):

@@ -10,12 +10,15 @@ import numpy as np
 from exo_gravity.core.safety.gate import START_GATE
 from exo_gravity.core.safety.guidance import GUIDANCE
 
-from .loop import QUIET, QUIET_OTHERS, THREAD_PRIORITY, LoopRun, run_loop
+from .loop import BOTH_ARMS, ONE_ARM, QUIET, QUIET_OTHERS, SEVEN_JOINTS, THREAD_PRIORITY, LoopRun, run_loop
 from .table import Row
 from .timing import percentile
 
-RATES = (("one arm", False, 200), ("one arm", False, 500), ("one arm", False, 1000), ("both arms", True, 200),
-         ("both arms", True, 500))  # fmt: skip
+RATES = (
+    *(("one arm", ONE_ARM, rate) for rate in (200, 500, 1000)),
+    *(("both arms", BOTH_ARMS, rate) for rate in (200, 500)),
+    ("seven joints on CAN FD", SEVEN_JOINTS, 500),
+)
 QUICK_RATES = (RATES[1], RATES[3])
 KINDS = ("nodes", "one process", "fifo", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
@@ -29,13 +32,13 @@ Progress = Callable[[str], None]
 def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
     """Yield the rows of every rate, then of the start."""
     starts = []
-    for arms, both_arms, rate in QUICK_RATES if quick else RATES:
+    for arms, file, rate in QUICK_RATES if quick else RATES:
         runs: Runs = {}
         for kind in KINDS:
-            if kind == "fifo" and (both_arms or rate < 500):  # two devices would get no processor
+            if kind == "fifo" and (file != ONE_ARM or rate < 500):  # two devices would get no processor
                 continue
             progress(f"loop, {arms}, {rate} Hz: {kind}")
-            if run := quietest_run(kind, rate, both_arms, 5.0 if quick else 20.0, progress):
+            if run := quietest_run(kind, rate, file, 5.0 if quick else 20.0, progress):
                 runs[kind] = run
         name = f"loop, {arms}, {rate} Hz"
         yield from rows_of(name, rate, runs, "nodes")
@@ -50,12 +53,12 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
         yield Row("start, launch to active: the checks and the begin of the torque", median, least, "s", _range(starts))
 
 
-def quietest_run(kind: str, rate: int, both_arms: bool, seconds: float, progress: Progress) -> LoopRun | None:
+def quietest_run(kind: str, rate: int, file: str, seconds: float, progress: Progress) -> LoopRun | None:
     """Return the run from which least was taken, of up to `ATTEMPTS`; None if none carried the arm."""
     best = None
     for _ in range(ATTEMPTS):
         try:
-            run = run_loop(kind, rate, both_arms, seconds)
+            run = run_loop(kind, rate, file, seconds)
         except RuntimeError as error:
             progress(f"  {error}")
             continue

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .loop import run_loop
+from .loop import ONE_ARM, run_loop
 from .timing import percentile
 
 RATE = 500.0  # Hz
@@ -39,7 +39,7 @@ def main() -> int:
         return [*windows["off"], *windows["on"]]
 
     length = 2.0 * options.turns * (options.seconds + SETTLING) + START
-    run = run_loop("nodes", RATE, both_arms=False, seconds=length, watch=alternate)
+    run = run_loop("nodes", RATE, ONE_ARM, length, watch=alternate)
     latencies = [timing.latency * 1e3 for timing in run.windows]
     off, on = latencies[: options.turns], latencies[options.turns :]
     for name, parts in (("without", off), ("with", on)):

@@ -2,8 +2,8 @@
 """The timing of a loop from the frames on its bus: latency from reply to torque, cycle spacing, missed cycles.
 
 The content of a command shows which replies it answers. The arm moves to and fro, so that its angles change by a few
-position codes each cycle. The four angles of a cycle determine, by the law under test, the four command frames that
-answer it, bit for bit: while the arm is carried within its limits on an upright trunk, the loop changes nothing else.
+position codes each cycle. The angles of a cycle determine, by the law under test, the command frames that answer it,
+bit for bit: while the arm is carried within its limits on an upright trunk, the loop changes nothing else.
 An answer that equals one of the last cycles' is left out: the arm turned too little to distinguish them. Every other
 answer is searched in the later cycles; where a newer answer overtook it, that one counts. The latency of each motor
 runs from its reply to its command.
@@ -55,16 +55,19 @@ class Cycle:
 
 def split_cycles(frames: dict[str, np.ndarray], motors: Sequence[JointMotor], begin: float, end: float) -> list[Cycle]:
     """Return the cycles between two times (s)."""
-    joint_of = {motor.can_id: joint for joint, motor in enumerate(motors)}
+    commanded = {motor.command_id: joint for joint, motor in enumerate(motors)}
+    replying = {motor.reply_id: joint for joint, motor in enumerate(motors)}
     inside = (frames["time"] >= begin) & (frames["time"] < end)
     order = np.flatnonzero(inside)[np.argsort(frames["time"][inside], kind="stable")]
     cycles: list[Cycle] = []
     for i in order:
-        joint = joint_of.get(int(frames["id"][i]))
+        own = int(frames["id"][i])
+        joint = commanded.get(own, replying.get(own))
         data = frames["data"][i, : frames["length"][i]].tobytes()
         if joint is None or is_special(data):
             continue
-        is_reply = data[0] == motors[joint].can_id
+        # An AK motor has one ID for both, and begins a reply with it.
+        is_reply = own in replying and (own not in commanded or data[0] == own)
         if joint == 0 and not is_reply:
             cycles.append(Cycle())
         if cycles:
@@ -73,7 +76,7 @@ def split_cycles(frames: dict[str, np.ndarray], motors: Sequence[JointMotor], be
 
 
 def analyse(cycles: Sequence[Cycle], motors: Sequence[JointMotor], law: Law, period: float) -> LoopTiming:
-    """Return the timing of a loop that should run every `period` s and apply `law`: (4,) rad -> (4,) Nm."""
+    """Return the timing of a loop that should run every `period` s and apply `law`: (n,) rad -> (n,) Nm."""
     starts = np.array([cycle.commands[0][0] for cycle in cycles])
     spacing = np.diff(starts)
     cycles_due = round(float(starts[-1] - starts[0]) / period) + 1

@@ -14,26 +14,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import papers
-from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
-from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.control_loop import Controller
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
-from exo_gravity.lab.inputs.arms import read_arm
-from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedImu, VirtualWearer
+from exo_gravity.sim import SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_time import VirtualClock, Wire
 
+from ..arms import Friction, PlayedArm, on_boards
 from .drivers import Timing
 from .motors import Electronics, motor_of
 
@@ -41,25 +37,25 @@ LATE = 0.02  # s by which a busy computer is late
 TILT_TIMEOUT = 0.08  # s
 LOOK_PERIOD = 0.01  # s between two comparisons with the truth
 SETTLED = 1.5  # s until a tilt must be there
-DAY = TrialScript.parse(  # what the wearer does while the arm is carried
-    {
-        "name": "a wearer reaches, walks, bows and rests",
-        "steps": [
-            {"move": [0.1, 0.5, 0.5, 0.6], "over": 1.6},
-            {"hold": 2.0},
-            {"move": [-0.2, 0.8, 0.2, 1.2], "over": 1.3},
-            {"push": [0.2, 1.0, 0.6, 0.2], "over": 0.4},
-            {"hold": 1.0},
-            {"walk": 5.0},
-            {"move": [0.2, 0.4, 0.9, 0.4], "over": 1.3},
-            {"bow": 0.5, "over": 1.5},
-            {"hold": 1.0},
-            {"bow": 0.0, "over": 1.5},
-            {"move": [0.0, 0.2, 0.2, 0.3], "over": 1.4},
-            {"hold": 3.0},
-        ],
-    }
-)
+
+
+def day_of(arm: PlayedArm) -> TrialScript:
+    """Return what the wearer does while the arm is carried: reach, walk, bow and rest; the trunk only with an IMU."""
+    first, second, third, rest = map(list, arm.poses)
+    walk, bow, rise = {"walk": 5.0}, {"bow": 0.5, "over": 1.5}, {"bow": 0.0, "over": 1.5}
+    steps = [
+        {"move": first, "over": 1.6},
+        {"hold": 2.0},
+        {"move": second, "over": 1.3},
+        {"push": list(arm.shove), "over": 0.4},
+        {"hold": 1.0},
+        *([walk] if arm.has_imu else []),
+        {"move": third, "over": 1.3},
+        *([bow, {"hold": 1.0}, rise] if arm.has_imu else [{"hold": 1.0}]),
+        {"move": rest, "over": 1.4},
+        {"hold": 3.0},
+    ]
+    return TrialScript.parse({"name": "a wearer's day", "steps": steps})
 
 
 @dataclass(frozen=True)
@@ -72,7 +68,7 @@ class Equipment:
 
     name: str
     electronics: Electronics | None
-    friction: tuple[float, float] = (0.2, 0.0)  #: Nm, Coulomb's and Stribeck's
+    friction: Friction
     loss: float = 0.0
     batch: float = 0.0
     late: float = 0.0
@@ -124,25 +120,27 @@ class LateController:
 
 
 class OrdinaryArm:
-    """An arm of `equipment` and its wearer, whose trunk carries an IMU behind the driver `timing`."""
+    """An arm of `equipment` and its wearer, whose trunk may carry an IMU behind the driver `timing`."""
 
-    def __init__(self, equipment: Equipment, is_v3: bool, rate: float, timing: Timing, seed: int = 0) -> None:
+    def __init__(
+        self,
+        arm: PlayedArm,
+        equipment: Equipment,
+        is_v3: bool,
+        rate: float,
+        timing: Timing | None = None,
+        seed: int = 0,
+    ) -> None:
         self.result = Result()
-        arm = read_arm(load(packaged_config("sim.yaml")), "/right")
-        settings = replace(arm.settings(), tilt_timeout=TILT_TIMEOUT)
-        assert settings.robot_by_mass
-        robot = papers(settings.robot_by_mass)
-        board = MIT_V3 if is_v3 else MIT
-        motors = [replace(motor, spec=board.ranged(motor.spec), wire_format=board) for motor in arm.motors]
-        coulomb, stribeck = equipment.friction
-        config = ArmConfig(robot, coulomb_friction=(coulomb,) * 4, stribeck_friction=(stribeck,) * 4)
+        settings = replace(arm.carried.settings, tilt_timeout=TILT_TIMEOUT)
+        motors = on_boards(arm.motors, MIT_V3) if is_v3 else arm.motors
         boards = [motor_of(joint, equipment.electronics) for joint in motors]
-        self.device = SimulatedDevice(SimulatedArm(config), boards)
-        self._robot = robot
+        self.device = SimulatedDevice(arm.device_arm(equipment.friction), boards)
+        self._side, self._robot, self._day = settings.side, settings.loaded, day_of(arm)
         wire = Wire()
         wire.loss, wire.batch = equipment.loss, equipment.batch
-        limits = Limits(arm.joint_names)
-        self._compensator = Compensator(settings)
+        limits = arm.limits(rate)
+        self._compensator = Compensator(settings, limits.joint_names)
         controller = DirectController(self._compensator, limits)
         late = LateController(controller, wire.clock, equipment.late / (0.01 * rate), seed)
         self._arm = VirtualArm(self.device, late, motors, limits, rate, wire)
@@ -151,7 +149,8 @@ class OrdinaryArm:
         self._imu = SimulatedImu()
         self._begin = self._tilted = self.clock.monotonic()
         self.clock.every(LOOK_PERIOD, self._look)
-        self._send_samples(timing)
+        if timing:
+            self._send_samples(timing)
 
     def play(self, duration: float, carried: float) -> Result:
         """Start the arm again and again for `duration` s, and let it down after it was carried for `carried` s."""
@@ -184,10 +183,10 @@ class OrdinaryArm:
         end += duration
         while self.clock.monotonic() < end and self.safety.state is State.ACTIVE:
             if self.clock.monotonic() >= script_end:
-                self.device.start(VirtualWearer(DAY))
-                script_end += DAY.duration
+                self.device.start(VirtualWearer(self._day))
+                script_end += self._day.duration
             self.loop.cycle()
-        self.device.start(VirtualWearer(DAY), delay=1e9)
+        self.device.start(VirtualWearer(self._day), delay=1e9)
         return self.safety.state is State.ACTIVE
 
     def _run_until(self, states: Sequence[State], timeout: float) -> bool:
@@ -240,5 +239,5 @@ class OrdinaryArm:
         theta, velocity = arm.positions, arm.velocities
         at = zip(self.device.motors, theta, velocity, strict=True)
         applied = [motor.advance(angle, speed, 0.0) for motor, angle, speed in at]
-        wanted = gravity_torque(self._robot, theta, Tilt.of("right", trunk.pitch, trunk.roll).direction)
+        wanted = self._robot.torque(theta, Tilt.of(self._side, trunk.pitch, trunk.roll))
         self.result.largest_error = max(self.result.largest_error, float(np.max(np.abs(np.subtract(applied, wanted)))))

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.sim import SimulatedMotor
+from exo_gravity.sim.motors import simulated
+
+from ..arms import of_family
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class OrdinaryMotor(SimulatedMotor):
 
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass, and return the torque in Nm; see `SimulatedMotor.advance`."""
+        if self.firmware.timeout:  # it counts the time since the last command
+            super().advance(position, velocity, dt)
         self._speed -= (velocity - self._speed) * math.expm1(-dt / self._electronics.velocity_filter)
         aim = super().torque(position, self._speed)
         self.applied -= (aim - self.applied) * math.expm1(-dt / self._electronics.current_lag)
@@ -57,4 +62,6 @@ class OrdinaryMotor(SimulatedMotor):
 
 def motor_of(joint: JointMotor, electronics: Electronics | None) -> SimulatedMotor:
     """Return the motor of `joint`, an ideal one without `electronics`."""
-    return SimulatedMotor(joint) if electronics is None else OrdinaryMotor(joint, electronics)
+    if electronics is None:
+        return simulated(joint)
+    return of_family(OrdinaryMotor, joint.spec.family)(joint, electronics)

@@ -1,8 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""python -m bench.search [--minutes 60] [--seed S]: search for unlisted events that throw an arm.
+"""python -m bench.search [--minutes 60] [--arm ARM] [--seed S]: search for unlisted events that throw an arm.
 
 Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what
-is permitted, or beyond. build/search.jsonl keeps every case by its seed: the next run goes on where this one ended.
+is permitted, or beyond. build/search_ARM.jsonl keeps every case by its seed: the next run goes on where this one ended.
 With --seed one case is replayed: a table of what happened, and a picture in build/. Exit code 1 if a case was beyond.
 """
 
@@ -23,10 +23,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from ..arms import ARMS
 from .case import Event, draw
 from .play import Played, play, play_case
 
-FILE = Path("build/search.jsonl")
 SHOWN = 20
 AHEAD = 2  # cases that wait for each process
 
@@ -60,8 +60,8 @@ def kept(path: Path) -> dict[int, Row]:
     return rows
 
 
-def search(path: Path, minutes: float, workers: int, console: Console) -> dict[int, Row]:
-    """Play cases for so many minutes, or until Ctrl-C; return all rows, also those of earlier runs."""
+def search(arm: str, path: Path, minutes: float, workers: int, console: Console) -> dict[int, Row]:
+    """Play cases of an arm for so many minutes, or until Ctrl-C; return all rows, also those of earlier runs."""
     path.parent.mkdir(parents=True, exist_ok=True)
     rows = kept(path)
     begin, seed = time.monotonic(), 0
@@ -73,7 +73,7 @@ def search(path: Path, minutes: float, workers: int, console: Console) -> dict[i
             while (passed := time.monotonic() - begin) < 60.0 * minutes or waiting:
                 while passed < 60.0 * minutes and len(waiting) < AHEAD * workers:
                     if seed not in rows:
-                        waiting.add(pool.submit(play, seed))
+                        waiting.add(pool.submit(play, seed, arm))
                     seed += 1
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -111,9 +111,9 @@ def show(rows: dict[int, Row], console: Console) -> None:
     console.print(f"{len(rows)} cases; {len(beyond)} beyond a bound; replay one with --seed")
 
 
-def replay(seed: int, console: Console) -> float:
+def replay(seed: int, arm: str, console: Console) -> float:
     """Play one case, print what happened, and draw it; return its share of the bound."""
-    played, records = play_case(draw(seed))
+    played, records = play_case(draw(seed, arm))
     case = played.case
     console.print(
         f"seed {seed}: {case.rate:g} Hz, pose {case.pose}, friction {case.friction:g} Nm, payload {case.payload:g} kg"
@@ -160,14 +160,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.search", description="Search for ways to throw an arm.")
     parser.add_argument("--minutes", type=float, default=60.0, help="(%(default)g)")
     parser.add_argument("--seed", type=int, help="replay this case alone")
+    parser.add_argument("--arm", choices=ARMS, default="paper", help="one of those of config (%(default)s)")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), help="processes (default: one per core)")
-    parser.add_argument("--file", type=Path, default=FILE, help="of the cases so far (%(default)s)")
+    parser.add_argument("--file", type=Path, help="of the cases so far (build/search_ARM.jsonl)")
     options = parser.parse_args()
     console = Console(width=None if Console().is_terminal else 200, highlight=False)
     if options.seed is not None:
-        return int(replay(options.seed, console) > 1.0)
+        return int(replay(options.seed, options.arm, console) > 1.0)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    rows = search(options.file, options.minutes, options.workers, console)
+    path = options.file or Path(f"build/search_{options.arm.replace(' ', '_')}.jsonl")
+    rows = search(options.arm, path, options.minutes, options.workers, console)
     show(rows, console)
     return int(any(row["share"] > 1.0 for row in rows.values()))
 

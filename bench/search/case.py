@@ -13,18 +13,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from exo_gravity.core.motors.ak import USUAL_MOTORS
-from exo_gravity.core.motors.families import MOTORS
+from ..arms import ARMS, PlayedArm, Pose
 
-JOINTS = range(len(USUAL_MOTORS))
 RATES = (100.0, 250.0)  # Hz
 BODY_MASS = 75.0  # kg, of a wearer
-HORIZONTAL = (0.4, 1.35, 0.8, 1.5)  # rad, the farthest pose of a bare arm,
-CARRIED_IN_FULL = (0.2, 0.5, 0.2, 0.5)  # and of one with a wearer's arm, which the rated torques carry
 ENABLED, CARRIED = "enabled", "carried"  # what the times of a case's events count from
 REARM = "rearm"  # clear and enable
 
 Values = dict[str, Any]
+Draw = Callable[[random.Random, PlayedArm], Values]  # of the values of an event of this arm
 
 
 class Event(NamedTuple):
@@ -39,13 +36,15 @@ class Event(NamedTuple):
 class Case:
     """An arm and its events.
 
+    arm: its name in ARMS.
     worn: with the passive arm of a wearer in it, which Zero-G carries; else One-G carries the bare arm.
     payload: kg in the hand, known to the compensator.
-    friction: Nm, Coulomb's of each joint.
-    pose: (4,) rad, to which the wearer moves the carried arm.
+    friction: Nm, Coulomb's of a joint with an AK60-6.
+    pose: (n,) rad, to which the wearer moves the carried arm.
     begin: ENABLED or CARRIED.
     """
 
+    arm: str
     seed: int
     rate: float
     worn: bool
@@ -72,13 +71,13 @@ class Kind(NamedTuple):
     """A kind of event: its group, how its values are drawn, and its bound where its cause cannot be seen."""
 
     group: str
-    draw: Callable[[random.Random], Values] = lambda random: {}
+    draw: Draw = lambda random, arm: {}
     bound: Bound = Bound()
 
 
-def lasting(shortest: float, longest: float) -> Callable[[random.Random], Values]:
+def lasting(shortest: float, longest: float) -> Draw:
     """Draw a duration in s, short ones as often as long ones."""
-    return lambda random: {"duration": span(random, shortest, longest)}
+    return lambda random, arm: {"duration": span(random, shortest, longest)}
 
 
 def span(random: random.Random, shortest: float, longest: float) -> float:
@@ -86,57 +85,64 @@ def span(random: random.Random, shortest: float, longest: float) -> float:
     return round(math.exp(random.uniform(math.log(shortest), math.log(longest))), 3)
 
 
-def some_motors(shortest: float, longest: float) -> Callable[[random.Random], Values]:
+def joints_of(arm: PlayedArm) -> range:
+    """Return the joints of an arm, from 0 on."""
+    return range(len(arm.motors))
+
+
+def some_motors(shortest: float, longest: float) -> Draw:
     """Draw one motor or all of them, and a duration in s."""
 
-    def draw(random: random.Random) -> Values:
-        motors = list(JOINTS) if random.random() < 0.5 else [random.choice(JOINTS)]
+    def draw(random: random.Random, arm: PlayedArm) -> Values:
+        joints = joints_of(arm)
+        motors = list(joints) if random.random() < 0.5 else [random.choice(joints)]
         return {"motors": motors, "duration": span(random, shortest, longest)}
 
     return draw
 
 
-def slip(random: random.Random) -> Values:
+def slip(random: random.Random, arm: PlayedArm) -> Values:
     """Draw a joint and an error of its encoder in rad: a turn of the rotor, or 0.3 rad."""
-    joint = random.choice(JOINTS)
-    turn = 2.0 * math.pi / MOTORS[USUAL_MOTORS[joint]].gear_ratio
+    joint = random.choice(joints_of(arm))
+    turn = 2.0 * math.pi / arm.motors[joint].spec.gear_ratio
     return {"joint": joint, "error": random.choice((-1.0, 1.0)) * random.choice((round(turn, 3), 0.3))}
 
 
-def wrong_speed(random: random.Random) -> Values:
+def wrong_speed(random: random.Random, arm: PlayedArm) -> Values:
     """Draw a joint, the factor of its reported speed, and a duration in s."""
     factor = random.choice((-1.0, 0.0, 0.3, 3.0))
-    return {"joint": random.choice(JOINTS), "factor": factor, "duration": span(random, 0.1, 5.0)}
+    return {"joint": random.choice(joints_of(arm)), "factor": factor, "duration": span(random, 0.1, 5.0)}
 
 
-def on_joint(**choices: tuple[float, ...]) -> Callable[[random.Random], Values]:
+def on_joint(**choices: tuple[float, ...]) -> Draw:
     """Draw a joint, and one of the values of each name."""
-    return lambda random: {
-        "joint": random.choice(JOINTS),
+    return lambda random, arm: {
+        "joint": random.choice(joints_of(arm)),
         **{name: random.choice(values) for name, values in choices.items()},
     }
 
 
-def one_of(**choices: tuple[Any, ...]) -> Callable[[random.Random], Values]:
+def one_of(**choices: tuple[Any, ...]) -> Draw:
     """Draw one of the values of each name."""
-    return lambda random: {name: random.choice(values) for name, values in choices.items()}
+    return lambda random, arm: {name: random.choice(values) for name, values in choices.items()}
 
 
-def reach(random: random.Random) -> Values:
-    """Draw a pose (4,) rad and the time to reach it in s."""
-    return {"pose": list(pose(random, HORIZONTAL)), "duration": round(random.uniform(1.0, 2.0), 2)}
+def reach(random: random.Random, arm: PlayedArm) -> Values:
+    """Draw a pose (n,) rad and the time to reach it in s."""
+    return {
+        "pose": list(pose(random, arm.farthest, arm.nearest(arm.farthest))),
+        "duration": round(random.uniform(1.0, 2.0), 2),
+    }
 
 
-def pose(random: random.Random, farthest: tuple[float, ...]) -> tuple[float, ...]:
-    """Draw a pose (4,) rad that is no farther than `farthest`."""
-    least = -farthest[0], 0.2, -0.5 * farthest[2], 0.1
+def pose(random: random.Random, farthest: Pose, least: Pose) -> Pose:
+    """Draw a pose (n,) rad between two."""
     return tuple(round(random.uniform(*ends), 2) for ends in zip(least, farthest, strict=True))
 
 
-def push(random: random.Random) -> Values:
-    """Draw torques (4,) N m and a duration in s."""
-    most = (2.0, 4.0, 1.5, 0.5)
-    torque = [round(random.uniform(-limit, limit), 2) for limit in most]
+def push(random: random.Random, arm: PlayedArm) -> Values:
+    """Draw torques (n,) N m and a duration in s."""
+    torque = [round(random.uniform(-limit, limit), 2) for limit in arm.push]
     return {"torque": torque, "duration": round(random.uniform(0.2, 0.6), 2)}
 
 
@@ -181,42 +187,55 @@ KINDS = {
     "lean": Kind("wearer", one_of(lean=(-0.5, 0.5), duration=(0.5, 1.0))),
     REARM: Kind("operator", lasting(0.1, 1.0)),
 }
+NEEDS_IMU = ("imu_wrong", "imu_creeps", "imu_frozen", "imu_silent", "trunk_falls", "lean")
+NEEDS_WEARER = ("body_mass",)
 AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
 
 
-def draw(seed: int) -> Case:
-    """Return the case of `seed`, always the same one."""
-    source = random.Random(seed)
-    worn = source.random() < 0.5
-    first, second = pair(source)
+def draw(seed: int, name: str) -> Case:
+    """Return the case of `seed` for the arm called `name`, always the same one."""
+    source, arm = random.Random(seed), ARMS[name]
+    worn = source.random() < 0.5 and arm.worn is not None
+    kinds = kinds_of(arm)
+    first, second = pair(source, kinds)
     begin = ENABLED if {first, second} & set(AT_POWER_UP) or source.random() < 0.25 else CARRIED
     longest = 8.0 if begin == ENABLED else 1.0
     at = source.uniform(0.0, longest)
     apart = source.choice((span(source, 0.01, 0.5), span(source, 0.1, 6.0)))
-    events = [event(source, first, at), event(source, second, at + apart)]
+    events = [event(source, arm, first, at), event(source, arm, second, at + apart)]
     if source.random() < 0.6:
-        events.append(event(source, REARM, at + apart + source.uniform(3.0, 14.0)))
+        events.append(event(source, arm, REARM, at + apart + source.uniform(3.0, 14.0)))
         if source.random() < 0.3:
             last = source.choice(("reach", "limp", "push"))
-            events.append(event(source, last, events[-1].time + source.uniform(3.0, 9.0)))
+            events.append(event(source, arm, last, events[-1].time + source.uniform(3.0, 9.0)))
     payload = source.choice((0.2, 1.0)) if {first, second} & {"payload_dropped", "payload_flicked"} else 0.0
-    rate, farthest = source.choice(RATES), CARRIED_IN_FULL if worn and source.random() < 0.75 else HORIZONTAL
+    rate, farthest = source.choice(RATES), arm.farthest
+    if worn and source.random() < 0.75 and arm.worn:
+        farthest = arm.worn
     in_order = tuple(sorted(events, key=lambda event: event.time))
     friction = source.choice((0.05, 0.2))
-    return Case(seed, rate, worn, payload, friction, pose(source, farthest), begin, in_order)
+    to = pose(source, farthest, arm.nearest(farthest))
+    return Case(name, seed, rate, worn, payload, friction, to, begin, in_order)
 
 
-def pair(random: random.Random) -> tuple[str, str]:
-    """Return two kinds of events, of different groups seven times in eight."""
+def kinds_of(arm: PlayedArm) -> list[str]:
+    """Return the kinds of events that can happen to an arm."""
+    impossible = set() if arm.has_imu else set(NEEDS_IMU)
+    impossible |= set() if arm.worn else set(NEEDS_WEARER)
+    return [name for name in KINDS if name not in impossible]
+
+
+def pair(random: random.Random, kinds: list[str]) -> tuple[str, str]:
+    """Return two of these kinds of events, of different groups seven times in eight."""
     while True:
-        first, second = random.choice(list(KINDS)), random.choice(list(KINDS))
+        first, second = random.choice(kinds), random.choice(kinds)
         if KINDS[first].group != KINDS[second].group or random.random() < 0.125:
             return first, second
 
 
-def event(random: random.Random, name: str, time: float) -> Event:
+def event(random: random.Random, arm: PlayedArm, name: str, time: float) -> Event:
     """Draw the values of an event; what is wired wrong happens at 0 s."""
-    return Event(0.0 if name in AT_POWER_UP else round(time, 3), name, KINDS[name].draw(random))
+    return Event(0.0 if name in AT_POWER_UP else round(time, 3), name, KINDS[name].draw(random, arm))
 
 
 def bound_of(case: Case, clamped: bool) -> Bound:

@@ -9,12 +9,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from exo_gravity.core.arm.arm import papers
-from exo_gravity.core.arm.wearer import Wearer
-
 from .stage import Stage
 
-LAP = (0.1, 0.45, 0.5, 1.3)  # rad, an arm that lies in the lap
 RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms
 WARMING = 4.0  # s
 Act = Callable[..., None]
@@ -63,7 +59,7 @@ def max_effort(stage: Stage, share: float) -> None:
 
 def body_mass(stage: Stage, mass: float) -> None:
     """Set the mass of the wearer's body, in kg, as the operator would."""
-    load = Wearer(mass).on_links(papers(stage.settings.loaded).length)
+    load = stage.played.load_of(mass)
     stage.change(wearer_mass=load.mass.tolist(), wearer_cog=load.cog.tolist())
 
 
@@ -140,7 +136,7 @@ def efforts_late(stage: Stage, duration: float) -> None:
 
 
 def reach(stage: Stage, pose: list[float], duration: float) -> None:
-    """Let the wearer move their arm to a pose (4,) rad within `duration` s."""
+    """Let the wearer move their arm to a pose (n,) rad within `duration` s."""
     stage.act({"move": list(pose), "over": duration})
 
 
@@ -152,12 +148,12 @@ def resist(stage: Stage, duration: float) -> None:
 
 def spasm(stage: Stage, size: float) -> None:
     """Shake the arm: eight pushes of 0.15 s, to and fro."""
-    torque = [0.0, 2.5 * size, 1.2 * size, 0.6 * size]
+    torque = [size * most for most in stage.played.spasm]
     stage.act(*({"push": [sign * each for each in torque], "over": 0.15} for sign in (1.0, -1.0) * 4))
 
 
 def push(stage: Stage, torque: list[float], duration: float) -> None:
-    """Push the joints with torques (4,) N m for `duration` s."""
+    """Push the joints with torques (n,) N m for `duration` s."""
     stage.act({"push": list(torque), "over": duration})
 
 
@@ -176,7 +172,7 @@ def payload_dropped(stage: Stage) -> None:
 
 def payload_flicked(stage: Stage) -> None:
     """Let the wearer throw upwards what they carry."""
-    stage.act({"push": [0.0, 3.0, 1.0, 1.0], "over": 0.2})
+    stage.act({"push": list(stage.played.flick), "over": 0.2})
     stage.clock.later(0.15, lambda: payload_dropped(stage))
 
 
@@ -233,7 +229,7 @@ ACTS: dict[str, Act] = {
     "efforts_nan": efforts("nan"),
     "reach": reach,
     "limp": lambda stage: stage.act(),
-    "lap": lambda stage, duration: stage.act({"move": list(LAP), "over": duration}),
+    "lap": lambda stage, duration: stage.act({"move": list(stage.played.lap), "over": duration}),
     "resist": resist,
     "spasm": spasm,
     "push": push,

@@ -38,9 +38,9 @@ class Played:
         return 10.0 if self.error else max(speed, self.driven.energy / self.bound.energy)
 
 
-def play(seed: int) -> Played:
-    """Return what becomes of the case of `seed`."""
-    return play_case(draw(seed))[0]
+def play(seed: int, arm: str) -> Played:
+    """Return what becomes of the case of `seed` for the arm called `arm`."""
+    return play_case(draw(seed, arm))[0]
 
 
 def play_case(case: Case) -> tuple[Played, np.ndarray]:
@@ -54,7 +54,8 @@ def play_case(case: Case) -> tuple[Played, np.ndarray]:
     stage.arm.bus.close()
     records = stage.truth.records
     was_clamped = stage.controller.was_clamped
-    return Played(case, driven(records), bound_of(case, was_clamped), tuple(stage.states), begin, error), records
+    done = driven(records, [motor.joint.spec for motor in stage.motors])
+    return Played(case, done, bound_of(case, was_clamped), tuple(stage.states), begin, error), records
 
 
 def _play(stage: Stage, case: Case) -> float:
@@ -76,4 +77,5 @@ def _play(stage: Stage, case: Case) -> float:
     stage.run(DESCENT, lambda: stage.safety.state in off and not stage.device.powered)
     stage.run(1.0)
     stage.arm.catch_up()
+    stage.arm.check_controller()
     return begin

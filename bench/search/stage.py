@@ -11,27 +11,24 @@ from dataclasses import replace
 
 import can
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.tilt import gravity_in_trunk
-from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
-from exo_gravity.lab.inputs.arms import read_arm
-from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim import SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.truth import TruthRecords
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock, Wire
 
+from ..arms import ARMS, Friction, of_family
 from .case import BODY_MASS, CARRIED, Case
 
 IMU_PERIOD = 0.01  # s
-COMMAND_TIMEOUT, TILT_TIMEOUT, ENABLE_TIMEOUT = 0.05, 0.08, 10.0  # s, those of a real arm
+TILT_TIMEOUT = 0.08  # s, that of a real arm
 NOTHING = TrialScript("nothing", ())
 
 
@@ -123,26 +120,24 @@ class Stage:
     """
 
     def __init__(self, case: Case) -> None:
-        configured = read_arm(load(packaged_config("sim.yaml")), "/right")
-        settings = replace(configured.settings(), tilt_timeout=TILT_TIMEOUT, payload_mass=case.payload)
-        robot = settings.robot_by_mass
-        assert robot
-        self.load = Wearer(BODY_MASS).on_links(papers(robot).length)
-        worn = {"wearer_mass": self.load.mass.tolist(), "wearer_cog": self.load.cog.tolist()}
+        self.played = ARMS[case.arm]
+        configured = self.played.carried
+        settings = replace(configured.settings, tilt_timeout=TILT_TIMEOUT, payload_mass=case.payload)
+        load = self.played.load_of(BODY_MASS) if self.played.worn else None
+        worn = {"wearer_mass": load.mass.tolist(), "wearer_cog": load.cog.tolist()} if load else {}
         mode = "zero_g" if case.worn else "one_g"
         self.settings: Settings = replace(settings, mode=mode, support=1.0, **worn)
-        friction = (case.friction,) * len(configured.motors)
-        device_arm = SimulatedArm(ArmConfig(coulomb_friction=friction, **(worn if case.worn else {})))
+        device_arm = self.played.device_arm(Friction(case.friction), load if case.worn else None)
         device_arm.carry(case.payload)
-        self.motors = [FailingMotor(joint) for joint in configured.motors]
+        self.motors = [of_family(FailingMotor, joint.spec.family)(joint) for joint in configured.motors]
         self.device = SimulatedDevice(device_arm, self.motors)
         self.truth = self.device.truth = TruthRecords()
-        limits = replace(configured.limits, command_timeout=COMMAND_TIMEOUT, enable_timeout=ENABLE_TIMEOUT)
+        limits = self.played.limits(case.rate)
         if case.begin == CARRIED:  # its signs are as good as proven, which takes 5 s
             limits = replace(limits, sign_check_torque=0.0)
         self.wire = LossyWire([motor.can_id for motor in configured.motors])
         self.clock = self.wire.clock
-        self.compensator = Compensator(self.settings)
+        self.compensator = Compensator(self.settings, configured.limits.joint_names)
         self.controller = FailingController(DirectController(self.compensator, limits), self.clock)
         self.arm = VirtualArm(self.device, self.controller, configured.motors, limits, case.rate, self.wire)
         self.safety = self.arm.safety

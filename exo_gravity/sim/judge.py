@@ -11,14 +11,14 @@ that brakes causes none. When the hand lets go and the arm falls, the first HAND
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.numbers import for_joints
+from exo_gravity.core.motors.frames import MotorSpec
 
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
@@ -29,10 +29,8 @@ SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
 COAST = 0.02  # s for which a motor may stop driving within a stretch: a light arm is thrown and caught by turns
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
-RESOLUTION = 2 * MOTORS["AK80-9"].torque_range * 2 / 0xFFF  # Nm, two codes of a command
-# Nm, of the paper's arm; of another arm the least of them
-PEAK_TORQUE = tuple(MOTORS[name].peak_torque for name in USUAL_MOTORS)
-RATED_TORQUE = tuple(MOTORS[name].rated_torque for name in USUAL_MOTORS)
+CODES = 2  # of a command, by which a torque may differ from what is meant
+USUAL = tuple(MOTORS[name] for name in USUAL_MOTORS)  # the motors of the paper's arm
 MAX_GAP = 0.2  # s between two records: a longer gap means that the simulated device did not run
 
 
@@ -58,8 +56,16 @@ class Driven:
     time: float = 0.0
 
 
-def driven(records: np.ndarray) -> Driven:
-    """Return what the motors did in these records (sim/truth.py); at least one."""
+def resolution(motors: Sequence[MotorSpec] = USUAL) -> float:
+    """Return the torque in Nm of CODES of the motor that has the coarsest."""
+    return CODES * 2 * max(motor.torque_range for motor in motors) / 0xFFF
+
+
+def driven(records: np.ndarray, motors: Sequence[MotorSpec] = USUAL) -> Driven:
+    """Return what the motors did in these records (sim/truth.py); at least one.
+
+    motors: of the joints (n,), by default those of the paper's arm.
+    """
     is_free, _, gained = _gained(records)
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
     power[np.abs(records["torque"]) < WEAK] = 0.0
@@ -70,7 +76,7 @@ def driven(records: np.ndarray) -> Driven:
     energy = done - np.maximum.accumulate(np.where(in_stretch, 0.0, done), axis=0)
     speed = np.where(energy > LITTLE, _gained_in(in_stretch, gained), 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
-    rated = for_joints(RATED_TORQUE, speed.shape[1])
+    rated = [motor.rated_torque for motor in motors]
     return Driven(
         speed=float(speed[when, joint]),
         energy=float(energy.max()),
@@ -106,7 +112,7 @@ class Response:
     """What the arm did since the fault.
 
     reaction: s until every motor that can be reached is off or applies damping, None if one never does. top_speed:
-    rad/s of `fastest` (joint 1..4), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
+    rad/s of `fastest` (joint 1..n), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
     torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
     what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
     put into the arm while no hand was on it. power: W, and damping, as in `Driven`. off: s until the last motor was
@@ -135,12 +141,14 @@ def measure(
     unreached: Collection[int] = (),
     unpowered: Collection[int] = (),
     steps_from: float = 0.0,
+    motors: Sequence[MotorSpec] = USUAL,
 ) -> Response:
     """Return the response to a fault at `fault_time` (wall clock, s) of a control loop with `period` s.
 
-    records: of sim/truth.py, from shortly before the fault on; at least one. unreached: joints (0..3) whose motors no
+    records: of sim/truth.py, from shortly before the fault on; at least one. unreached: joints (0..) whose motors no
     frame can reach. unpowered: joints that fall because their motors have no power; their speed does not count.
     steps_from: s after the fault from which on torque steps count, where the fault itself is a step.
+    motors: as in `driven`.
     """
     since = records["time"] - fault_time
     after = since >= 0.0
@@ -149,10 +157,10 @@ def measure(
     for of_joints in (speed, gained):
         of_joints[~after] = 0.0
         of_joints[:, list(unpowered)] = 0.0
-    step, excess = _steps(records, period)
+    step, excess = _steps(records, period, motors)
     step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
     powered = np.flatnonzero(on.any(axis=1))
-    whole = driven(records[after]) if after.any() else Driven()
+    whole = driven(records[after], motors) if after.any() else Driven()
     off_at = powered[-1] + 1 if len(powered) else 0
     dark = np.flatnonzero(after & ~records["on"].any(axis=1))
     return Response(
@@ -196,19 +204,19 @@ def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]
     return float(since[np.argmax(safe)]) if safe.any() else None
 
 
-def _steps(records: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the torque steps (n - 1, 4) between records in Nm, and by how much each exceeds what is allowed."""
+def _steps(records: np.ndarray, period: float, motors: Sequence[MotorSpec]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torque steps (n - 1, joints) between records in Nm, and by how much each exceeds what is allowed."""
     torque = records["torque"]
     effort = torque + records["damping"] * records["velocity"]  # the part that damping does not explain
     step = np.minimum(np.abs(np.diff(effort, axis=0)), np.abs(np.diff(torque, axis=0)))
-    peak = np.array(for_joints(PEAK_TORQUE, torque.shape[1]))
-    at_peak = np.abs(torque) > peak - RESOLUTION  # there, damping explains less than its share
+    peak, codes = np.array([motor.peak_torque for motor in motors]), resolution(motors)
+    at_peak = np.abs(torque) > peak - codes  # there, damping explains less than its share
     step[at_peak[1:] | at_peak[:-1]] = 0.0
     on = records["on"]
     switched_off = on[:-1] & ~on[1:]
     step[switched_off] = np.abs(records["torque"][:-1])[switched_off]
     frames = np.maximum(1, np.diff(records["frames"].astype(int), axis=0))
-    return step, step - (MAX_EFFORT_RATE * period * frames + RESOLUTION)
+    return step, step - (MAX_EFFORT_RATE * period * frames + codes)
 
 
 def _work(records: np.ndarray, after: np.ndarray) -> np.ndarray:

@@ -39,7 +39,7 @@ def play(monkeypatch):
             return result
 
         monkeypatch.setattr(loops, "run_loop", next_run)
-        kept = loops.quietest_run("nodes", 500, False, 5.0, lambda _: None)
+        kept = loops.quietest_run("nodes", 500, loop.ONE_ARM, 5.0, lambda _: None)
         return kept, len(results) - len(waiting)
 
     return play

@@ -10,8 +10,9 @@ import pytest
 
 from bench.timing import LoopTiming, analyse, split_cycles
 from exo_gravity.core.motors.ak import pack_reply
+from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import ENTER
+from exo_gravity.core.motors.frames import ENTER, MotorReply
 from exo_gravity.core.motors.joint_motor import JointMotor
 
 MOTOR_SPECS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
@@ -109,3 +110,17 @@ def test_special_frames_and_foreign_frames_are_ignored():
     extra = {"time": [START + 0.01, START + 0.0301], "id": [1, 77], "length": [8, 8], "data": [list(ENTER), [0] * 8]}
     both = {name: np.concatenate([values, np.array(extra[name], values.dtype)]) for name, values in frames.items()}
     assert timing_of(both).latency == pytest.approx(timing_of(frames).latency)
+
+
+def test_replies_under_an_id_of_their_own_belong_to_their_motor():
+    motor = JointMotor(MOTORS["DM-J4310"], 3, wire_format=DAMIAO_MIT, timeout=0.3)
+    reply = DAMIAO_MIT.pack_reply(motor.spec, MotorReply(3, 0.5, 0.0, 0.0, 30, 0), True)
+    rows = [(motor.command_id, motor.command(1.0, 0.0)), (motor.reply_id, reply)] * 3
+    frames = {
+        "time": START + 1e-3 * np.arange(len(rows)),
+        "id": np.array([own for own, _ in rows]),
+        "length": np.array([len(data) for _, data in rows]),
+        "data": np.array([list(data) for _, data in rows], dtype=np.uint8),
+    }
+    cycles = split_cycles(frames, [motor], START, START + 1.0)
+    assert [(cycle.commands[0][1], cycle.replies[0][1]) for cycle in cycles] == [(rows[0][1], reply)] * 2

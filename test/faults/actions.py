@@ -20,9 +20,11 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
-from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import EXTENDED, ID_BITS
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.ak import FAMILY
+from exo_gravity.core.motors.frames import Frame
+from exo_gravity.core.motors.joint_motor import is_fd
+from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 from ..support.launched_nodes import executable
 from ..support.load import start_frames, start_spin
@@ -34,10 +36,10 @@ Steps = list[dict[str, Any]]
 START_LIMIT = 15.0  # s for a process that must refuse its parameters
 FILE_SIZE_LIMIT = 50_000  # bytes
 FRAME_RATE = 3000  # random frames per second; with our own 2,000, as many as five Python processes on two cores receive
-MOTOR_2 = JointMotor(MOTORS["AK80-9"], 2, direction=-1)  # as in sim.yaml
-MOTOR_TURN = 0.698  # rad of joint 2 for one turn of its rotor
-J2 = [False, True, False, False]
-NONE = [False] * 4
+FOREIGN = -6.0  # Nm
+AK_ERROR, DAMIAO_ERROR = 5, 0xB
+
+OfRig = Callable[[Rig], Any]
 
 
 def in_turn(*actions: Action) -> Action:
@@ -83,12 +85,31 @@ def let_step_fail(how: str) -> Action:
     return lambda rig: rig.failure.write_text(how)
 
 
+def at_struck(value: Any, others: Any = None) -> OfRig:
+    """Return what makes a list (n,) with `value` for the joint that the rig's faults strike.
+
+    value: also a function of the rig. others: of every other joint, by default the zero of its type.
+    """
+
+    def make(rig: Rig) -> list[Any]:
+        own = value(rig) if callable(value) else value
+        rest = type(own)() if others is None else others
+        return [own if joint == rig.struck else rest for joint in range(len(rig.motors))]
+
+    return make
+
+
+def everywhere(value: Any) -> OfRig:
+    """Return what makes a list (n,) with `value` for every joint."""
+    return lambda rig: [value] * len(rig.motors)
+
+
 def simulator(**values: Any) -> Action:
-    """Set parameters of the simulator."""
+    """Set parameters of the simulator; a value may be a function of the rig."""
 
     def inject(rig: Rig) -> None:
         for name, value in values.items():
-            result = rig.probe.set_parameters("simulator", **{name: value})
+            result = rig.probe.set_parameters("simulator", **{name: value(rig) if callable(value) else value})
             assert result.successful, result.reason
 
     return inject
@@ -182,6 +203,19 @@ def raw_imu(rig: Rig) -> Imu:
 def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
     """Return what makes a message of /imu/data with the orientation (x, 0, 0, w)."""
     return lambda rig: stamped(rig, Imu(orientation=Quaternion(x=x, w=w)))
+
+
+def refused_on_the_wrong_angle(rig: Rig) -> None:
+    """Clear the fault and enable the arm, whose encoder is still wrong: its motors must stay off."""
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    start = time.time()
+    assert rig.probe.trigger("clear_fault").success
+    rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
+    assert rig.probe.enable(True).success
+    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
+    assert rig.probe.fault == "implausible_zero", rig.probe.fault
+    assert not rig.truth.since(start)["on"].any(), "the motors were switched on"
+    NO_JUMP(rig)
 
 
 def overload_processors(rig: Rig) -> None:
@@ -289,12 +323,16 @@ def random_frames(count: int, ids: Iterable[int]) -> Action:
     return inject
 
 
-def foreign_frames(data: bytes, rate: float = 1.0, seconds: float = 0.0, frame_id: int = MOTOR_2.command_id) -> Action:
-    """Send `data` to motor 2 as another host would: once, or `rate` a second for `seconds` s."""
+def foreign_frames(frame: bytes | Callable[[Rig], Frame], rate: float = 1.0, seconds: float = 0.0) -> Action:
+    """Send to the motor that is struck as another host would: once, or `rate` a second for `seconds` s.
+
+    frame: the bytes of a command, or what returns the whole frame.
+    """
 
     def inject(rig: Rig) -> float:
-        is_extended = bool(frame_id & EXTENDED)
-        message = can.Message(arbitration_id=frame_id & ID_BITS, data=data, is_extended_id=is_extended)
+        motor = rig.motors[rig.struck]
+        whole = (motor.command_id, frame) if isinstance(frame, bytes) else frame(rig)
+        message = message_of(whole, is_fd(can_options(load(rig.nodes[0].path)["/right/can_bridge"])))
         with can.Bus(**rig.nodes[0].bus) as bus:
             wall, start = time.time(), time.monotonic()
             for number in range(1 + int(rate * seconds)):
@@ -305,12 +343,33 @@ def foreign_frames(data: bytes, rate: float = 1.0, seconds: float = 0.0, frame_i
     return inject
 
 
+def commanding(torque: float) -> Callable[[Rig], Frame]:
+    """Return what makes a command of `torque` (Nm) for the joint that is struck."""
+
+    def make(rig: Rig) -> Frame:
+        motor = rig.motors[rig.struck]
+        return motor.command_id, motor.command(torque, 0.0)
+
+    return make
+
+
+def motor_error(rig: Rig) -> int:
+    """Return the code of an error of the struck motor."""
+    return AK_ERROR if rig.motors[rig.struck].spec.family == FAMILY else DAMIAO_ERROR
+
+
+def motor_turn(rig: Rig) -> float:
+    """Return by how many rad the struck joint turns with its motor's rotor."""
+    return rig.motors[rig.struck].spec.rotor_turn
+
+
 # Faults of the simulated device, and what ends them.
-CUT_OFF, CONNECT = simulator(fault__cut_off=J2), simulator(fault__cut_off=NONE)
+CUT_OFF, CONNECT = simulator(fault__cut_off=at_struck(True)), simulator(fault__cut_off=everywhere(False))
 # The device counts the time from the moment at which the motor loses its power.
-RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=J2)
-SHORT_RESTART = simulator(fault__unplugged_time=0.015, fault__unplugged=J2)
-RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=NONE)
+RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=at_struck(True))
+SHORT_RESTART = simulator(fault__unplugged_time=0.015, fault__unplugged=at_struck(True))
+RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=everywhere(False))
+CUT, RELEASE = simulator(fault__unplugged=everywhere(True)), simulator(fault__unplugged=everywhere(False))
 SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
-ERROR, NO_ERROR = simulator(fault__error=[0, 5, 0, 0]), simulator(fault__error=[0] * 4)
-JUMP, NO_JUMP = (simulator(fault__encoder_error=[0.0, error, 0.0, 0.0]) for error in (MOTOR_TURN, 0.0))
+ERROR, NO_ERROR = simulator(fault__error=at_struck(motor_error)), simulator(fault__error=everywhere(0))
+JUMP, NO_JUMP = simulator(fault__encoder_error=at_struck(motor_turn)), simulator(fault__encoder_error=everywhere(0.0))

@@ -24,10 +24,13 @@ from ..support.launched_nodes import SECOND_GROUP
 from ..support.ros_probe import Timeout
 from .actions import (
     CONNECT,
+    CUT,
     CUT_OFF,
     END_SILENCE,
     ERROR,
+    FOREIGN,
     NO_ERROR,
+    RELEASE,
     SILENCE,
     enable,
     foreign_frames,
@@ -47,14 +50,11 @@ from .rigs import HandedOverRig, LauncherRig, ShortEnableRig, TwoBusRig, TwoBusV
 
 GIVEN_UP = 8.0  # s after which a watchdog says that its motors do not reply
 START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, or to be refused
-CUT = simulator(fault__unplugged=[True] * 4)
-RELEASE = simulator(fault__unplugged=[False] * 4)
 OBSERVED = 3.0  # s after the release
 DEAD = simulator(fault__cut_off=[False, False, True, True])
 ALIVE = simulator(fault__cut_off=[False] * 4)
 FAR = (2, 3)
 V3_MOTOR_2 = JointMotor(MIT_V3.ranged(MOTORS["AK80-9"]), 2, direction=-1, wire_format=MIT_V3)
-V3_EXIT_ID, V3_EXIT = V3_MOTOR_2.exit[-1]
 KILL, HANG_UP = signal.SIGKILL, signal.SIGHUP
 
 
@@ -145,10 +145,11 @@ V3_BOARDS = (
     FaultCase("V3 boards: bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), V3Rig,
         unreached=ALL_JOINTS),
     FaultCase("V3 boards: motor 2 reports an error", ERROR, V3Rig, clear=NO_ERROR, outcomes=("motor_error",)),
-    FaultCase("V3 boards: foreign exit of motor 2, once", foreign_frames(V3_EXIT, frame_id=V3_EXIT_ID), V3Rig,
+    FaultCase("V3 boards: foreign exit of motor 2, once", foreign_frames(lambda rig: V3_MOTOR_2.exit[-1]), V3Rig,
         steps_from=0.05, outcomes=("foreign_command", "torque_not_delivered")),
     FaultCase("V3 boards: foreign 6 Nm to motor 2, 500 a second for 2 s",
-        foreign_frames(V3_MOTOR_2.command(-6.0, 0.0), 500.0, 2.0, V3_MOTOR_2.command_id), V3Rig, steps_from=2.1,
+        foreign_frames(lambda rig: (V3_MOTOR_2.command_id, V3_MOTOR_2.command(FOREIGN, 0.0)), 500.0, 2.0), V3Rig,
+        steps_from=2.1,
         outcomes=("foreign_command",), work_limit=2.0),
     FaultCase("V3 boards: compensator killed", send_signal("compensator", KILL), V3Rig, PROCESS_REACTION),
     FaultCase("V3 boards: can_bridge killed", send_signal("can_bridge", KILL), V3Rig, PROCESS_REACTION),

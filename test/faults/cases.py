@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import signal
-import time
 
 import numpy as np
 from geometry_msgs.msg import Vector3Stamped
@@ -18,15 +17,16 @@ from .actions import (
     CUT_OFF,
     END_SILENCE,
     ERROR,
-    J2,
+    FOREIGN,
     JUMP,
-    MOTOR_2,
     NO_ERROR,
     NO_JUMP,
     RESTART,
     RESTARTED,
     SHORT_RESTART,
     SILENCE,
+    at_struck,
+    commanding,
     deactivate,
     enable,
     foreign_frames,
@@ -40,6 +40,7 @@ from .actions import (
     random_frames,
     raw_imu,
     record_on_a_full_disk,
+    refused_on_the_wrong_angle,
     send_signal,
     set_contradicting_parameters,
     set_impossible_parameters,
@@ -54,6 +55,7 @@ from .actions import (
 from .bus_cases import OWNERSHIP, SUPPLY, TWO_BUSES, V3_BOARDS
 from .command_cases import CLOCK, EFFORT_COMMANDS, MONITOR, RIDES
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase
+from .other_arm_cases import OTHER_ARMS
 from .outer_loop_cases import LEASES, OUTER_LOOP
 from .person_cases import CONNECTIONS, FIRMWARE, REQUESTS
 from .rig import Rig
@@ -83,19 +85,6 @@ KILL, STOP, CONTINUE, TERMINATE, INTERRUPT = (
     signal.SIGTERM,
     signal.SIGINT,
 )
-
-
-def refused_on_the_wrong_angle(rig: Rig) -> None:
-    """Clear the fault and enable the arm, whose encoder is still wrong: its motors must stay off."""
-    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    start = time.time()
-    assert rig.probe.trigger("clear_fault").success
-    rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
-    assert rig.probe.enable(True).success
-    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    assert rig.probe.fault == "implausible_zero", rig.probe.fault
-    assert not rig.truth.since(start)["on"].any(), "the motors were switched on"
-    NO_JUMP(rig)
 
 
 def left_arm_is_carried(rig: BothArmsRig) -> None:
@@ -137,8 +126,8 @@ MOTORS = (
     FaultCase("motor 2 cut off from the bus", CUT_OFF, clear=CONNECT, unreached=(1,), steps_from=math.inf,
         outcomes=("motor_silent",)),
     # The joint falls onto its mechanical stop: for 2 ms the other motors' damping opposes an impact of 3 to 5 rad/s.
-    FaultCase("motor 2 without power", simulator(fault__unplugged=J2), clear=RESTARTED, unpowered=ALL_JOINTS,
-        steps_from=0.05, damping_limit=math.inf, outcomes=("motor_silent",)),
+    FaultCase("motor 2 without power", simulator(fault__unplugged=at_struck(True)), clear=RESTARTED,
+        unpowered=ALL_JOINTS, steps_from=0.05, damping_limit=math.inf, outcomes=("motor_silent",)),
     FaultCase("motor 2 restarts in 30 ms", RESTART, clear=RESTARTED, steps_from=0.3,
         outcomes=("torque_not_delivered", "motor_silent")),
     FaultCase("bus silent until the arm is given up", SILENCE, clear=END_SILENCE, unreached=ALL_JOINTS,
@@ -154,10 +143,10 @@ MOTORS = (
         outcomes=("foreign_command", "torque_not_delivered")),
     FaultCase("foreign SET_ZERO to motor 2, once", foreign_frames(SET_ZERO), unreached=(1,), steps_from=0.05,
         ends_rig=True),
-    FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign_frames(MOTOR_2.command(-6.0, 0.0), 500.0, 2.0),
+    FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign_frames(commanding(FOREIGN), 500.0, 2.0),
         steps_from=2.1, outcomes=("foreign_command",), work_limit=2.0),  # the foreign torque does work until opposed
     FaultCase("foreign zero commands to motor 2, 500 a second for 2 s",
-        foreign_frames(MOTOR_2.command(0.0, 0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
+        foreign_frames(commanding(0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
     FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
     FaultCase("second publisher of the trunk's orientation", publish(Imu, TRUNK_IMU, trunk_imu(0.6, 0.8))),
@@ -252,5 +241,5 @@ ARMS = (
 CASES = (
     *(*HELD_ROWS, *MOTORS, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *OUTER_LOOP, *CLOCK, *ARMS, *V3_BOARDS),
     *(*RIDES, *OWNERSHIP, *LEASES, *LOAD_CHANGES, *ACTIVE_WEARER, *SUPPLY, *MONITOR, *TWO_BUSES),
-    *(*REQUESTS, *CONNECTIONS, *FIRMWARE),
+    *(*REQUESTS, *CONNECTIONS, *FIRMWARE, *OTHER_ARMS),
 )

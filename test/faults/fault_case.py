@@ -19,7 +19,7 @@ RECOVERY = 6.0  # s in which the launcher brings down an arm that has lost its b
 
 Action = Callable[[Any], object]  # on a rig of the case's type
 Check = Callable[[np.ndarray], str]  # of the truth records since the fault: returns what is wrong, or ''
-ALL_JOINTS = (0, 1, 2, 3)
+ALL_JOINTS = (0, 1, 2, 3)  # of the paper's arm
 
 
 @dataclass(frozen=True)

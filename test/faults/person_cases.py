@@ -24,8 +24,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
 from ..support.launched_nodes import LaunchedNodes, Parameters, executable
-from .actions import ERROR, NO_ERROR, in_turn, pause, publish, simulator, stamped, wearer
-from .bus_cases import CUT, RELEASE, stays_off
+from .actions import CUT, ERROR, NO_ERROR, RELEASE, in_turn, pause, publish, simulator, stamped, wearer
+from .bus_cases import stays_off
 from .command_cases import stopped_for
 from .fault_case import ALL_JOINTS, FaultCase
 from .rig import Rig

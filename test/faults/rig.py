@@ -13,15 +13,20 @@ import signal
 import subprocess
 import time
 from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import yaml
 
+from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.hardware.clock import favour
+from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 
+from ..support import CONFIG
 from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
@@ -37,6 +42,7 @@ class Rig:
     """Nodes that carry the arm in `pose`, with a probe and the arm's true motion. End it with `close`.
 
     shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
+    struck: the joint (0..) whose motor is the one that fails; it carries much of the arm's weight.
     bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. one_process:
     whether can_bridge and compensator of an arm share a process, in every rig of a run. two_buses: whether motors 3 and
     4 are on a second bus.
@@ -46,6 +52,7 @@ class Rig:
     base = "sim.yaml"
     rate = 250.0  # Hz
     pose: Sequence[float] = RAISED
+    struck = 1
     bridge: ClassVar[Parameters] = {}
     compensator: ClassVar[Parameters] = {}
     simulator: ClassVar[Parameters] = {}
@@ -55,9 +62,10 @@ class Rig:
         self.folder, self.shipped_timeouts = folder, shipped_timeouts
         self.script = self.write_script("pose", [{"move": list(self.pose), "over": 1.0}, {"hold": 600.0}])
         self.probe = RosProbe()
+        self.probe.home_script = self.write_script("home", [{"move": self.home, "over": over} for over in (2.0, 20.0)])
         device = self._device_nodes()
         self.nodes = [*self._make_nodes(device.bus["port"]), device]
-        self.truth = Truth(device.truth_path())
+        self.truth = Truth(device.truth_path(), len(self.motors))
         self._bridges: set[int] = set()  # IDs of their processes
         self.second_bridge: tuple[int | None, list[str]] = (None, [])  # exit code and log of the last one started
 
@@ -65,6 +73,16 @@ class Rig:
         """Start the nodes, the simulated device first."""
         for nodes in reversed(self.nodes):
             nodes.start()
+
+    @cached_property
+    def motors(self) -> tuple[JointMotor, ...]:
+        """The motors of the configuration."""
+        return motors_of(node_values(load(CONFIG / self.base), "/right/can_bridge", CAN_BRIDGE))
+
+    @property
+    def home(self) -> list[float]:
+        """A pose (n,) in rad near to hanging, within the limits."""
+        return [0.0, *[0.05] * (len(self.motors) - 1)]
 
     @property
     def timing(self) -> Mapping[str, Parameters]:
@@ -110,7 +128,7 @@ class Rig:
                 self._wait_for_states(self.rate / 4)
             if stage == "letting down":
                 assert self.probe.enable(False).success
-                self.probe.wait_until(lambda: abs(self.true_velocity(1)) > 0.2)
+                self.probe.wait_until(lambda: abs(self.true_velocity(self.struck)) > 0.2)
 
     def _wait_for_states(self, count: float) -> None:
         seen = len(self.probe.joint_states)
@@ -144,7 +162,7 @@ class Rig:
         probe.wait_until(lambda: probe.state == stage)
 
     def true_velocity(self, joint: int) -> float:
-        """Return the newest velocity in rad/s of `joint` (0..3)."""
+        """Return the newest velocity in rad/s of `joint` (0..)."""
         newest = self.truth.newest()
         return 0.0 if newest is None else float(newest["velocity"][joint])
 

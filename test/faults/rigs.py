@@ -41,7 +41,7 @@ PEAK = [9.0, 18.0, 9.0, 9.0]  # Nm
 ChangeMessage = Callable[[JointState], object]
 
 
-def variant(base: type[Rig], **attributes: Any) -> type[Rig]:
+def variant(base: type[Rig], /, **attributes: Any) -> type[Rig]:
     """Return a rig with other parameters."""
     return type(f"{base.__name__} with {', '.join(attributes)}", (base,), attributes)
 

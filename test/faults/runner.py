@@ -94,7 +94,8 @@ def _outcome(rig: Rig) -> str:
 def _response(case: FaultCase, rig: Rig, records: np.ndarray, fault_time: float) -> Response:
     if not len(records):
         return Response()
-    return measure(records, fault_time, 1.0 / rig.rate, case.unreached, case.unpowered, case.steps_from)
+    motors = [motor.spec for motor in rig.motors]
+    return measure(records, fault_time, 1.0 / rig.rate, case.unreached, case.unpowered, case.steps_from, motors)
 
 
 def _failures(
@@ -103,7 +104,7 @@ def _failures(
     """Return what was unsafe."""
     carried = outcome in CARRYING
     late = response.reaction is None or (case.limit is not None and response.reaction > case.limit)
-    must_react = case.limit is not None and not case.must_stay_off and len(case.unreached) < 4
+    must_react = case.limit is not None and not case.must_stay_off and len(case.unreached) < len(rig.motors)
     failures = {
         "empty truth": not len(records),
         "switched on": case.must_stay_off and bool(len(records)) and bool(records["on"].any()),

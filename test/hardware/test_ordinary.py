@@ -15,8 +15,9 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
 
 ROWS = (
-    Row(EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"),
-    Row(EQUIPMENT[2], True, 100.0, "arrival, 16 ms timer of an FTDI adapter"),
+    Row("paper", EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"),
+    Row("paper", EQUIPMENT[2], True, 100.0, "arrival, 16 ms timer of an FTDI adapter"),
+    Row("seven joints", EQUIPMENT[2], False, 100.0, ""),
 )
 
 

@@ -47,7 +47,7 @@ class ShippedArm(VirtualArm):
     def caused(self) -> Driven:
         """What the motors caused."""
         assert isinstance(self.device.truth, TruthRecords)
-        return driven(self.device.truth.records)
+        return driven(self.device.truth.records, [motor.joint.spec for motor in self.device.motors])
 
 
 shipped_arm = prepared(ShippedArm)

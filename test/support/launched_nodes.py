@@ -91,9 +91,11 @@ class LaunchedNodes:
             parameters.update(copy.deepcopy(changes.get(node, {})))  # ROS reads no YAML aliases
         unknown = set(changes) - {name.split("/")[-1] for name in content}
         assert not unknown, f"changes of nodes that are left out: {unknown}"
+        given = (entry["ros__parameters"].get("can") for entry in content.values())
+        channel = next((can["channel"] for can in given if can), GROUP).split(",")[0]
         self.bus: dict[str, Any] = {
             "interface": "udp_multicast",
-            "channel": GROUP,
+            "channel": channel,
             "port": port,
             "hop_limit": 0,
         }
@@ -153,8 +155,8 @@ class LaunchedNodes:
 
     def _end_watchdogs(self) -> None:
         """End watchdogs that retry forever, because their simulated motors are gone, and remove their notes."""
-        port = self.bus["port"]
-        own = ((GROUP, port), (SECOND_GROUP, port + 1))
+        port, first = self.bus["port"], self.bus["channel"]
+        own = ((first, port), (SECOND_GROUP, port + 1))
         names = [f"{group}_{port}.bus" for group, port in own]
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
@@ -162,7 +164,7 @@ class LaunchedNodes:
                     name in os.readlink(descriptor) for descriptor in (process / "fd").iterdir() for name in names
                 ):
                     os.kill(int(process.name), signal.SIGKILL)
-        for group, number in (*own, (GROUP, port + 1)):
+        for group, number in (*own, (first, port + 1)):
             notes_file((self.bus["interface"], group, {"port": number})).unlink(missing_ok=True)
 
 

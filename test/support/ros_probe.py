@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -44,6 +45,7 @@ class RosProbe:
 
     def __init__(self, arm: str = "/right") -> None:
         self.arm = arm
+        self.home_script: Path = CONFIG / "home.yaml"  # that of the paper's arm
         self._thread = NodeThread("ros_probe", after_spin=self._notify)
         self.context, self.executor, (self.node,) = self._thread.context, self._thread.executor, self._thread.nodes
         self.close = self._thread.close
@@ -188,7 +190,7 @@ class RosProbe:
             misplaced = self.fault == "implausible_zero" or is_outside
             if misplaced and time.monotonic() > helped + HELP_TIME:
                 helped = time.monotonic()
-                self.set_parameters("simulator", trial=str(CONFIG / "home.yaml"))
+                self.set_parameters("simulator", trial=str(self.home_script))
             if self.state == "fault":
                 self.trigger("clear_fault")
             elif self.state == "disabled":

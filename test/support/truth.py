@@ -8,19 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from exo_gravity.sim.truth import RECORD
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.sim.truth import record_of
 
 
 class Truth:
-    """The truth log at `path`."""
+    """The truth log at `path`, of an arm with so many joints."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, joints: int = JOINT_COUNT) -> None:
         self.path = path
+        self._record = record_of(joints)
 
     @property
     def count(self) -> int:
         """How many records there are; 0 without a file."""
-        return self.path.stat().st_size // RECORD.itemsize if self.path.exists() else 0
+        return self.path.stat().st_size // self._record.itemsize if self.path.exists() else 0
 
     def newest(self) -> np.ndarray | None:
         """Return the newest record, None if there is none."""
@@ -31,8 +33,8 @@ class Truth:
         """Return the records from `time` (wall clock, s) on."""
         count = self.count
         if not count:
-            return np.empty(0, RECORD)
-        records = np.memmap(self.path, RECORD, "r", shape=(count,))
+            return np.empty(0, self._record)
+        records = np.memmap(self.path, self._record, "r", shape=(count,))
         return self._read(bisect_left(range(count), time, key=lambda index: records["time"][index]), count)
 
     def motors_are_off(self) -> bool:
@@ -42,5 +44,5 @@ class Truth:
 
     def _read(self, start: int, end: int) -> np.ndarray:
         if end <= start:
-            return np.empty(0, RECORD)
-        return np.fromfile(self.path, RECORD, end - start, offset=start * RECORD.itemsize)
+            return np.empty(0, self._record)
+        return np.fromfile(self.path, self._record, end - start, offset=start * self._record.itemsize)
