@@ -321,7 +321,7 @@ def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()
     arm = arm_in_file(values, ": a calibration does not wait for a topic")
     rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
     arm = arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
-    return UrdfMoments(arm.with_wearer(*worn) if worn else arm, rotors)
+    return UrdfMoments(arm.with_wearer(*worn) if worn else arm, rotors, values["use_imu"])
 
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:
