@@ -71,7 +71,9 @@ class WornMujocoArm:
     ) -> None:
         none = (0.0,) * len(joint_names)
         springs = {"wearer_stiffness": tuple(stiffness) or none, "wearer_rest": tuple(rest) or none}
-        config = UrdfConfig(text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog, **springs)
+        config = UrdfConfig(
+            text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog, **springs
+        )
         self._model, _ = config.models(payload)
         self._model.opt.gravity = UPRIGHT
         self._data = mujoco.MjData(self._model)

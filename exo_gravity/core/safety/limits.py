@@ -190,9 +190,7 @@ class Limits:
         moments, names = list(self.largest_moment), self.joint_names
         if not self._has_axes:
             if any(moments) and len(names) != JOINT_COUNT:
-                expected = (
-                    "zeros without axis_x, axis_y, axis_z, which `budget` prints for arms but the paper's"
-                )
+                expected = "zeros without axis_x, axis_y, axis_z, which `budget` prints for arms but the paper's"
                 raise ParameterError("largest_moment", moments, expected)
             return
         for name, moment, axis, way in zip(names, moments, self.axes, self.ways, strict=True):
