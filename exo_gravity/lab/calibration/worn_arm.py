@@ -94,7 +94,7 @@ class PapersWorn:
         self._to_moments = worn_moments(self._robot.length)
         self._table = tuple(map(np.array, self._wearer(tabled=True)))
         self.known = _known(self._robot.length, *self._table)
-        self.expected = moments_of(self._robot.with_wearer(*self._wearer()))
+        self.expected: np.ndarray | None = moments_of(self._robot.with_wearer(*self._wearer()))
 
     def columns(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque (p, 4, 6) in Nm per kg of the mass, and per kg m of M3, M4, Z, Y3, Y4."""
@@ -201,7 +201,7 @@ class UrdfWorn:
         if not np.any(mass):
             expected = "the wearer's, in kg, or wearer.mass and wearer.cog: they also give the inertia"
             raise ParameterError(f"{arm.namespace}/compensator wearer.body_mass", values["wearer.body_mass"], expected)
-        self.changes = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
+        self.changes: Mapping[str, Any] = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
         self._links = np.flatnonzero(mass)
         self._to_moments = np.column_stack([column for link in self._links for column in self._columns_of(int(link))])
         self._mass_columns = np.arange(0, self._to_moments.shape[1], 4)
@@ -220,7 +220,7 @@ class UrdfWorn:
 
     def _prior(self, mass: np.ndarray, cog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what is known before: the table's masses within a half, and their places within some centimetres."""
-        rows, values = [], []
+        rows, values = list[np.ndarray](), list[float]()
         for number, link in enumerate(self._links):
             own, way = mass[link], self._model.arm.directions[link]
             across = np.linalg.svd(way[None])[2][1:]
