@@ -79,9 +79,8 @@ WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming(
 
 
 def _direction(what: str) -> Any:
-    """Return a field with one component of a direction for each joint."""
-    text = f"component along x, in the root link's axes while all angles are 0, {what}" if "along" not in what else what
-    return owned((0.0,) * JOINT_COUNT, text, (-1.0, 1.0), expert=True)
+    """Return a field with one component of a unit vector for each joint."""
+    return owned((0.0,) * JOINT_COUNT, what, (-1.0, 1.0), expert=True)
 
 
 @dataclass(frozen=True)
@@ -136,10 +135,12 @@ class Limits:
         (0.0, 10.0),
         "Nm",
     )
-    axis_x: Sequence[float] = _direction("of each joint's axis, as `budget` prints it; all 0: the paper's arm")
+    axis_x: Sequence[float] = _direction(
+        "along x of the root link, of each joint's axis while all angles are 0, by `budget`; 0 on the paper's arm"
+    )
     axis_y: Sequence[float] = _direction("the same along y")
     axis_z: Sequence[float] = _direction("the same along z")
-    link_x: Sequence[float] = _direction("of each link, from its joint to the next one, as `budget` prints it")
+    link_x: Sequence[float] = _direction("along x of the root link, of the way from each joint to the next, likewise")
     link_y: Sequence[float] = _direction("the same along y")
     link_z: Sequence[float] = _direction("the same along z")
     home: Sequence[float] = owned(
