@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,10 +35,26 @@ SEEDS = range(6)
 NEW_POSES = 100
 
 
+@cache
+def relaxed_poses(name: str) -> list[np.ndarray]:
+    """The poses of the tour for an arm of config, without the visits again."""
+    arm = any_arm(packaged_config(f"{name}.yaml"), "right")
+    arm = replace(arm, compensator={**arm.compensator, "wearer.body_mass": BODY_MASS})
+    model, (low, high) = model_of(arm), worn_arm(arm).comfortable.tolist()
+    limits = replace(arm.limits, position_min=low, position_max=high)
+    poses, taken = candidates(limits, model), [np.array(limits.home)]
+    while len(taken) < WEARER.poses:
+        best = next_pose(taken, poses, DOWN, model.moments, model)
+        taken.append(poses[best])
+        poses = np.delete(poses, best, axis=0)
+    return taken
+
+
 @dataclass
 class Person:
     """A relaxed wearer of an arm of config, drawn at random."""
 
+    name: str
     params: Path
     arm: AnyArm
     truth: WornMujocoArm
@@ -58,20 +75,12 @@ class Person:
         stiffness = STIFFNESS * springs * random.integers(0, 2, count)
         rest = random.uniform(0.0, 0.8, count)
         worn = WornMujocoArm(text, arm.joint_names, mass, place, stiffness=stiffness, rest=rest)
-        return cls(params, arm, worn, WornMujocoArm(text, arm.joint_names, 0.0 * mass, 0.0 * mass), seed)
+        return cls(name, params, arm, worn, WornMujocoArm(text, arm.joint_names, 0.0 * mass, 0.0 * mass), seed)
 
     def observed(self, varying: float = 0.0) -> list[Observation]:
         """What the tour shows. varying: share of the weight that they carry until the poses are visited again."""
-        worn, model, random = worn_arm(self.arm), model_of(self.arm), np.random.default_rng(10 + self.seed)
-        limits = replace(
-            self.arm.limits, position_min=worn.comfortable[0].tolist(), position_max=worn.comfortable[1].tolist()
-        )
-        poses, taken = candidates(limits, model), [np.array(limits.home)]
-        while len(taken) < WEARER.poses:
-            best = next_pose(taken, poses, DOWN, model.moments, model)
-            taken.append(poses[best])
-            poses = np.delete(poses, best, axis=0)
-        seen, count = [], len(limits.home)
+        random, taken = np.random.default_rng(10 + self.seed), relaxed_poses(self.name)
+        seen, count = [], len(self.arm.joint_names)
         for number, theta in enumerate([*taken, *taken[: WEARER.again]]):
             bare = self.bare.torque(theta)
             effort = self.truth.torque(theta) + random.normal(0.0, np.hypot(BREATHING, NOISE), count)
@@ -102,7 +111,7 @@ def value_of(result: CalibrationResult, name: str) -> Sequence[float]:
 
 @pytest.mark.parametrize("name", ["elbow", "three_joints", "seven_joints"])
 def test_a_relaxed_arm_keeps_little_of_its_weight_and_the_band_says_how_much(name: str, tmp_path: Path) -> None:
-    left, sizes, covered = [], [], []
+    left, covered = [], []
     for seed in SEEDS:
         person = Person.of(name, seed, tmp_path)
         result = wearer_from(person.arm, person.observed(), 0.0)
@@ -110,9 +119,8 @@ def test_a_relaxed_arm_keeps_little_of_its_weight_and_the_band_says_how_much(nam
         share, off = person.left(result)
         left.append(share)
         band = 2.0 * np.array(value_of(result, "model_error.wearer_torque"))
-        sizes.append(off)
         covered += (off <= band).tolist()
-    assert np.median(left) < 0.03 and max(left) < 0.06
+    assert np.median(left) < 0.02 and max(left) < 0.04
     assert np.mean(covered) > 0.9
 
 
