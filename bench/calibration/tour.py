@@ -20,7 +20,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
-from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, tour_of
+from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, side_of, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
@@ -88,8 +88,8 @@ def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -
     if values["use_imu"]:
         imu = SimulatedImu(imu_of(simulator))
         tilt = measured_tilt(*tilt, imu, content["/imu"]["rotation_trunk_from_imu"])
-    side = values.get("side", "left")  # the root link of a URDF is not mirrored
-    return Player(tour_of(values), device, motors_of(bridge), limits_of(bridge), bridge["rate"], Tilt.of(side, *tilt))
+    seen = Tilt.of(side_of(values), *tilt)
+    return Player(tour_of(values), device, motors_of(bridge), limits_of(bridge), bridge["rate"], seen)
 
 
 def let_hang(device: SimulatedDevice) -> None:

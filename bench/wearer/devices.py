@@ -33,7 +33,9 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
-from exo_gravity.lab.calibration.tours import WEARER, moments_from, wearer_from
+from exo_gravity.lab.calibration.tours import moments_from
+from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
+from exo_gravity.lab.calibration.worn_arm import WORN
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -126,7 +128,7 @@ def holding(arm: SimulatedArm, theta: Vector, direction: Vector) -> np.ndarray:
 def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     """Return the poses of `calibrate wearer`, chosen as it does, the first ones again at the end."""
     nominal = configured_arm(packaged_config("sim.yaml"))
-    low, high = np.maximum(nominal.low, WEARER.comfortable[0]), np.minimum(nominal.high, WEARER.comfortable[1])
+    low, high = np.maximum(nominal.low, WORN.comfortable[0]), np.minimum(nominal.high, WORN.comfortable[1])
     limits = replace(nominal.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, PAPERS), [hanging(limits).theta]
     expected = moments_of(nominal.robot.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)))

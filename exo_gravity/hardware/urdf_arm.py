@@ -19,7 +19,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,16 +35,16 @@ from exo_gravity.core.arm.arm import (
     STANDARD_GRAVITY,
 )
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError, with_extra
 from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
+from exo_gravity.hardware.urdf_links import UrdfLinks
 
 PACKAGE = "package://"
 MOMENT_NAMES = tuple(f"urdf.moment_{axis}" for axis in "xyz")  # the compensator's parameters
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
-POSES = 500  # at random, for the least inertia
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
 INERTIAL = 10  # parameters of a link in Pinocchio's regressor: mass, first moment, inertia
@@ -93,6 +93,15 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
     return arm_from(values, read_urdf(values["urdf.file"]))
 
 
+class Skeleton(NamedTuple):
+    """What `can_bridge` is told of an arm of n joints, for its own computation of gravity: in the root link's axes."""
+
+    axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
+    ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
+    moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
+    beside: np.ndarray  #: (n,) kg m, the most by which masses beside the links load each joint in any pose
+
+
 class UrdfArm:
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
@@ -124,10 +133,11 @@ class UrdfArm:
         self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
+        self._worn_moments = np.zeros((len(names), 3))  # kg m, of the wearer, in place of `_worn`
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
         self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
         self._identity = text, tuple(names)
-        self._bare = self._model  # without load and wearer
+        self._bare = self._by_mass = self._model  # without load and wearer
         self._data = self._model.createData()
         self._pin.computeSubtreeMasses(self._model, self._data)
         self._own_mass = max(self._data.mass[joint] for joint in self._joints)
@@ -146,7 +156,7 @@ class UrdfArm:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        held = self.payload, self._worn, self._own_mass
+        held = self.payload, self._worn, self._worn_moments.tobytes(), self._own_mass
         return (*self._identity, self._hand, self._rotors, self.scale, *held, self._change.tobytes())
 
     @cached_property
@@ -177,7 +187,7 @@ class UrdfArm:
     @cached_property
     def links(self) -> UrdfLinks:
         """The inertia of links, load, wearer and rotors."""
-        return UrdfLinks(self._pin, self._model, self._moves, self._rotors)
+        return UrdfLinks(self._pin, self._by_mass, self._moves, self._rotors)
 
     def worn_links(self, mass: Vector, cog: Vector) -> UrdfLinks:
         """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
@@ -237,15 +247,36 @@ class UrdfArm:
         if np.array_equal(change, self._change):
             return self
         arm = copy.copy(self)
-        arm._bare = self._bare.copy()
-        for joint, name, own in zip(self._joints, self._moves.names, change - self._change, strict=True):
-            link = arm._bare.inertias[joint]
-            if any(own) and not link.mass:
-                raise ParameterError(f"urdf.moment of {name}", own.tolist(), "0: its link has no mass in the URDF")
-            if any(own):
-                arm._bare.inertias[joint] = self._pin.Inertia(link.mass, link.lever + own / link.mass, link.inertia)
+        arm._bare = self._shifted(self._bare, change - self._change, "urdf.moment")
         arm._change = np.array(change)
         return arm._held()
+
+    def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> UrdfArm:
+        """Return this arm plus a share `support` (0..1) of what a wearer's arm adds to the first moments of the links.
+
+        moments: (n, 3) kg m, along x, y, z of each joint's frame, in place of any other wearer. The inertia is that of
+        the arm alone. Raises ParameterError.
+        """
+        arm = copy.copy(self)
+        arm._worn, arm._worn_moments = (), one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
+        return arm._held()
+
+    def _shifted(self, model: Any, moments: np.ndarray, what: str) -> Any:
+        """Return a copy of `model` whose links have these `moments` (n, 3) kg m more: their centres of gravity move."""
+        shifted = model.copy()
+        for joint, name, own in zip(self._joints, self._moves.names, moments, strict=True):
+            link = shifted.inertias[joint]
+            if any(own) and not link.mass:
+                raise ParameterError(f"{what} of {name}", own.tolist(), "0: its link has no mass in the URDF")
+            if any(own):
+                shifted.inertias[joint] = self._pin.Inertia(link.mass, link.lever + own / link.mass, link.inertia)
+        return shifted
+
+    @property
+    def directions(self) -> np.ndarray:
+        """Unit vectors (n, 3) along the links in their joints' frames, zeros for one without length."""
+        length = np.array(self.length)[:, None]
+        return np.divide(self._along, length, out=np.zeros((len(length), 3)), where=length >= LEAST_LENGTH)
 
     @property
     def change(self) -> np.ndarray:
@@ -349,6 +380,24 @@ class UrdfArm:
         centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
         return np.array([link.mass for link in links]), np.array(centres)
 
+    def skeleton(self) -> Skeleton | None:
+        """Return axes, links and largest moments of all that the arm holds; None if its joints are no single chain."""
+        parents = [self._model.parents[joint] for joint in self._joints]
+        if not self.moves_alone or parents[1:] != self._joints[:-1]:
+            return None
+        self.places([0.0] * len(self.names))
+        self._pin.computeSubtreeMasses(self._model, self._data)
+        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
+        for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
+            link = self._model.inertias[joint]
+            own = link.mass * link.lever
+            beyond = length * (self._data.mass[joint] - link.mass)
+            moments[n] = max(0.0, float(own @ way) + beyond) if np.any(way) else 0.0
+            beside[n] = np.linalg.norm(own + beyond * ways[n] - moments[n] * ways[n])
+        axes = np.einsum("nab,nb->na", turns, self._axes)
+        return Skeleton(axes, np.einsum("nab,nb->na", turns, ways), moments, np.cumsum(beside[::-1])[::-1])
+
     def places(self, theta: Sequence[float]) -> np.ndarray:
         """Return where the joints are at `theta` (n,) rad, and the hand or the last joint again: (n + 1, 3) m.
 
@@ -380,6 +429,7 @@ class UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
         arm = self.scaled(np.ones(len(self.gain)).tolist(), gravity)
         arm.payload, arm._worn, arm._own_mass = NO_PAYLOAD, (), 0.0
+        arm._worn_moments = np.zeros_like(self._worn_moments)
         arm._bare = self._bare.copy()
         for joint in range(arm._bare.njoints):
             arm._bare.inertias[joint] = self._pin.Inertia.Zero()
@@ -413,6 +463,7 @@ class UrdfArm:
                 raise ParameterError("wearer.mass", mass, f"0 on link {number}, which has no length and no direction")
         arm = copy.copy(self)
         arm._worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
+        arm._worn_moments = np.zeros_like(self._worn_moments)
         return arm._held()
 
     def _anew(self) -> UrdfArm:
@@ -431,6 +482,9 @@ class UrdfArm:
         for joint, (mass, cog), way in zip(self._joints, self._worn, self._along, strict=False):
             if mass:
                 self._add(joint, mass, way * (cog / np.linalg.norm(way)))
+        self._by_mass = self._model  # moments alone have no inertia
+        if np.any(self._worn_moments):
+            self._model = self._shifted(self._model, self._worn_moments, "wearer.moment")
         return self._anew()
 
     def _add(self, joint: int, mass: float, place: np.ndarray) -> None:
@@ -466,48 +520,6 @@ class UrdfArm:
             else:
                 ways.append(np.zeros(3))
         return ways
-
-
-class UrdfLinks:
-    """The inertia of an arm by Pinocchio: `Links` of core/arm/interface.py.
-
-    moves: how the joints of `model` move.
-    rotors: (n,) kg m^2 at the joints.
-    """
-
-    def __init__(self, pin: Any, model: Any, moves: UrdfJoints, rotors: Sequence[float]) -> None:
-        self._pin, self._moves, self._rotors = pin, moves, np.array(rotors)
-        self._model, self._data = model, model.createData()
-
-    def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
-        """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
-        self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
-        rates = (self._moves.spread(values) for values in (velocity, acceleration))
-        torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
-        return tuple((self._moves.folded(torque) + self._rotors * acceleration).tolist())
-
-    def momentum(
-        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
-    ) -> tuple[Torque, Torque]:
-        """Return the generalized momentum p = M v, (n,) kg m^2/s, and C^T v, (n,) Nm, with M' = C + C^T.
-
-        turning: angular velocity of the base, (3,) rad/s, whose part is neglected.
-        """
-        speed, at = self._moves.spread(velocity), self._moves.configuration(theta)
-        momentum = self.matrix(theta) @ np.asarray(velocity)
-        coriolis = self._pin.computeCoriolisMatrix(self._model, self._data, at, speed)
-        return tuple(momentum.tolist()), tuple(self._moves.folded(coriolis.T @ speed).tolist())
-
-    def matrix(self, theta: Sequence[float]) -> np.ndarray:
-        """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
-        upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
-        return np.asarray(self._moves.folded_matrix(upper + np.triu(upper, 1).T) + np.diag(self._rotors))
-
-    @cached_property
-    def least(self) -> tuple[float, ...]:
-        """The least inertia (n,) in kg m^2 that each joint feels, the other joints being free, in poses at random."""
-        poses = np.random.default_rng(0).uniform(-math.pi, math.pi, (POSES, len(self._moves.names)))
-        return tuple(np.min([1.0 / np.diag(np.linalg.inv(self.matrix(pose))) for pose in poses], axis=0).tolist())
 
 
 def _pinocchio() -> Any:

@@ -4,8 +4,8 @@
 The steps run over the control loop and the motor bus that carry a worn arm, without a watchdog: a person stands at the
 emergency stop. The same steps judge the simulated device, and the record says which of the two it was.
 
-The weight hangs on the last link, and the motor of that joint lifts it; the other joints hang. Torque, angle and weight
-then balance. Friction adds to the weight on the way up and takes from it on the way down: the mean of both counts.
+The weight hangs on the last link of any arm, and the motor of that joint lifts it; the other joints hang. Torque, angle
+and weight then balance. Friction adds to the weight on the way up and takes from it on the way down: the mean counts.
 """
 
 import json
@@ -19,8 +19,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+import numpy as np
+
+from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.boards import CHECK
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_of_bus
 from exo_gravity.core.numbers import limited
@@ -33,7 +34,9 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import BusLock
-from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.tours import model_of
+from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 
@@ -46,6 +49,7 @@ class BenchAcceptance:
     silence: float = 0.3  #: s without a reply that show that the supply was off
     start: float = 20.0  #: s for the checks of a start to pass
     angle: float = math.radians(30.0)  #: rad to which the weight is lifted: enough for its torque, not far to fall
+    least: float = 0.3  #: Nm that the last joint must need there: less is lost in friction and resolution
     rise: float = 0.3  #: Nm/s; an arm that is lifted so slowly is in balance all the time
     higher: float = 1.3  #: times that torque, from which the weight comes down again
     still: float = 0.5  #: s for which a joint must turn by less than
@@ -63,7 +67,7 @@ ACCEPTANCE = BenchAcceptance()
 
 @dataclass(frozen=True)
 class Weight:
-    """The known weight: kg, and m from the elbow."""
+    """The known weight: kg, and m from the last joint, on the way to the hand."""
 
     mass: float
     lever: float
@@ -107,7 +111,7 @@ class Bench:
     """An arm on the bench, its loop, and the person beside it.
 
     loop: of the arm; its controller is `lift`.
-    robot: the arm without the weight, as the file has it.
+    model: the arm without the weight, as the file has it.
     advance: lets the loop run for some s.
     ask: shows the person a request, and calls a function many times a second until it is done.
     """
@@ -117,23 +121,31 @@ class Bench:
         loop: ControlLoop,
         lift: Lift,
         motors: Sequence[JointMotor],
-        robot: ArmModel,
+        model: MomentModel,
         weight: Weight,
         advance: Callable[[float], None],
         ask: Callable[[str, Callable[[], str]], None],
         clock: Clock,
     ) -> None:
-        self.loop, self.lift, self.motors, self.robot, self.weight = loop, lift, motors, robot, weight
+        self.loop, self.lift, self.motors, self.model, self.weight = loop, lift, motors, model, weight
         self.advance, self.ask, self.clock = advance, ask, clock
-        self.moments = moments_of(robot) + load_moments(robot.length.tolist(), weight.mass, weight.lever)
+        self.moments = model.moments + model.load(weight.mass, weight.lever)
 
     def needed(self, angles: Sequence[float]) -> float:
-        """Return the torque in Nm that the last joint needs to hold the weight at these angles (4,) in rad."""
-        return float((regressor(angles, gravity=self.robot.gravity)[0] @ self.moments)[-1])
+        """Return the torque in Nm that the last joint needs to hold the weight at these angles (n,) in rad."""
+        down = self.model.down(Tilt.of(SIDES[0]))  # the base is upright
+        return float((self.model.rows(np.array([angles]), down)[0] @ self.moments)[-1])
+
+    @property
+    def way(self) -> float:
+        """The direction, 1 or -1, in which the last joint has more room from `home`: there it lifts the weight."""
+        limits = self.loop.safety.limits
+        low, home, high = (column[-1] for column in (limits.position_min, limits.home, limits.position_max))
+        return 1.0 if high - home >= home - low else -1.0
 
     @property
     def angles(self) -> list[float]:
-        """The joint angles (4,) in rad."""
+        """The joint angles (n,) in rad."""
         return [sample.position for sample in self.loop.samples]
 
     def until(self, condition: Callable[[], object], timeout: float, watch: Callable[[], None] = lambda: None) -> bool:
@@ -161,10 +173,15 @@ class Bench:
 
         Returns why it does not come to rest, or ''.
         """
-        self.lift.goal = share * self.needed([0.0] * (len(self.motors) - 1) + [ACCEPTANCE.angle])
-        most = self.loop.safety.limits.max_effort[-1]
-        if self.lift.goal > most:
-            return f"the weight needs {self.lift.goal:.2f} Nm, max_effort permits {most:g}: take a lighter one"
+        limits = self.loop.safety.limits
+        lifted = [*limits.home[:-1], limits.home[-1] + self.way * ACCEPTANCE.angle]
+        goal, most = share * self.needed(lifted), limits.max_effort[-1]
+        if self.way * goal < ACCEPTANCE.least:
+            expected = f"at least {ACCEPTANCE.least:g}: take a heavier one; the last joint must lift it"
+            return f"the weight needs {self.way * goal:.2f} Nm, must be {expected}"
+        if abs(goal) > most:
+            return f"the weight needs {abs(goal):.2f} Nm, max_effort permits {most:g}: take a lighter one"
+        self.lift.goal = goal
         still, since = self.angles[-1], self.clock.monotonic()
 
         def is_still() -> bool:
@@ -205,21 +222,23 @@ def zero(bench: Bench) -> BenchStep:
 
     bench.ask("let the arm hang, hands off; switch the motors' supply off and on", watch)
     bench.until(lambda: all(bench.clock.monotonic() - one.time < 0.1 for one in bench.loop.samples), ACCEPTANCE.start)
-    after, tolerance = bench.angles, bench.loop.safety.limits.home_tolerance
+    after, limits = bench.angles, bench.loop.safety.limits
     moved = max(abs(now - then) for now, then in zip(after, before, strict=True))
-    is_home = all(abs(angle) <= most for angle, most in zip(after, tolerance, strict=True))
+    columns = zip(after, limits.home, limits.home_tolerance, strict=True)
+    is_home = all(abs(angle - home) <= most for angle, home, most in columns)
     passed = len(silent) == len(bench.motors) and moved <= ACCEPTANCE.same and is_home
     sentence = (
         f"{len(silent)} motors were silent while their supply was off, must be {len(bench.motors)}; the hanging arm "
         f"turned by {math.degrees(moved):.1f} degrees at most, must be within {math.degrees(ACCEPTANCE.same):g}; it is "
-        f"{'near' if is_home else 'not near'} zero"
+        f"{'near' if is_home else 'not near'} {'home' if any(limits.home) else 'zero'}"
     )
     return BenchStep("zero", passed, sentence, {"before_rad": before, "after_rad": after, "silent": sorted(silent)})
 
 
 def sign(bench: Bench) -> BenchStep:
     """Check that every motor switches on, and pushes its joint the way that its encoder shows."""
-    bench.ask(f"hang {bench.weight.mass:g} kg at {bench.weight.lever:g} m from the elbow; stand clear", lambda: "")
+    last, weight = bench.loop.safety.limits.joint_names[-1], bench.weight
+    bench.ask(f"hang {weight.mass:g} kg at {weight.lever:g} m from the joint {last}; stand clear", lambda: "")
     why = bench.carry()
     return BenchStep("sign", not why, why or "every joint moved the way it was pushed")
 
@@ -277,7 +296,7 @@ def time_out(bench: Bench) -> BenchStep:
     paused = bench.loop.call(lambda: bench.clock.sleep(ACCEPTANCE.pause))
     bench.until(paused.done, 2.0 * ACCEPTANCE.pause)
     bench.advance(0.1)
-    fallen = before - bench.angles[-1]
+    fallen = bench.way * (before - bench.angles[-1])
     has_let_go = fallen > ACCEPTANCE.dip
     expected = f"it must {'let go' if timeout else 'hold'}: motor_timeout = {timeout:g} s"
     sentence = (
@@ -316,8 +335,13 @@ def record(results: Sequence[BenchStep], arm: str, source: Source) -> dict[str, 
     return {"arm": arm, "date": date, "source": source.value, "passed": passed, "steps": steps}
 
 
-def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, person: Any) -> bool:
-    """Run the acceptance on the bus of `arm`, and write its record; return whether it passed. Raises BusError."""
+def accept_arm(params: Path, output: Path, arm: AnyArm, weight: Weight, person: Any) -> bool:
+    """Run the acceptance on the bus of `arm`, and write its record; return whether it passed.
+
+    Raises BusError, and ParameterError if the weight cannot hang there.
+    """
+    model = model_of(arm)
+    model.load(weight.mass, weight.lever)
     interface, channel = arm.can_bridge["can.interface"], arm.can_bridge["can.channel"]
     address = interface, channel, can_options(load(params)[f"{arm.namespace}/can_bridge"])
     period = 1.0 / arm.can_bridge["rate"]
@@ -332,7 +356,7 @@ def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, p
         loop = ControlLoop(bus, SafetyMachine(arm.limits, period, arm.motors), period, lift)
         loop.start()
         held.callback(loop.stop)
-        bench = Bench(loop, lift, arm.motors, arm.robot, weight, time.sleep, person.wait, COMPUTER_CLOCK)
+        bench = Bench(loop, lift, arm.motors, model, weight, time.sleep, person.wait, COMPUTER_CLOCK)
         results = accept(bench, person.say)
     written = record(results, arm.name, source_of_bus(interface, channel))
     output.write_text(json.dumps(written, indent=2, default=float) + "\n", encoding="utf-8")

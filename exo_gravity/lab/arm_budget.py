@@ -18,6 +18,8 @@ from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.wearer import PAPER_LINKS, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
+from exo_gravity.core.safety.motion_monitor import GRAVITY
+from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.budget import (
     JointBudget,
     budget,
@@ -119,9 +121,26 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
     else:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     if arm.by_urdf:
+        yield from _skeleton_lines(arm, names)
         return
     moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in papers(arm.carrying).first_moment)
     yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
+
+
+def _skeleton_lines(arm: ArmBudget, names: str) -> Iterator[str]:
+    """Yield what the can_bridge of an arm from a URDF needs to judge efforts; nothing if it is no single chain."""
+    skeleton = arm.carrying.skeleton() if isinstance(arm.carrying, UrdfArm) else None
+    if skeleton is None:
+        return
+    yield f"For the can_bridge of {names}, if it never carries more; add what assistance and terms may add:"
+    rows = {
+        "largest_moment": np.ceil(1000.0 * skeleton.moments) / 1000.0,  # kg m
+        "largest_addition": np.ceil(100.0 * GRAVITY * skeleton.beside) / 100.0,  # Nm
+        **{f"axis_{name}": column for name, column in zip("xyz", skeleton.axes.T, strict=True)},
+        **{f"link_{name}": column for name, column in zip("xyz", skeleton.ways.T, strict=True)},
+    }
+    for name, values in rows.items():
+        yield f"    {name}: {(values.round(4) + 0.0).tolist()}"
 
 
 def joint_figure(arm: ArmBudget, joint: int) -> "Figure":

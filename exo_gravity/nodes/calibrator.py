@@ -25,7 +25,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN, NodeState
-from exo_gravity.lab.calibration.tour import calibrator_table, tour_of
+from exo_gravity.lab.calibration.tour import calibrator_table, side_of, tour_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare, given_to
 from exo_gravity.nodes.ros.run import run
@@ -50,7 +50,7 @@ class CalibratorNode(Node):
         values = declare(self, calibrator_table(given_to(self)))
         self._names, self._uses_imu = values["joint_names"], values["use_imu"]
         self._tour = tour_of(values)
-        self._tilt = TiltInput(values.get("side", "left"), values["tilt_timeout"])
+        self._tilt = TiltInput(side_of(values), values["tilt_timeout"])
         self._bridge = f"{self.get_namespace().strip('/')}/can_bridge".lstrip("/")
         self._bridge_state, self._bridge_message = "", ""
         self._began = False

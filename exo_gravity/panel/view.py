@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.compensation.settings import COMPENSATOR, URDF, WORN_MOMENTS
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.params import Param
 from exo_gravity.lab.source import source_of
@@ -30,9 +30,9 @@ PANEL = (
 # fmt: on
 # What the page may change on a compensator. Every limit stays with the compensator and the bridge.
 # Found by `calibrate wearer`: the page withdraws them with another wearer's data.
-CALIBRATED = ("wearer.first_moment", "wearer.off_axis", "wearer.joint_stiffness")
+CALIBRATED = ("wearer.first_moment", "wearer.off_axis", *WORN_MOMENTS, "wearer.joint_stiffness")
 LOAD = ("mode", "wearer.body_mass", "wearer.sex", "wearer.segment_length", *CALIBRATED, "support", "payload.mass")
-SETTABLE = {param.name: param for param in COMPENSATOR if param.name in LOAD}
+SETTABLE = {param.name: param for param in (*COMPENSATOR, *URDF) if param.name in LOAD}
 # What belongs to a subject: in the wearer's file, and set by the page together with the wearer's data.
 OF_SUBJECT = {p.name: p for p in COMPENSATOR if p.name in (*LOAD[1:4], "limits.lower", "limits.upper")}
 

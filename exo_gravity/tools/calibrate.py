@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.lab.inputs.arms import any_arm, configured_arm
+from exo_gravity.lab.inputs.arms import any_arm
 from exo_gravity.tools.cli import extras, require_ros
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ COMMANDS = {
     "gravity": ("tours", "the robot's first moments, from a slow tour of poses"),
     "friction": ("tours", "friction of each joint, from slow sweeps"),
     "scale": ("tours", "torque scale of each motor, from a known weight on the last link"),
-    "wearer": ("tours", "the moments of the wearer's relaxed arm"),
+    "wearer": ("wearer", "the moments of the wearer's relaxed arm"),
     "check": ("tours", "nothing: whether a few poses still need the torque of the last calibration"),
     "imu": ("imu", "the mounting of the IMU, from standing upright and bowing"),
     ACCEPTANCE: ("", "nothing: a record (JSON) of what the first real, unworn arm shows on the bench, step by step"),
@@ -53,7 +53,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
         if name == ACCEPTANCE:
             option("--mass", type=float, required=True, metavar="KG", help="of the weight that is lifted")
-            option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
+            option("--lever", type=float, required=True, metavar="M", help="from the last joint to the weight")
         elif name == "motors":
             option(
                 "--pose", type=float, nargs="+", default=(), metavar="DEG",
@@ -76,7 +76,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
             )  # fmt: skip
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")
-            option("--lever", type=float, required=True, metavar="M", help="from the elbow to the weight")
+            option("--lever", type=float, required=True, metavar="M", help="from the last joint to the weight")
     what = "the first parameter file of an arm, from its URDF, its motors and their CAN IDs"
     new = commands.add_parser(NEW, help=f"writes {what}", description=f"calibrate {NEW}: writes {what}.")
     option = new.add_argument
@@ -164,5 +164,5 @@ def _accept(options: argparse.Namespace, person: "Person") -> int:
     from exo_gravity.lab.calibration.result import check_output
 
     check_output(options.output)
-    arm, weight = configured_arm(options.params, options.side), Weight(options.mass, options.lever)
+    arm, weight = any_arm(options.params, options.side), Weight(options.mass, options.lever)
     return 0 if accept_arm(options.params, options.output, arm, weight, person) else 1

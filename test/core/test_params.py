@@ -200,7 +200,7 @@ def test_what_differs_between_the_joints_of_the_papers_arm_is_no_default_for_ano
         ({"zero": [0.0] * 4}, r"^zero = .*: must be 1 number"),
         ({"joint_names": []}, r"^joint_names = \[\]: must be 4 strings"),
         ({"home": [2.9]}, r"^home of elbow = 2\.9: must be within its limits, -0\.1 to 2\.4 rad"),
-        ({"largest_moment": [0.3]}, r"^largest_moment = \[0\.3\]: must be zeros for another arm than the paper's"),
+        ({"largest_moment": [0.3]}, r"^largest_moment = \[0\.3\]: must be zeros without axis_x"),
         ({"can.channel": "a,b"}, r"^can\.channel = 'a,b': must be one channel for all motors, or 1"),
     ],
 )

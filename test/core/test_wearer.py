@@ -57,6 +57,18 @@ def test_a_centre_of_gravity_beyond_its_link_is_rejected_with_the_segments_name(
         Wearer(75.0).on_links(links)
 
 
+def test_a_forearm_in_several_links_has_forearm_and_hand_each_at_their_own_place():
+    wearer, short = Wearer(75.0, "male", "de_leva", LENGTHS), (0.06, 0.1, 0.18, 0.09, 0.15, 0.04, 0.1)
+    mass, cog = wearer.on_links(short, (3, 4))
+    (upper, upper_cog), (forearm, forearm_cog), (hand, hand_cog) = wearer.segments
+    assert mass == pytest.approx((0, 0, upper, 0, forearm, 0, hand))
+    assert cog == pytest.approx((0, 0, upper_cog, 0, forearm_cog - 0.09, 0, 0.27 + hand_cog - 0.28))
+    with pytest.raises(ParameterError, match=r"upper arm is at 0\.162 m, beyond link 3"):  # link 4 is the forearm's
+        wearer.on_links((0.06, 0.1, 0.15, 0.09, 0.15, 0.04, 0.1), (3, 4))
+    with pytest.raises(ParameterError, match=r"forearm and hand is at 0\.338 m, beyond link 5"):
+        wearer.on_links(short[:5], (3, 4))
+
+
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [

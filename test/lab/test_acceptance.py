@@ -14,8 +14,13 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
+from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
+from exo_gravity.lab.calibration.tours import model_of
+from exo_gravity.lab.inputs.arms import any_arm, node_values
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
 from ..support.simulated_device import SPECS
@@ -63,19 +68,46 @@ def acceptance(
     firmware = Firmware(timeout=spoil.pop("timeout", 0.0))
     boards = [SimulatedMotor(one, firmware) for one in true]
     device = SimulatedDevice(SimulatedArm(ArmConfig(links=loaded_links())), boards)
-    person, lift = Person(), Lift(LIMITS, 1.0 / RATE)
-    device.motors[0].temperature = spoil.pop("temperature", 25.0)
+    person = Person()
     for motor in device.motors[1:]:
         motor.temperature = 25.0
+    device.motors[0].temperature = spoil.pop("temperature", 25.0)
     for name, value in spoil.items():
         setattr(person, name, value)
-    person.arm = arm = VirtualArm(device, lift, assumed, LIMITS, RATE)
-    bench = Bench(arm.loop, lift, assumed, DEFAULT_LINKS, WEIGHT, arm.run, person.ask, arm.clock)
+    return played(device, assumed, LIMITS, PapersMoments(DEFAULT_LINKS), WEIGHT, person, RATE)
+
+
+def played(
+    device: SimulatedDevice,
+    assumed: tuple[JointMotor, ...],
+    limits: Limits,
+    model: MomentModel,
+    weight: Weight,
+    person: Person,
+    rate: float,
+) -> list[BenchStep]:
+    """Run the acceptance of `device`, which already carries the weight; the rest is what the file says."""
+    lift = Lift(limits, 1.0 / rate)
+    person.arm = arm = VirtualArm(device, lift, assumed, limits, rate)
+    bench = Bench(arm.loop, lift, assumed, model, weight, arm.run, person.ask, arm.clock)
     results = accept(bench, person.said.append)
     assert not device.powered
     assert len(person.said) == len(results)
     arm.bus.stop()
     return results
+
+
+def of_urdf(name: str, weight: Weight, scale: float = 1.0) -> list[BenchStep]:
+    """Run the acceptance of an arm of config whose motors give `scale` of what they are commanded."""
+    params = packaged_config(f"{name}.yaml")
+    arm, nodes = any_arm(params, "right"), load(params)
+    none, simulator = [0.0] * (len(arm.motors) - 1), nodes["/right/simulator"]
+    simulator |= {"wearer.mass": [*none, weight.mass], "wearer.cog": [*none, weight.lever]}
+    simulator["torque_scale"] = [scale] * len(arm.motors)
+    device = device_of(node_values(nodes, "/right/simulator", simulator_table(simulator)))
+    for motor in device.motors:
+        motor.temperature = 25.0
+    return played(device, arm.motors, arm.limits, model_of(arm), weight, Person(), arm.can_bridge["rate"])
 
 
 def failed(results: list[BenchStep]) -> str:
@@ -95,6 +127,21 @@ def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
     measured = results[NAMES.index("torque")].measured
     assert measured["ratio"] == pytest.approx(1.0, abs=0.15)
     assert not record(results[:-1], "right", Source.REAL)["passed"]  # a step is missing
+
+
+@pytest.mark.parametrize(
+    ("name", "weight"),
+    [("elbow", Weight(2.0, 0.2)), ("three_joints", Weight(1.0, 0.2)), ("seven_joints", Weight(1.5, 0.09))],
+)
+def test_an_arm_from_a_urdf_passes_every_step_and_one_with_weak_motors_fails_at_the_known_weight(name, weight):
+    results = of_urdf(name, weight)
+    assert failed(results) == "", results[-1].sentence
+    assert failed(of_urdf(name, weight, scale=0.6)) == "torque"
+
+
+def test_a_weight_that_the_last_joint_hardly_feels_is_refused():
+    results = of_urdf("three_joints", Weight(0.05, 0.02))
+    assert failed(results) == "torque" and "must be at least 0.3: take a heavier one" in results[-1].sentence
 
 
 def test_a_motor_without_the_offset_of_its_temperature_fails_when_cold():
@@ -122,5 +169,5 @@ def test_a_time_out_that_is_not_that_of_the_file_fails(true, assumed, sentence):
 
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
-    bench = Bench(None, None, MOTORS, DEFAULT_LINKS, WEIGHT, None, None, None)
+    bench = Bench(None, None, MOTORS, PapersMoments(DEFAULT_LINKS), WEIGHT, None, None, None)
     assert bench.moments == pytest.approx(moments_of(loaded_links()))

@@ -167,3 +167,14 @@ def test_the_budget_of_an_arm_from_a_urdf_is_what_mujoco_needs_in_its_worst_pose
     assert joint.torque == pytest.approx(max(needs), rel=1e-4)
     assert "1 elbow" in "\n".join(table_lines(found))
     assert len(joint_figure(found, 0).axes) == 2
+
+
+@pytest.mark.thorough
+def test_the_budget_of_a_forearm_in_several_links_is_what_mujoco_needs_in_its_worst_poses() -> None:
+    arm = any_arm(packaged_config("seven_joints.yaml"), "right")
+    found = arm_budget(arm, Wearer(75.0), 1.0, 0.0, 0.0)
+    load = Wearer(75.0).on_links(arm.robot.length, arm.compensator["wearer.links"])
+    text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
+    oracle = WornMujocoArm(text, arm.joint_names, load.mass, load.cog)
+    for number, joint in enumerate(found.joints):
+        assert joint.torque == pytest.approx(abs(oracle.torque(joint.worst[:-2])[number]), rel=1e-4)

@@ -102,7 +102,7 @@ class PlayedArms:
         self.reads += 1
         if self.problem:
             raise ExoGravityError(self.problem)
-        return {name: self.settings[arm][name] for name in SETTABLE}
+        return {name: value for name, value in self.settings[arm].items() if name in SETTABLE}
 
     async def ask(self, kind: str, arm: str, values: Mapping[str, Any]) -> str:
         self.calls.append((kind, arm, str(dict(values))) if values else (kind, arm))

@@ -56,6 +56,7 @@ class WornMujocoArm:
     """The arm that `joint_names` (n,) move in the URDF `text`, with all that it holds.
 
     mass, cog: of the wearer's segment on each link, (n,) kg and (n,) m. payload: kg, and (3,) m, in the link `hand`.
+    stiffness, rest: of the springs of the wearer's joints, (n,) Nm/rad and (n,) rad; () for none.
     """
 
     def __init__(
@@ -65,8 +66,14 @@ class WornMujocoArm:
         mass: Sequence[float],
         cog: Sequence[float],
         payload: Sequence[float] = (0.0,) * 4,
+        stiffness: Sequence[float] = (),
+        rest: Sequence[float] = (),
     ) -> None:
-        config = UrdfConfig(text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog)
+        none = (0.0,) * len(joint_names)
+        springs = {"wearer_stiffness": tuple(stiffness) or none, "wearer_rest": tuple(rest) or none}
+        config = UrdfConfig(
+            text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog, **springs
+        )
         self._model, _ = config.models(payload)
         self._model.opt.gravity = UPRIGHT
         self._data = mujoco.MjData(self._model)
@@ -75,4 +82,4 @@ class WornMujocoArm:
         """Return what holds the arm at `theta` (n,) rad on an upright base, (n,) Nm."""
         self._data.qpos[:] = theta
         mujoco.mj_forward(self._model, self._data)
-        return self._data.qfrc_bias.copy()
+        return self._data.qfrc_bias - self._data.qfrc_passive

@@ -20,7 +20,8 @@ from exo_gravity.core.numbers import COVER
 from exo_gravity.core.params import values_of
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
-from exo_gravity.lab.calibration.tours import calibrate_scale, friction_from, moments_from, wearer_from
+from exo_gravity.lab.calibration.tours import calibrate_scale, friction_from, moments_from
+from exo_gravity.lab.calibration.wearer import wearer_from
 from exo_gravity.lab.calibration.wearer_fit import fit_wearer
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config

@@ -36,9 +36,9 @@ class Tilt(NamedTuple):
 
     @property
     def gravity_in_trunk(self) -> tuple[float, float, float]:
-        """Unit vector of gravity (3,) in the trunk's axes, if this is the tilt of the left arm."""
-        x, y, z = self.direction
-        return y, x, -z
+        """Unit vector of gravity (3,) in the trunk's axes, which the root link of a URDF has on either side."""
+        level = math.cos(self.pitch)
+        return math.sin(self.pitch), -math.sin(self.roll) * level, -math.cos(self.roll) * level
 
     @classmethod
     def of(cls, side: str, pitch: float = 0.0, roll: float = 0.0) -> "Tilt":

@@ -116,26 +116,30 @@ class Wearer:
     def on_links(self, link_length: Vector, links: Sequence[int] = PAPER_LINKS) -> LinkLoad:
         """Return the load of this wearer's arm on a robot with links of `link_length` (n,) m.
 
-        links: which of them, from 1 on, carry the upper arm, and forearm and hand; 0: the robot does not carry it.
+        links: which of them, from 1 on, carry the upper arm, and forearm and hand; 0: the robot does not carry it. What
+        lies beyond its link is on the links that follow, up to that of the next segment; forearm and hand then each at
+        their own place.
 
-        Raises ParameterError if there is no such link, or if the centre of gravity of a segment lies beyond it.
+        Raises ParameterError if there is no such link, or if the centre of gravity of a segment lies beyond them all.
         """
         upper_arm, forearm, hand = self.segments
         elbow_to_wrist = self.segment_length[1]
         lower = forearm[0] + hand[0]
         moment = forearm[0] * forearm[1] + hand[0] * (elbow_to_wrist + hand[1])  # about the elbow
-        segments = (*upper_arm, "the upper arm"), (lower, moment / lower, "the forearm and hand")
-        count = len(link_length)
+        length, count = [*map(float, link_length)], len(link_length)
         load = LinkLoad(np.zeros(count), np.zeros(count))
-        if len(links) != len(segments) or not all(0 <= link <= count for link in links) or links[0] == links[1]:
+        if len(links) != 2 or not all(0 <= link <= count for link in links) or links[0] == links[1]:
             raise ParameterError("links", list(links), f"2 different links from 1 to {count}, or 0 for none")
-        for link, (mass, centre, what) in zip(links, segments, strict=True):
-            if not link:
-                continue
-            if centre > link_length[link - 1]:
-                beyond = f"the centre of gravity of {what} is at {centre:.3f} m, beyond link {link}"
-                raise ParameterError("link_length", [*map(float, link_length)], f"long enough for the wearer: {beyond}")
-            load.mass[link - 1], load.cog[link - 1] = mass, centre
+        first, second = links
+        if first:
+            _place(load, length, first, second - 1 if second > first else count, "the upper arm", upper_arm)
+        if second:
+            last = first - 1 if first > second else count
+            whole, what = (lower, moment / lower), "the forearm and hand"
+            is_split = whole[1] > length[second - 1] and last > second
+            parts = (forearm, (hand[0], elbow_to_wrist + hand[1])) if is_split else (whole,)
+            for part in parts:
+                _place(load, length, second, last, what, part)
         return load
 
     @property
@@ -143,3 +147,18 @@ class Wearer:
         """Mass in kg and centre of gravity in m from the proximal joint of the upper arm, forearm and hand."""
         rows = zip(TABLES[self.table][self.sex], self.segment_length, strict=True)
         return tuple((self.body_mass * mass, length * cog) for (mass, cog), length in rows)
+
+
+def _place(
+    load: LinkLoad, length: Sequence[float], first: int, last: int, what: str, part: tuple[float, float]
+) -> None:
+    """Add a part, kg and m from the joint of link `first`, to one of the links up to `last`. Raises ParameterError."""
+    (mass, centre), link = part, first
+    while centre > length[link - 1] and link < last:
+        centre, link = centre - length[link - 1], link + 1
+    if centre > length[link - 1]:
+        beyond = f"the centre of gravity of {what} is at {part[1]:.3f} m, beyond link {link}"
+        raise ParameterError("link_length", list(length), f"long enough for the wearer: {beyond}")
+    moment = load.mass[link - 1] * load.cog[link - 1] + mass * centre
+    load.mass[link - 1] += mass
+    load.cog[link - 1] = moment / load.mass[link - 1]

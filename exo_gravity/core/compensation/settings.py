@@ -6,7 +6,7 @@ import operator
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.arm.arm import (
@@ -70,6 +70,10 @@ class UrdfModel(Arm, Protocol):
         """Return this arm with other gains, (n,), and another gravity, m/s^2. Raises ParameterError."""
         ...
 
+    def with_wearer_moments(self, moments: Sequence[Sequence[float]], support: float = 1.0) -> Arm:
+        """Return this arm plus a share `support` (0..1) of moments (n, 3) kg m of a wearer. Raises ParameterError."""
+        ...
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -91,6 +95,9 @@ class Settings:
     #: inertia; () for none
     wearer_first_moment: Sequence[float] = ()
     wearer_off_axis: Sequence[float] = ()  #: (4,) kg m, the same of W, Z, Y3, Y4
+    #: (n, 3) kg m, what the wearer's arm adds to the first moment of each link of an arm from a URDF, along x, y, z of
+    #: its joint's frame, likewise; () for none
+    wearer_moments: Sequence[Sequence[float]] = ()
     tissue: Tissue = field(default_factory=Tissue)  #: of the wearer's relaxed joints
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
@@ -167,6 +174,8 @@ class Settings:
         """Return `arm` plus a share `support` (0..1) of the wearer's arm. Raises ParameterError."""
         if any(self.wearer_first_moment):
             return papers(arm).with_moments(self.wearer_first_moment, self.wearer_off_axis, support)
+        if self.wearer_moments:
+            return cast(UrdfModel, arm).with_wearer_moments(self.wearer_moments, support)
         return arm.with_wearer(self.wearer_mass, self.wearer_cog, support)
 
     @cached_property
@@ -265,6 +274,7 @@ COMMAND_PARAMETERS = (
 )
 # What is declared where a file gives one of them, as `calibrate` writes them.
 MODEL_PARAMETERS = tuple(replace(param, name=f"model_error.{param.name}") for param in params_of(ModelError))
+WORN_MOMENTS = ("wearer.moment_x", "wearer.moment_y", "wearer.moment_z")  # of an arm from a URDF
 # What an arm from a URDF has in place of PAPER: the first also in `simulator`.
 URDF_FILE = Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True)
 URDF_HAND = Param("urdf.hand", "", "link of the URDF that holds the load; empty: there is no load, nor a wearer on the "
@@ -278,6 +288,9 @@ URDF = (
     *(Param(f"urdf.moment_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: what the first moment of each joint's "
             f"link has beyond the URDF's, along {axis} of the joint's frame", (-MAX_MOMENT, MAX_MOMENT), "kg m",
             fixed=True, expert=True) for axis in "xyz"),
+    *(Param(name, [0.0] * JOINT_COUNT, "by `calibrate wearer`: what the wearer's arm adds to the first moment of each "
+            f"joint's link, along {name[-1]} of the joint's frame; all 0: by mass and cog",
+            (-MAX_WORN_MOMENT, MAX_WORN_MOMENT), "kg m", expert=True) for name in WORN_MOMENTS),
 )
 PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
          "wearer.first_moment", "wearer.off_axis"}
@@ -337,7 +350,9 @@ def urdf_settings_of(values: Mapping[str, Any], robot: UrdfModel) -> Settings:
         limits.append(given or own)
     values = {**values, "max_effort": tuple(limits)}
     wearer = wearer_of(values, robot.length, values["wearer.links"])
-    return _settings_of(values, "left", robot.scaled(values["gain"], values["gravity"]), wearer)
+    moments = tuple(zip(*(values[name] for name in WORN_MOMENTS), strict=True))
+    worn = {"wearer_moments": moments} if any(map(any, moments)) else {}
+    return _settings_of(values, "left", robot.scaled(values["gain"], values["gravity"]), wearer, **worn)
 
 
 def _settings_of(

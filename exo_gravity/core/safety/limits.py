@@ -5,6 +5,7 @@
 docs/safety_case.md compares the defaults with those of other systems.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,6 +78,11 @@ class LoopTiming:
 WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming()
 
 
+def _direction(what: str) -> Any:
+    """Return a field with one component of a unit vector for each joint."""
+    return owned((0.0,) * JOINT_COUNT, what, (-1.0, 1.0), expert=True)
+
+
 @dataclass(frozen=True)
 class Limits:
     """The limits that the worn arm must never exceed: one entry per joint (n,), or one number for all joints.
@@ -118,7 +124,7 @@ class Limits:
     largest_moment: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
         "M1 to M4, the largest first moments of robot plus wearer, as `budget` prints them: efforts that no load up to "
-        "these needs are a fault; zeros: not checked, as on any arm but the paper's",
+        "these needs are a fault; zeros: not checked",
         (0.0, MAX_MOMENT),
         "kg m",
     )
@@ -129,6 +135,14 @@ class Limits:
         (0.0, 10.0),
         "Nm",
     )
+    axis_x: Sequence[float] = _direction(
+        "along x of the root link, of each joint's axis while all angles are 0, by `budget`; 0 on the paper's arm"
+    )
+    axis_y: Sequence[float] = _direction("the same along y")
+    axis_z: Sequence[float] = _direction("the same along z")
+    link_x: Sequence[float] = _direction("along x of the root link, of the way from each joint to the next, likewise")
+    link_y: Sequence[float] = _direction("the same along y")
+    link_z: Sequence[float] = _direction("the same along z")
     home: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
         "angles of the arm while it hangs, where a start from unknown zeros begins",
@@ -149,8 +163,7 @@ class Limits:
         for name in ("max_velocity", "home_tolerance", "max_command"):
             object.__setattr__(self, name, for_joints(getattr(self, name), len(names)))
         object.__setattr__(self, "channels", tuple(self.channels) or ("",) * len(names))
-        if any(self.largest_moment) and len(names) != JOINT_COUNT:
-            raise ParameterError("largest_moment", list(self.largest_moment), "zeros for another arm than the paper's")
+        self._check_directions()
         if any(high - low < 4 * WALL.width for low, high in zip(self.position_min, self.position_max, strict=True)):
             expected = f"at least {4 * WALL.width} rad above position_min = {list(self.position_min)}"
             raise ParameterError("position_max", list(self.position_max), expected)
@@ -158,6 +171,36 @@ class Limits:
         for name, low, home, high, tolerance in columns:
             if not low - tolerance <= home <= high + tolerance:
                 raise ParameterError(f"home of {name}", home, f"within its limits, {low:g} to {high:g} rad")
+
+    @property
+    def axes(self) -> tuple[tuple[float, float, float], ...]:
+        """Unit vectors (n, 3) along the joints' axes of an arm from a URDF, () for the paper's arm."""
+        return tuple(zip(self.axis_x, self.axis_y, self.axis_z, strict=True)) if self._has_axes else ()
+
+    @property
+    def ways(self) -> tuple[tuple[float, float, float], ...]:
+        """Unit vectors (n, 3) along its links, zeros for one without length."""
+        return tuple(zip(self.link_x, self.link_y, self.link_z, strict=True))
+
+    @property
+    def _has_axes(self) -> bool:
+        return any((*self.axis_x, *self.axis_y, *self.axis_z))
+
+    def _check_directions(self) -> None:
+        """Check axes and links, which `largest_moment` of any arm but the paper's needs. Raises ParameterError."""
+        moments, names = list(self.largest_moment), self.joint_names
+        if not self._has_axes:
+            if any(moments) and len(names) != JOINT_COUNT:
+                expected = "zeros without axis_x, axis_y, axis_z, which `budget` prints for arms but the paper's"
+                raise ParameterError("largest_moment", moments, expected)
+            return
+        for name, moment, axis, way in zip(names, moments, self.axes, self.ways, strict=True):
+            for what, vector, sizes in (("axis", axis, (1.0,)), ("link", way, (0.0, 1.0))):
+                if not any(abs(math.hypot(*vector) - size) < 0.01 for size in sizes):
+                    expected = f"a vector of length {' or '.join(f'{size:g}' for size in sizes)}"
+                    raise ParameterError(f"{what}_x, _y, _z of {name}", list(vector), expected)
+            if moment and not any(way):
+                raise ParameterError(f"largest_moment of {name}", moment, "0 for a link without a direction")
 
     def is_silent(self, now: float, joint: JointSample) -> bool:
         """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""

@@ -3,9 +3,11 @@
 
 It shares no code and no masses with the compensator. Its own ground is `largest_moment`, M1..M4 in kg m: the largest
 first moments of the arm, robot plus wearer, about joints 1 to 4, each along its link (M4 = m4 d4, M3 = m3 d3 + m4 l3,
-and so on). Any load from none to these, in the arm's pose and at the trunk's tilt, gives a range of torques for each
-joint, which `largest_addition` widens both ways: what assistance, springs, friction and inertia terms or a calibration
-may add, and what the joints' own springs need. What is asked for outside that range, beyond a margin, is unexplained.
+and so on). Another arm has the same moments, and the directions of its axes and links while all angles are 0. Any load
+from none to these, in the arm's pose and at the trunk's tilt, gives a range of torques for each joint, which
+`largest_addition` widens both ways: what assistance, springs, friction and inertia terms or a calibration may add, and
+what the joints' own springs and masses beside the links need. What is asked for outside that range, beyond a margin, is
+unexplained.
 
 Unexplained torque is summed over time, with both signs as positive, and forgotten over `memory`. The sum is an impulse:
 it bounds the speed that the motors cause and gravity does not, whatever the wearer does meanwhile. A joint of a link
@@ -18,12 +20,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
+from exo_gravity.core.arm.rotation import Floats3, Quaternion, cross, dot, product, rotated
+from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
 
 GRAVITY = 9.81  # m/s^2
-ALONG_BASE = (0.0, 0.0, 1.0)  # gravity in the arm's base frame while the trunk is upright
+NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -43,19 +47,25 @@ MOTION = MotionLimits()
 
 
 class MotionMonitor:
-    """The unexplained impulse of each joint. gravity: (3,) unit vector in the arm's base frame; may be set anytime.
+    """The unexplained impulse of each joint.
 
-    limits.largest_moment: (n,) kg m; zeros switch the monitor off, as they must for another arm than the paper's.
+    gravity: (3,) unit vector in the arm's base frame, for an arm with `axes` in its root link's axes; set by `follow`.
+
+    limits.largest_moment: (n,) kg m; zeros switch the monitor off.
     impulse: (n,) Nm s. full: (n,) Nm, the largest load.
     """
 
     def __init__(self, limits: Limits) -> None:
-        self.gravity: tuple[float, float, float] = ALONG_BASE
-        self._limits = limits
+        self._limits, self._axes, self._ways = limits, limits.axes, limits.ways
         self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
-        self._is_on = any(self._load[1:])
+        self._is_on = any(self._load if self._axes else self._load[1:])
         self.full = tuple(accumulate(self._load[::-1]))[::-1]
+        self.follow(Tilt.of(SIDES[0]))
         self.reset()
+
+    def follow(self, tilt: Tilt) -> None:
+        """Take the tilt of the trunk; upright before the first one."""
+        self.gravity: Floats3 = tilt.gravity_in_trunk if self._axes else tilt.direction
 
     def reset(self) -> None:
         """Forget the past."""
@@ -97,10 +107,17 @@ class MotionMonitor:
         return passed, fault
 
     def explained(self, theta: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the least and the greatest torque (4,) in Nm that gravity needs at `theta` (4,) rad of any load.
+        """Return the least and the greatest torque (n,) in Nm that gravity needs at `theta` (n,) rad of any load.
 
         Potential -g sum(M_n u_n), u_n being how far down link n points; torques are its derivatives.
         """
+        parts = self._parts_of_axes(theta) if self._axes else self._parts(theta)
+        lowest = tuple([MOTION.surplus * sum([min(0.0, torque) for torque in torques]) for torques in parts])
+        highest = tuple([MOTION.surplus * sum([max(0.0, torque) for torque in torques]) for torques in parts])
+        return lowest, highest
+
+    def _parts(self, theta: Sequence[float]) -> Sequence[Sequence[float]]:
+        """Return the torque of each joint of the paper's arm by the moment of each link from its own on."""
         one, two, three, four = theta
         x, y, z = self.gravity
         s1, c1, s2, c2 = math.sin(one), math.cos(one), math.sin(two), math.cos(two)
@@ -109,12 +126,21 @@ class MotionMonitor:
         down, across = s2 * out + c2 * z, s2 * z - c2 * out  # along the hanging link 2, and across it
         m1, m2, m3, m4 = self._load
         turn3, turn4 = m3 * (s3 * down - c3 * ahead), m4 * (s4 * down - c4 * ahead)
-        parts = (
+        return (
             (-m1 * ahead, -m2 * s2 * ahead, m3 * (s3 * out - c3 * s2 * ahead), m4 * (s4 * out - c4 * s2 * ahead)),
             (m2 * across, m3 * c3 * across, m4 * c4 * across),
             (turn3, turn4),
             (turn4,),
         )
-        lowest = tuple([MOTION.surplus * sum([min(0.0, torque) for torque in torques]) for torques in parts])
-        highest = tuple([MOTION.surplus * sum([max(0.0, torque) for torque in torques]) for torques in parts])
-        return lowest, highest
+
+    def _parts_of_axes(self, theta: Sequence[float]) -> Sequence[Sequence[float]]:
+        """Return the same of any arm: the axis turned by the joints before, the link by its own joint, too."""
+        turn, levers, moments = NO_TURN, list[Floats3](), list[Floats3]()
+        for angle, axis, way, load in zip(theta, self._axes, self._ways, self._load, strict=True):
+            levers.append(cross(rotated(turn, axis), self.gravity))
+            half = math.sin(angle / 2.0)
+            turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
+            x, y, z = rotated(turn, way)
+            moments.append((load * x, load * y, load * z))
+        # -g . (axis x link) = (axis x g) . link
+        return [[dot(lever, moment) for moment in moments[n:]] for n, lever in enumerate(levers)]

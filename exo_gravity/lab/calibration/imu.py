@@ -322,7 +322,7 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     """Return `result` with a better mounting of the IMU in the file `params`, if the arm's weight showed one."""
     found, arm = result.identified, result.arm
     rotation = load(params).get(NODE, {}).get(ROTATION)
-    if found is None or arm is None or arm.by_urdf or not rotation or not arm.compensator["use_imu"]:
+    if found is None or arm is None or not rotation or not arm.compensator["use_imu"]:
         return result
     square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
     error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
@@ -330,7 +330,8 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
         return result
     is_whole = heading_error < LARGEST_HEADING_ERROR
     turn = found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
-    angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, turn_in_trunk(arm.side, turn))
+    in_trunk = turn if arm.by_urdf else turn_in_trunk(arm.side, turn)  # a URDF's root link has the trunk's axes
+    angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, in_trunk)
     heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
     accuracy = f"±{math.degrees(error):.2f} degrees, {heading}"
     note = f"{accuracy}, from the arm's weight: {angle:.1f} degrees from the value before"

@@ -128,10 +128,11 @@ class PapersMoments:
 
 
 class UrdfMoments:
-    """An arm from a URDF, of which gravity's direction is taken as measured.
+    """An arm from a URDF.
 
     arm: with gains of 1.
     rotors: (n,) kg m^2, inertia of the motors' rotors at the joints.
+    shows_tilt: whether an IMU measures gravity's direction, and its mounting may be wrong.
 
     Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
@@ -139,14 +140,14 @@ class UrdfMoments:
     angles: tuple[tuple[int, int], ...] = ()
     positive: tuple[int, ...] = ()
     optional: tuple[int, ...] = ()
-    shows_tilt, expects_scales = False, True
+    expects_scales = True
 
-    def __init__(self, arm: UrdfArm, rotors: Sequence[float]) -> None:
+    def __init__(self, arm: UrdfArm, rotors: Sequence[float], shows_tilt: bool) -> None:
         if not arm.moves_alone:
             listed = list(arm.names)
             raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
         self.arm, self.gravity, self.moments = arm, arm.gravity, arm.moments
-        self._rotors = np.diag(rotors)
+        self._rotors, self.shows_tilt = np.diag(rotors), shows_tilt
         self.count, self.start = len(arm.names), self.moments
         numbers = [n for n, _ in arm.base]
         self.names = tuple(f"{arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))

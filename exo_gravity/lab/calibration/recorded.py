@@ -82,9 +82,7 @@ def _down(bag: Bag, arm: AnyArm, times: np.ndarray) -> np.ndarray:
 
 def _base_direction(arm: AnyArm, tilt: Tilt) -> tuple[float, float, float]:
     """Return gravity's direction (3,) in the base frame, which a URDF has in the trunk's axes."""
-    if not arm.by_urdf:
-        return tilt.direction
-    return Tilt.of("left", tilt.pitch, tilt.roll).gravity_in_trunk
+    return tilt.gravity_in_trunk if arm.by_urdf else tilt.direction
 
 
 def tilts_of(bag: Bag, side: str) -> list[Tilt]:

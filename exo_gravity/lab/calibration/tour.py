@@ -16,7 +16,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT, ArmModel
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.tilt import Tilt, angle_between
+from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
@@ -265,6 +265,13 @@ CALIBRATOR = (
     Param("tour.load_mass", 0.0, "weight that hangs on the last link", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the last joint", (0.0, MAX_LENGTH), "m", fixed=True),
 )
+# Of an arm from a URDF: the paper's has its wearer in first_moment and off_axis.
+WORN = (
+    Param("tour.wearer_mass", [0.0] * 4, "expected mass of the wearer's segment on each link", (0.0, MAX_MASS), "kg",
+          fixed=True),
+    Param("tour.wearer_cog", [0.0] * 4, "its centre of gravity from the link's joint", (0.0, MAX_LENGTH), "m",
+          fixed=True),
+)  # fmt: skip
 OF_URDF = ("joint_names", "gravity", "use_imu", "tilt_timeout", "law")  # as the compensator's, for an arm from a URDF
 OF_BRIDGE = (*BRIDGE, "motor", "home")
 
@@ -282,7 +289,12 @@ def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     known = {param.name for param in own} | {*ARM, *MOMENTS, *BRIDGE}
     bridge = {param.name: param for param in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if param.name in OF_BRIDGE}
     others = (param for param in CALIBRATOR if param.name not in known)
-    return tuple(table_for((*own, *bridge.values(), *others), given))
+    return tuple(table_for((*own, *bridge.values(), *others, *WORN), given))
+
+
+def side_of(values: Mapping[str, Any]) -> str:
+    """Return the side of the arm that `calibrator` moves. One from a URDF has none: its root link is not mirrored."""
+    return str(values.get("side", SIDES[0]))
 
 
 def tour_of(values: Mapping[str, Any]) -> Tour:
@@ -290,23 +302,26 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     load, is_urdf = (values["tour.load_mass"], values["tour.load_lever"]), values.get("law") == URDF_LAW
     given_limits = {name: values[name] for name in ((*LIMITS, "home") if is_urdf else LIMITS)}
     limits = Limits(tuple(values["joint_names"]), **given_limits)
-    model = urdf_moments(values) if is_urdf else _papers_moments(values)
-    upright = Tilt.of(values.get("side", "left"))  # the root link of a URDF is not mirrored
-    guess = TorqueGuess(model, model.moments + model.load(*load), upright)
+    worn = (values["tour.wearer_mass"], values["tour.wearer_cog"]) if is_urdf else ()
+    model = urdf_moments(values, worn) if is_urdf else _papers_moments(values)
+    guess = TorqueGuess(model, model.moments + model.load(*load), Tilt.of(side_of(values)))
     given = friction_stations(limits) if values["tour.friction"] else ()
     count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
     return Tour(limits, guess, itinerary, values["rate"], load)
 
 
-def urdf_moments(values: Mapping[str, Any]) -> UrdfMoments:
+def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()) -> UrdfMoments:
     """Return the moments of the arm from a URDF that parameter values describe, with the rotors of its motors.
+
+    worn: mass (n,) in kg and centre of gravity (n,) in m of a wearer's segments on its links; () for none.
 
     Raises ParameterError, also if the URDF comes from a topic.
     """
     arm = arm_in_file(values, ": a calibration does not wait for a topic")
     rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
-    return UrdfMoments(arm.scaled([1.0] * len(values["joint_names"]), values["gravity"]), rotors)
+    arm = arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
+    return UrdfMoments(arm.with_wearer(*worn) if worn else arm, rotors, values["use_imu"])
 
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""calibrate gravity, scale, friction, wearer and check: what slow tours of the arm show, live or from a recording.
+"""calibrate gravity, scale, friction and check: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
 is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: the
@@ -14,16 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ModelError, moments_along, papers
-from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, moments_of, regressor
+from exo_gravity.core.arm.arm import ModelError, papers
+from exo_gravity.core.arm.gravity import MOMENTS
 from exo_gravity.core.arm.joint_spring import JointSpring
-from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
+from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
-from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
+from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
@@ -34,35 +33,11 @@ from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tour import urdf_moments
-from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit, fit_wearer, unrest
-from exo_gravity.lab.inputs.arms import AnyArm, ConfiguredArm
+from exo_gravity.lab.inputs.arms import AnyArm
 
-MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to relax
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
-
-
-@dataclass(frozen=True)
-class WearerTour:
-    """The tour of a worn arm, and which arms a wearer can have."""
-
-    poses: int = 8  #: the hanging arm and seven others
-    again: int = 2  #: of them, visited again at the end
-    least_poses: int = 5  #: different ones: fewer do not tell springs from weight
-    #: rad: a comfortable part of the joints' ranges.
-    comfortable: tuple[tuple[float, ...], tuple[float, ...]] = ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7))
-    #: share of their arm's weight that a relaxed person may hold throughout, unseen: it looks like a lighter arm
-    carried: float = 0.2
-    unrest: float = 0.5  #: Nm by which what holds the arm may differ between two visits of a pose: breathing, 3.5 times
-    largest_error: float = 0.25  #: of M3 and M4, as a standard error
-    most: float = 15.0  #: kg of a person's arm
-    body_mass: float = 70.0  #: kg, where the file has none
-    table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled moments that are plausible
-    samples: int = 200  #: poses of the comfortable range in which the error of the torque is taken
-
-
-WEARER = WearerTour()
 
 
 @dataclass(frozen=True)
@@ -82,10 +57,10 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier) if options.earlier else []
-    return moments_from(arm, earlier + _observations(options, arm, say, {"tour.poses": options.poses}))
+    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}))
 
 
-def _observations(
+def tour_observations(
     options: argparse.Namespace, arm: AnyArm, say: Say, changes: Mapping[str, Any], request: str = "",
     moments: np.ndarray | None = None,
 ) -> list[Observation]:  # fmt: skip
@@ -110,7 +85,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
     earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
-    bare = _observations(options, arm, say, poses)
+    bare = tour_observations(options, arm, say, poses)
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
         needed = _needed(arm, model, bare)
@@ -118,7 +93,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     else:
         hang = _request(arm, mass, lever)
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
-        weighed = _observations(options, arm, say, changes, hang)
+        weighed = tour_observations(options, arm, say, changes, hang)
     return moments_from(arm, earlier + bare + weighed)
 
 
@@ -131,9 +106,12 @@ def _request(arm: AnyArm, mass: float, lever: float) -> str:
 
 def model_of(arm: AnyArm) -> MomentModel:
     """Return the moments of an arm as configured. Raises ParameterError."""
-    if arm.by_urdf:
-        return urdf_moments({**arm.compensator, "motor": arm.can_bridge["motor"]})
-    return PapersMoments(papers(arm.robot))
+    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(papers(arm.robot))
+
+
+def urdf_model_of(arm: AnyArm) -> UrdfMoments:
+    """Return the moments of an arm from a URDF as configured. Raises ParameterError."""
+    return urdf_moments({**arm.compensator, "motor": arm.can_bridge["motor"]})
 
 
 def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np.ndarray:
@@ -179,11 +157,11 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
         new = model.arm.with_moments(moments)
         for name, values in zip(MOMENT_NAMES, new.change.T, strict=True):
             yield Change(
-                node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {_row(np.array(arm.compensator[name]))}"
+                node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {row(np.array(arm.compensator[name]))}"
             )
         return
     for name, part in MOMENT_PARAMETERS.items():
-        note = f"{' '.join(MOMENTS[part])} {unit}, +-{_row(error[part])}, was {_row(before[part])}"
+        note = f"{' '.join(MOMENTS[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
         yield Change(node, name, moments[part].round(5).tolist(), note)
 
 
@@ -191,7 +169,7 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
     """Return the new values of the parameter file."""
     node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
     changes += [
-        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{_row(found.scale_error)}"),
+        Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{row(found.scale_error)}"),
         *_temperature_changes(arm, found),
         *_spring_changes(arm, found),
     ]
@@ -218,7 +196,7 @@ def _temperature_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     given = np.array(bridge["torque_scale_slope"])
     if np.any(given) or np.any(found.slope):
         slope = given * bridge["torque_scale"] / _scale_before(arm, found) + found.slope
-        note = f"1/K, +-{_row(found.slope_error)}; 0: the poses show none, the file's is kept"
+        note = f"1/K, +-{row(found.slope_error)}; 0: the poses show none, the file's is kept"
         yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
 
 
@@ -228,7 +206,7 @@ def _spring_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     if not (np.any(found.stiffness) or before.on):
         return
     new = JointSpring(found.stiffness.round(4).tolist(), found.rest.round(4).tolist())
-    note = f"Nm/rad, +-{_row(found.stiffness_error)}; 0: the poses show none"
+    note = f"Nm/rad, +-{row(found.stiffness_error)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")
     bridge = arm.can_bridge
@@ -251,13 +229,14 @@ def _lines(arm: AnyArm, found: Identified) -> Iterator[str]:
     yield from found.unknown
 
 
-def _row(values: np.ndarray) -> str:
+def row(values: np.ndarray) -> str:
+    """Return numbers with three digits, and 'unknown' for those that are not finite."""
     return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
 
 
 def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Compare the torque that a few poses need with the file's. Raises ParameterError."""
-    return checked(arm, _observations(options, arm, say, {"tour.poses": CHECK.poses}))
+    return checked(arm, tour_observations(options, arm, say, {"tour.poses": CHECK.poses}))
 
 
 def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
@@ -266,7 +245,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
     A joint that differs by more than the band of `model_error.torque` is a refusal.
     """
     held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
-    error = np.array(for_joints(_torque_error(arm), len(arm.joint_names), max))
+    error = np.array(for_joints(torque_error(arm), len(arm.joint_names), max))
     size = np.sqrt(np.mean(held**2, axis=0))
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
@@ -284,7 +263,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 
-def _torque_error(arm: AnyArm) -> Sequence[float]:
+def torque_error(arm: AnyArm) -> Sequence[float]:
     """Return the file's `model_error.torque`, or its default, in Nm."""
     error: Sequence[float] = arm.compensator.get("model_error.torque", ModelError().torque)
     return error
@@ -292,7 +271,7 @@ def _torque_error(arm: AnyArm) -> Sequence[float]:
 
 def calibrate_friction(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
-    return friction_from(arm, _observations(options, arm, say, {"tour.friction": True}))
+    return friction_from(arm, tour_observations(options, arm, say, {"tour.friction": True}))
 
 
 def friction_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
@@ -312,173 +291,3 @@ def friction_from(arm: AnyArm, observations: Sequence[Observation]) -> Calibrati
         if fit.coulomb <= 0.0:
             refusals.append(f"{name}: friction of {fit.coulomb:.3f} Nm: must be above 0: was the arm touched?")
     return CalibrationResult(tuple(changes), (), tuple(refusals), arm, observations=tuple(observations), curves=curves)
-
-
-def calibrate_wearer(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
-    """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError.
-
-    It knows the segments of a person's arm on the links of the paper's arm alone.
-    """
-    if not isinstance(arm, ConfiguredArm):
-        what = "exact: `calibrate wearer` is for the paper's arm; give wearer.body_mass, or wearer.mass and wearer.cog"
-        raise ParameterError(f"{arm.namespace}/compensator law", URDF_LAW, what)
-    carried = WEARER.carried if options.carried is None else one_float("carried", options.carried, 0.0, MOST_CARRIED)
-    # Few poses, in a comfortable range, with the weight that the table expects.
-    low, high = np.maximum(arm.low, WEARER.comfortable[0]), np.minimum(arm.high, WEARER.comfortable[1])
-    changes = {"tour.poses": WEARER.poses, "tour.again": WEARER.again}
-    changes |= {"position_min": low.tolist(), "position_max": high.tolist()}
-    expected = moments_of(arm.robot.with_wearer(*_wearer(arm)))
-    request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
-    return wearer_from(arm, _observations(options, arm, say, changes, request, expected), carried)
-
-
-def wearer_from(
-    arm: ConfiguredArm, observations: Sequence[Observation], carried: float = WEARER.carried
-) -> CalibrationResult:
-    """Return moments and springs of the wearer's arm: what the robot alone does not explain.
-
-    carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
-    not show an arm.
-    """
-    length, table = arm.robot.length, _wearer(arm, tabled=True)
-    theta, direction, effort, spread = columns(observations)
-    rows = regressor(theta, direction, arm.robot.gravity)
-    torque = effort - rows @ moments_of(arm.robot) - joint_spring_of(arm.compensator).torques(theta)
-    again, change = unrest(theta, torque)
-    if len(observations) - again < WEARER.least_poses:
-        measured = f"{len(observations) - again} different poses were measured"
-        raise DataError(f"{measured}, must be at least {WEARER.least_poses}")
-    restless = [
-        f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
-        for name, off in zip(arm.joint_names, change, strict=True)
-        if off > WEARER.unrest
-    ]
-    if restless:
-        raise DataError("; ".join(restless))
-    to_moments = worn_moments(length)
-    fit = fit_wearer(rows @ to_moments, theta, torque, spread, _known(length, *map(np.array, table)))
-    own = fit.covariance[: len(fit.moments), : len(fit.moments)]
-    moments, error = to_moments @ fit.moments, np.sqrt(np.diag(to_moments @ own @ to_moments.T))
-    for index in (2, 3):
-        shown = f"{MOMENTS[index]} of the wearer = {moments[index]:.3f} +- {error[index]:.3f} kg m"
-        if not moments[index] > error[index] / WEARER.largest_error:
-            raise DataError(f"{shown}: is the arm relaxed, the robot calibrated?")
-    mass, beside = _bounded(fit.moments, length)
-    if mass > WEARER.most:
-        raise DataError(f"the wearer's arm = {mass:.1f} kg: must be at most {WEARER.most:g}: is the arm relaxed?")
-    moments = to_moments @ np.array((mass, *fit.moments[1:3], *beside))
-    poses = np.random.default_rng(0).uniform(*WEARER.comfortable, (WEARER.samples, JOINT_COUNT))
-    unsure = fit.torque_error(regressor(poses, direction[0], arm.robot.gravity) @ to_moments, poses)
-    ratio = moments[2:4] / moments_along(length, *map(np.array, (table[1], table[0])))[2:]
-    body_mass, (low, high) = arm.compensator["wearer.body_mass"], WEARER.table_ratio
-    compared = f"a person of {WEARER.body_mass * ratio[0]:.0f} kg has this M3 by the table {Wearer.table}"
-    refusals: tuple[str, ...] = ()
-    if body_mass:
-        compared = f"{ratio[0]:.0%} of M3 and {ratio[1]:.0%} of M4 by the table {Wearer.table} for {body_mass:g} kg"
-        if not np.all((ratio >= low) & (ratio <= high)):
-            refusals = (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
-    refusals += tuple(
-        f"{name}: a spring of {stiffness:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
-        for name, stiffness in zip(arm.joint_names, fit.stiffness.tolist(), strict=True)
-        if stiffness > MAX_TISSUE
-    )
-    lines = (
-        f"largest remainder of a pose: {np.abs(fit.remainder).max():.2f} Nm", compared,
-        f"{again} poses were visited again, and differed by {change.max():.2f} Nm at most",
-        f"a wearer who holds up to {carried:.0%} of their arm throughout looks like one with a lighter arm: "
-        "the band contains that, and nothing shows it",
-        _bridge_line(arm, moments_of(arm.robot) + moments, fit),
-    )  # fmt: skip
-    return CalibrationResult(
-        _wearer_changes(arm, fit, moments, error, unsure, carried),
-        lines,
-        refusals,
-        arm,
-        observations=tuple(observations),
-    )
-
-
-def _wearer_changes(
-    arm: ConfiguredArm, fit: WearerFit, moments: np.ndarray, error: np.ndarray, unsure: np.ndarray, carried: float
-) -> tuple[Change, ...]:
-    """Return the new values; unsure: standard error (n,) in Nm of the wearer's torque."""
-    node, stiffness_error = f"{arm.namespace}/compensator", fit.stiffness_error
-    changes = [
-        Change(node, f"wearer.{name}", np.round(moments[part], 4).tolist(), f"kg m, +-{_row(error[part])}")
-        for name, part in (("first_moment", slice(JOINT_COUNT)), ("off_axis", slice(JOINT_COUNT, None)))
-    ]
-    changes += [
-        Change(node, "wearer.joint_stiffness", fit.stiffness.round(3).tolist(), f"Nm/rad, +-{_row(stiffness_error)}"),
-        Change(node, "wearer.joint_rest", fit.rest.round(3).tolist(), "rad"),
-        Change(node, "model_error.wearer_torque", unsure.round(3).tolist(), "Nm, of the wearer's passive arm"),
-        Change(node, "model_error.wearer", round(unseen_error(carried), 3), "share that the wearer may have held"),
-    ]
-    if arm.compensator["law"] != "exact":
-        changes.append(Change(node, "law", "exact", "the other laws need masses and centres of gravity"))
-    return tuple(changes)
-
-
-def _bridge_line(arm: ConfiguredArm, moments: np.ndarray, fit: WearerFit) -> str:
-    """Return what can_bridge must let the efforts of this wearer have at support 1, if it checks them.
-
-    moments: (8,) kg m of robot and wearer.
-    """
-    along, (w, z, y3, y4) = moments[:JOINT_COUNT], np.abs(moments[JOINT_COUNT:])
-    beside = arm.robot.gravity * np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
-    way = np.maximum(np.abs(arm.low - fit.rest), np.abs(arm.high - fit.rest))
-    device = joint_spring_of(arm.compensator).largest(arm.low.tolist(), arm.high.tolist())
-    added = beside + device + fit.stiffness * np.minimum(way, TISSUE_REACH)
-    values = ", ".join(f"{math.ceil(100.0 * moment) / 100.0:g}" for moment in along)
-    more = ", ".join(f"{math.ceil(10.0 * torque) / 10.0:g}" for torque in added)
-    return (
-        f"can_bridge, for this wearer at support 1: largest_moment [{values}] kg m, largest_addition {more} Nm or more"
-    )
-
-
-def unseen_error(carried: float) -> float:
-    """Return the standard error of the weight, as a share of what was found, if up to `carried` (0..1) was held.
-
-    Any share up to that is as likely. Two of these errors cover 95 % of them.
-    """
-    usual = 0.95 * carried
-    return usual / (1.0 - usual) / COVER
-
-
-def worn_moments(length: np.ndarray) -> np.ndarray:
-    """Return the moments M1..M4, W, Z, Y3, Y4 by those that links 3 and 4 can add: (8, 6).
-
-    These are the mass in kg, with which both pull at the links before, and M3, M4, Z, Y3, Y4 in kg m. length: (4,) m.
-    """
-    matrix = np.zeros((len(MOMENTS), 6))
-    matrix[:2, 0] = length[:2]
-    matrix[[2, 3, 5, 6, 7], np.arange(1, 6)] = 1.0
-    return matrix
-
-
-def _known(length: np.ndarray, mass: np.ndarray, cog: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what is known before of the six columns of `worn_moments`, as `fit_wearer` takes it, by the table."""
-    along, total = moments_along(length, cog, mass)[2:], mass.sum()
-    upper, lower = cog[2], cog[3]
-    # The mass that the moments have at these places is the whole one.
-    by_moments = np.array((1.0, -1.0 / upper, -(1.0 - length[2] / upper) / lower, 0.0, 0.0, 0.0))
-    matrix = np.vstack((by_moments / (PRIOR.mass * total), np.eye(6)[1:]))
-    beside = PRIOR.beside * np.array((total, mass[2], mass[3]))
-    matrix[1:] /= np.concatenate((PRIOR.moments * along, beside))[:, None]
-    return matrix, np.concatenate(([0.0], np.full(2, 1.0 / PRIOR.moments), np.zeros(3)))
-
-
-def _bounded(found: np.ndarray, length: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return a mass in kg, and Z, Y3 and Y4 in kg m, that an arm with the moments `found` (6,) can have."""
-    mass, m3, m4 = found[:3]
-    mass = max(float(mass), m3 / length[2], m4 / length[3])
-    most = MAX_OFFSET * mass
-    return mass, np.clip(found[3:], -most, most)
-
-
-def _wearer(arm: ConfiguredArm, tabled: bool = False) -> tuple[Sequence[float], Sequence[float]]:
-    """Return mass (4,) in kg and cog (4,) in m on each link: the file's if it gives both masses, else the table's."""
-    values = arm.compensator
-    if not tabled and all(values["wearer.mass"][2:]):
-        return values["wearer.mass"], values["wearer.cog"]
-    body_mass = values["wearer.body_mass"] or WEARER.body_mass
-    return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})

@@ -27,6 +27,7 @@ class WearerPrior:
 
     moments: float = 0.5  #: share of the table's moments along the links
     beside: float = 0.05  #: m, of a segment's centre of gravity beside its link
+    along: float = 0.03  #: m, of the same along its link, where the mass is another unknown
     mass: float = 0.15  #: share of the whole mass, against that which the moments have at the table's places
     stiffness: float = 1.5  #: Nm/rad, of a relaxed shoulder or elbow
     middle: float = 1.0  #: Nm, of its torque in the middle of the poses

@@ -7,6 +7,7 @@ It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
     s, terms, now = control.settings, control.terms, time.monotonic()
     most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, NONE))
     asked, why_not = control.support_request.fresh(now), terms.assist.reason
+    worn = (*s.wearer_first_moment, *s.wearer_off_axis, *chain.from_iterable(s.wearer_moments))
     facts = {f"robot {what}": UNKNOWN if known is None else row(known) for what, known in s.robot.facts.items()}
     return {
         "law": s.law,
@@ -97,7 +99,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         **facts,
         "wearer mass (kg)": row(s.wearer_mass),
         "wearer cog (m)": row(s.wearer_cog),
-        "wearer moments (kg m)": row((*s.wearer_first_moment, *s.wearer_off_axis)) if s.wearer_first_moment else NONE,
+        "wearer moments (kg m)": row(worn) if worn else NONE,
         "wearer stiffness (Nm/rad)": row(s.tissue.joint_stiffness),
         "payload mass (kg)": f"{s.payload_mass:.3f}",
         "terms": words(*terms.active),

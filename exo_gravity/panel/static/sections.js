@@ -5,7 +5,8 @@ import { degrees, has, number, t, write } from "./texts.js";
 
 const byId = (id) => document.getElementById(id);
 const LENGTHS = ["upper_arm", "forearm", "hand"];
-const CALIBRATED = ["wearer.first_moment", "wearer.off_axis", "wearer.joint_stiffness"]; // of one person, on one arm
+const MOMENTS = ["first_moment", "off_axis", "moment_x", "moment_y", "moment_z"].map((name) => `wearer.${name}`);
+const CALIBRATED = [...MOMENTS, "wearer.joint_stiffness"]; // of one person, on one arm
 const ROUNDED = 0.0006; // m, of a length in the form
 
 // What withdraws the last wearer's calibration from an arm with the settings `now`, if `values` are another person's.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -18,6 +18,7 @@ from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, UrdfArm
+from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.live import tour_parameters
 from exo_gravity.lab.calibration.moment_model import along_axes
 from exo_gravity.lab.calibration.poses import candidates, next_pose
@@ -122,6 +123,27 @@ def test_a_known_weight_shows_wrong_torque_scales(name: str, tmp_path: Path) -> 
     seen = [*bench.observed(scales), *bench.observed(scales, (1.0, lever))]
     after, worst = bench.errors(bench.calibrated(seen), scales)
     assert after < MEDIAN and worst < WORST
+
+
+def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> None:
+    bench, turn = Bench.of("three_joints", tmp_path), np.array((0.03, -0.03, 0.04))
+    arm = replace(bench.arm, compensator={**bench.arm.compensator, "use_imu": True})
+    model, truth, seen = model_of(arm), MujocoArm(bench.text, arm.joint_names), []
+    random = np.random.default_rng(4)
+    poses, taken = candidates(arm.limits, model), [np.array(arm.limits.home)]
+    while len(taken) < POSES:
+        taken.append(poses[next_pose(taken, poses, DOWN, model.moments, model)])
+    leans = [gravity_in_trunk(pitch, 0.1) for pitch in (0.12, -0.12)]
+    for down in leans:
+        for theta in taken:
+            effort = truth.torque(theta, 9.80665 * down) + random.normal(0.0, NOISE, len(theta))
+            spread = np.full(len(theta), NOISE)
+            seen.append(Observation(theta, down - np.cross(turn, down), effort, spread, spread))
+    found = identify(seen, model)
+    for down in leans:
+        measured = down - np.cross(turn, down)
+        assert np.linalg.norm(measured + np.cross(found.tilt, measured) - down) < np.radians(0.3)
+    assert model_of(bench.arm).shows_tilt is False  # nothing is measured there
 
 
 def test_a_joint_that_turns_the_wrong_way_is_refused(tmp_path: Path) -> None:
