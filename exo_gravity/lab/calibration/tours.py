@@ -17,6 +17,7 @@ import numpy as np
 from exo_gravity.core.arm.arm import ModelError, moments_along, papers
 from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, moments_of, regressor
 from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import joint_spring_of, wearer_of
@@ -145,7 +146,7 @@ def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np
 
 def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
-    model, (low, high) = model_of(arm), TORQUE_SCALE_BOUNDS
+    model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
     found = identify(observations, model)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
@@ -159,6 +160,14 @@ def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> Calibratio
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
     changes, lines = _changes(arm, model, found, scale), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
+
+
+def at_links(arm: AnyArm, observations: Sequence[Observation]) -> Sequence[Observation]:
+    """Return `observations` with the angles of the links, where the file gives a `joint_stiffness`."""
+    stiffness = arm.compensator["joint_stiffness"]
+    if not any(stiffness):
+        return observations
+    return [one._replace(theta=link_angles(one.theta, one.effort, stiffness)) for one in observations]
 
 
 def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
@@ -265,6 +274,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
 
     A joint that differs by more than the band of `model_error.torque` is a refusal.
     """
+    observations = at_links(arm, observations)
     held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
     error = np.array(for_joints(_torque_error(arm), len(arm.joint_names), max))
     size = np.sqrt(np.mean(held**2, axis=0))
@@ -340,7 +350,7 @@ def wearer_from(
     carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
     not show an arm.
     """
-    length, table = arm.robot.length, _wearer(arm, tabled=True)
+    length, table, observations = arm.robot.length, _wearer(arm, tabled=True), at_links(arm, observations)
     theta, direction, effort, spread = columns(observations)
     rows = regressor(theta, direction, arm.robot.gravity)
     torque = effort - rows @ moments_of(arm.robot) - joint_spring_of(arm.compensator).torques(theta)
