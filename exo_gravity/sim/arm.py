@@ -13,9 +13,9 @@ and Coriolis forces act on each link. They are not small: a sway of 2 degrees at
 the shoulder by 0.6 m/s^2, as walking shakes the shoulder by 1 to 2. Together they are exact. The arm's reaction on the
 trunk is neglected.
 
-A joint with `joint_stiffness` is elastic (Spong 1987): its motor, with the rotor's inertia and all friction, is a body of
-its own, and a spring with play drives the link. The encoder sits on the motor. The rotor's kinetic energy is that of its
-spin alone, as for a rigid joint.
+A joint with `joint_stiffness` is elastic (Spong 1987): its motor, with the rotor's inertia and all friction, is a body
+of its own, and a spring with play drives the link. The encoder sits on the motor. The rotor's kinetic energy is that of
+its spin alone, as for a rigid joint.
 
 MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3 m link with 0.15 Nm of friction and
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
@@ -271,7 +271,8 @@ class SimulatedArm:
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         count = len(self.config.joint_stiffness)
-        self._theta, self._velocity, self._torque = self.data.qpos[:count], self.data.qvel[:count], self.data.qfrc_applied
+        self._theta, self._velocity = self.data.qpos[:count], self.data.qvel[:count]
+        self._torque = self.data.qfrc_applied
         self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
         # Where the motor of each joint stands in `data`: with its link, or at the end.
         self._motors = np.arange(count)
@@ -387,7 +388,8 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
             worn = f"<body>{_tube(links.length[n], at, config.wearer_mass[n])}</body>"
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
-              <joint name="{_JOINTS[n]}" axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
+              <joint name="{_JOINTS[n]}" axis="0 0 1" armature="{config.rotor_inertia[n]}"
+                damping="{config.viscous_friction[n]}"
                 stiffness="{config.spring_stiffness[n]}" springref="{config.spring_rest[n]}"
                 frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
                 range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>

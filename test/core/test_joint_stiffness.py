@@ -41,9 +41,7 @@ def resting(arm: SimulatedArm, motors: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return found.x, arm.data.qfrc_bias[:count].copy()
 
 
-def errors(
-    settings: Settings, arm: SimulatedArm, tilt: Tilt, poses: np.ndarray
-) -> tuple[float, float]:
+def errors(settings: Settings, arm: SimulatedArm, tilt: Tilt, poses: np.ndarray) -> tuple[float, float]:
     """Return the largest error in Nm of the rigid law, and with the stiffness of `settings`."""
     rigid = replace(settings, joint_stiffness=(0.0,) * poses.shape[1])
     true = np.array([resting(arm, theta)[1] for theta in poses])

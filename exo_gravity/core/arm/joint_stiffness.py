@@ -1,9 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Elastic joints: a link lies behind its motor, where the encoder sits, by the torque that the joint carries.
 
-A joint of stiffness k [Nm/rad] that carries tau has its link at q = theta - tau(q) / k (M. Spong, J Dyn Sys Meas Control
-109:310, 1987). The torque changes with the angle by at most about g times the first moments, 15 Nm/rad on a worn arm:
-`held` finds it by fixed-point steps, each of which leaves that by k of the error.
+A joint of stiffness k [Nm/rad] that carries tau has its link at q = theta - tau(q) / k (M. Spong, J Dyn Sys Meas
+Control 109:310, 1987). The torque changes with the angle by at most about g times the first moments, 15
+Nm/rad on a worn arm: `held` finds it by fixed-point steps, each of which leaves that by k of the error.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ def link_angles(theta: Sequence[float], torque: Sequence[float], stiffness: Sequ
     return tuple([angle - tau / k if k else angle for angle, tau, k in columns])
 
 
-def held(
-    torque_at: Callable[[Sequence[float]], Torque], theta: Sequence[float], stiffness: Sequence[float]
-) -> Torque:
+def held(torque_at: Callable[[Sequence[float]], Torque], theta: Sequence[float], stiffness: Sequence[float]) -> Torque:
     """Return the torque (n,) in Nm that holds links whose motors stand at `theta` (n,) rad.
 
     torque_at: that for links at an angle. stiffness: (n,) Nm/rad; 0: rigid.

@@ -186,8 +186,8 @@ class Tracker:
     rate: control cycles per s. max_effort: (n,) Nm. lines: to follow, each taken when it begins; the owner sets them
     before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
-    behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step. speed: (n,)
-    rad/s of the joints, without the vibration of their motors.
+    behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    speed: (n,) rad/s of the joints, without the vibration of their motors.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
