@@ -275,8 +275,11 @@ class SimulatedArm:
         self._torque = self.data.qfrc_applied
         self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
         # Where the motor of each joint stands in `data`: with its link, or at the end.
-        self._motors = np.arange(count)
-        self._motors[self.config.elastic] = range(count, self.model.nv)
+        self._motors: slice | np.ndarray = slice(count)
+        self._is_elastic = bool(self.config.elastic)
+        if self._is_elastic:
+            self._motors = np.arange(count)
+            self._motors[self.config.elastic] = range(count, self.model.nv)
         self._substeps = round(STEP / self.model.opt.timestep)
 
     @property
@@ -292,12 +295,12 @@ class SimulatedArm:
     @property
     def motor_positions(self) -> list[float]:
         """Angles of the joints' motors (n,) in rad; those of the links where the joints are rigid."""
-        return list(self.data.qpos[self._motors].tolist()) if self.config.elastic else self.positions
+        return list(self.data.qpos[self._motors].tolist()) if self._is_elastic else self.positions
 
     @property
     def motor_velocities(self) -> list[float]:
         """Velocities of the joints' motors (n,) in rad/s."""
-        return list(self.data.qvel[self._motors].tolist()) if self.config.elastic else self.velocities
+        return list(self.data.qvel[self._motors].tolist()) if self._is_elastic else self.velocities
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""
@@ -339,7 +342,7 @@ class SimulatedArm:
             # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
             self._damping[self._motors] += damping
             force[self._motors] += self.data.qvel[self._motors] * damping
-        if of_motors is None or not self.config.elastic:
+        if of_motors is None or not self._is_elastic:
             force[self._motors] += torque
         else:
             force[self._motors] += of_motors

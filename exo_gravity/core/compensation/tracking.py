@@ -56,10 +56,10 @@ class TrackerTuning:
     #: times `soft_frequency`, where the low-pass filter begins; it costs 23 degrees of phase where the gain is 1
     filtered_from: float = 10.0
     filter_order: int = 2  #: of first-order filters in a row
-    #: rad/s, of the second difference of a motor's speed, as a root mean square: ten times that of the encoder's
-    #: steps; a joint that breaks away from its friction once has half of it
-    vibration: float = 0.2
+    #: rad/s, of the second difference of a motor's speed on average: ten times that of the velocity's 12-bit steps
+    vibration: float = 0.15
     vibration_cycles: float = 12.0  #: over which it is averaged
+    largest_change: float = 0.3  #: rad/s that each counts at most: a joint that leaves its friction changes twice
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -190,18 +190,18 @@ class LowPass:
 
 
 class Vibration:
-    """How much the fastest changing of n speeds changes back and forth, from one cycle to the next."""
+    """How much speeds change back and forth from one cycle to the next. count: of speeds."""
 
     def __init__(self, count: int) -> None:
         self._last = np.zeros((2, count))
         self._mean = np.zeros(count)
 
     def step(self, velocity: np.ndarray) -> float:
-        """Return the root mean square of the second difference in rad/s, of the worst joint; velocity: (n,) rad/s."""
-        change = velocity - 2.0 * self._last[0] + self._last[1]
+        """Return the mean size of the second difference in rad/s, of the worst joint; velocity: (n,) rad/s."""
+        change = np.minimum(np.abs(velocity - 2.0 * self._last[0] + self._last[1]), TRACKER.largest_change)
         self._last = np.array((velocity, self._last[0]))
-        self._mean += (change**2 - self._mean) / TRACKER.vibration_cycles
-        return math.sqrt(float(self._mean.max()))
+        self._mean += (change - self._mean) / TRACKER.vibration_cycles
+        return float(self._mean.max())
 
 
 class Tracker:
@@ -211,7 +211,7 @@ class Tracker:
     before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
     behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    speed: (n,) rad/s of the joints, of those that vibrate without the vibration.
+    speed: (n,) rad/s of the joints, without vibration.
     vibrates: whether a motor has vibrated, as it does behind an elastic joint: the gains are lower from then on.
     """
 
@@ -277,10 +277,9 @@ class Tracker:
         return self._effort
 
     def _watch_vibration(self, velocity: np.ndarray) -> None:
-        smooth = self._speed.step(velocity)
+        self.speed = self._speed.step(velocity)
         if not self.vibrates and self._vibration.step(velocity) > TRACKER.vibration:
             self.vibrates, self._frequency = True, min(self._frequency, TRACKER.soft_frequency)
-        self.speed = smooth if self.vibrates else velocity
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""

@@ -8,7 +8,7 @@ import pytest
 
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.joint_stiffness import link_angles
-from exo_gravity.core.compensation.tracking import Station
+from exo_gravity.core.compensation.tracking import TRACKER, Station, Vibration
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -33,3 +33,12 @@ def test_a_tour_of_an_elastic_arm_ends_with_the_true_torques_of_its_links(
         links = link_angles(one.theta, one.effort, (stiffness,) * 4)
         needed = gravity_torque(DEFAULT_LINKS, links, one.direction)
         np.testing.assert_allclose(one.effort, needed, atol=0.03 + 5.0 * play)
+
+
+def test_a_ringing_rotor_is_a_vibration_and_a_joint_that_leaves_its_friction_is_none() -> None:
+    ringing = 0.15 * np.sin(2.0 * np.pi * 170.0 / 250.0 * np.arange(50))  # rad/s, an AK60-6 on 1,000 Nm/rad
+    leaving = [0.0, 0.0, 0.4, 0.5, 0.3, 0.1, *[0.0] * 20, -0.3, -0.4, -0.1, *[0.0] * 20]
+    for speeds, vibrates in ((ringing, True), (leaving, False)):
+        vibration = Vibration(1)
+        seen = max(vibration.step(np.array([speed])) for speed in speeds)
+        assert (seen > TRACKER.vibration) == vibrates
