@@ -125,9 +125,7 @@ class Device:
             mujoco.mj_forward(model, data)
             return np.asarray(data.qfrc_bias[:count] - data.qfrc_passive[:count])
 
-        carried = (
-            unbalanced(motors) + data.qfrc_passive[:count]
-        )  # about: it says on which side of the play it is
+        carried = unbalanced(motors) + data.qfrc_passive[:count]  # about: it says on which side of the play it is
         config = self.arm.config
         begin = motors - carried / config.joint_stiffness - np.sign(carried) * np.divide(config.backlash, 2.0)
         found = root(unbalanced, begin, tol=1e-9)

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A worn arm with elastic joints in the real loop: start, proof of signs, a wearer who moves it, and their letting go."""
+"""A worn arm with elastic joints in the real loop: start, proof of signs, a wearer who moves it and lets go."""
 
 from __future__ import annotations
 

@@ -10,9 +10,9 @@ frequency, however they are coupled.
 
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
-sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass Stribeck
-friction best, and once a motor vibrates it goes on with lower gains, of which a low-pass filter leaves nothing at the
-rotor's frequencies.
+sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
+Stribeck friction best, and once a motor vibrates it goes on with lower gains, of which a low-pass filter leaves nothing
+at the rotor's frequencies.
 """
 
 import math
