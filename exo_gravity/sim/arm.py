@@ -13,6 +13,10 @@ and Coriolis forces act on each link. They are not small: a sway of 2 degrees at
 the shoulder by 0.6 m/s^2, as walking shakes the shoulder by 1 to 2. Together they are exact. The arm's reaction on the
 trunk is neglected.
 
+A joint with `joint_stiffness` is elastic (Spong 1987): its motor, with the rotor's inertia and all friction, is a body
+of its own, and a spring with play drives the link. The encoder sits on the motor. The rotor's kinetic energy is that of
+its spin alone, as for a rigid joint.
+
 MuJoCo models dry friction as a soft constraint, which creeps. Measured on a 0.3 m link with 0.15 Nm of friction and
 0.05 Nm of imbalance: 18 degrees per minute with MuJoCo's defaults, 0.002 with the stiffness below.
 """
@@ -41,11 +45,19 @@ from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.trunk_motion import TrunkState
 
 STEP = 0.001  # s
+ELASTIC_STEPS = 4  # of MuJoCo in one STEP of an elastic arm: 3 % of an AK60-6's rotor on 1,000 Nm/rad, 170 Hz
+MAX_JOINT_STIFFNESS = 5000.0  # Nm/rad; a stiffer joint is rigid, and its rotor too fast for the steps
+MAX_BACKLASH = 0.1  # rad
+# s, damping of a joint's spring per stiffness, an estimate: at 1,000 Nm/rad an AK60-6's rotor has a damping ratio of
+# 0.1 on it, a link of 0.1 kg m^2 one of 0.01, as arms of tube and printed parts have.
+JOINT_LOSS = 2e-4
 
 _ALPHA = (-math.pi / 2, math.pi / 2, 0.0, 0.0)
 _OFFSET = (0.0, -math.pi / 2, 0.0, 0.0)
+_JOINTS = tuple(f"joint {n + 1}" for n in range(JOINT_COUNT))
 _TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin carbon tube
 _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
+_MIN_ROTOR = 1e-5  # kg m^2 that each motor of an elastic joint has beside its rotor's; MuJoCo needs some
 _STOPS = (-math.pi, math.pi)  # rad
 _BESIDE = (-MAX_OFFSET, MAX_OFFSET)  # m
 _ZEROS = (0.0,) * JOINT_COUNT
@@ -96,6 +108,11 @@ class JointConfig:
     #: Cables and hoses across the joints.
     spring_stiffness: Sequence[float] = owned(_ZEROS, "springs across the joints", (0.0, MAX_STIFFNESS), "Nm/rad")
     spring_rest: Sequence[float] = owned(_ZEROS, "angle at which they are slack", (-MAX_REST, MAX_REST), "rad")
+    #: Between the motor, where the encoder sits, and the link.
+    joint_stiffness: Sequence[float] = owned(
+        _ZEROS, "stiffness between motor and link; 0: rigid", (0.0, MAX_JOINT_STIFFNESS), "Nm/rad"
+    )
+    backlash: Sequence[float] = owned(_ZEROS, "play between motor and link", (0.0, MAX_BACKLASH), "rad")
     #: The paper's motor mounts turn 190 degrees.
     position_min: Sequence[float] = owned(_radians(-95.0, -10.0, -45.0, -10.0), "lower joint stops", _STOPS, "rad")
     position_max: Sequence[float] = owned(_radians(95.0, 180.0, 145.0, 180.0), "upper joint stops", _STOPS, "rad")
@@ -105,6 +122,13 @@ class JointConfig:
         if np.any(np.greater_equal(self.position_min, self.position_max)):
             expected = f"below position_max = {list(self.position_max)} rad"
             raise ParameterError("position_min", self.position_min, expected)
+        if any(play and not stiffness for play, stiffness in zip(self.backlash, self.joint_stiffness, strict=True)):
+            raise ParameterError("backlash", self.backlash, "0 rad where joint_stiffness is 0, which is rigid")
+
+    @property
+    def elastic(self) -> list[int]:
+        """The joints, from 0 on, whose motor is a body of its own."""
+        return [n for n, stiffness in enumerate(self.joint_stiffness) if stiffness]
 
     def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
         """Return the arm, and the same on a base that can turn about its origin.
@@ -118,13 +142,45 @@ class JointConfig:
         raise NotImplementedError
 
     def with_tissue(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Add the springs of the wearer's joints to those of `model`, whose last joints are the arm's; return it."""
-        count = len(self.wearer_stiffness)
-        joints, angles = slice(model.njnt - count, None), slice(model.nq - count, None)
+        """Add the springs of the wearer's joints to those of `model`; return it."""
+        joints, angles, _ = self.places(model)
         own, worn = model.jnt_stiffness[joints].copy(), np.array(self.wearer_stiffness)
         pull = own * model.qpos_spring[angles] + worn * self.wearer_rest
         model.jnt_stiffness[joints] = both = own + worn
-        model.qpos_spring[angles] = np.divide(pull, both, out=np.zeros(count), where=both > 0.0)
+        model.qpos_spring[angles] = np.divide(pull, both, out=np.zeros(len(both)), where=both > 0.0)
+        return model
+
+    def places(self, model: mujoco.MjModel) -> tuple[slice, slice, slice]:
+        """Return where the arm's joints stand among the joints, angles and velocities of `model`.
+
+        They follow the base's, if it can turn. The motors of elastic joints come last.
+        """
+        count = len(self.wearer_stiffness)
+        base = model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL
+        joint, angle, velocity = (1, 4, 3) if base else (0, 0, 0)
+        return slice(joint, joint + count), slice(angle, angle + count), slice(velocity, velocity + count)
+
+    def add_motors(self, spec: mujoco.MjSpec, names: Sequence[str]) -> None:
+        """Give each elastic joint a motor with a spring to its link. names: of the joints (n,) in `spec`."""
+        for n in self.elastic:
+            stiffness, half = self.joint_stiffness[n], self.backlash[n] / 2.0
+            motor = spec.worldbody.add_body(mass=_MIN_MASS, inertia=(_MIN_ROTOR,) * 3, explicitinertial=True)
+            motor.add_joint(name=f"motor of {names[n]}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=(0, 0, 1))
+            damping = JOINT_LOSS * stiffness
+            shaft = spec.add_tendon(stiffness=stiffness, damping=damping, springlength=(-half, half))
+            shaft.wrap_joint(f"motor of {names[n]}", 1.0)
+            shaft.wrap_joint(names[n], -1.0)
+
+    def motors_apart(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        """Move rotor and friction of each elastic joint of `model` to its motor; return it."""
+        if not self.elastic:
+            return model
+        link, motor = self.elastic, list(range(len(self.joint_stiffness), model.nv))
+        for column in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
+            column[motor], column[link] = column[link], 0.0
+        model.dof_solref[motor], model.dof_solimp[motor, : len(FRICTION.impedance)] = FRICTION
+        model.opt.timestep = STEP / ELASTIC_STEPS
+        mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
 
@@ -151,8 +207,9 @@ class ArmConfig(JointConfig):
         """Return the arm, and the same on a base that can turn about its origin."""
         xml = _mjcf(self, payload)
         on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
-        arm, turning = map(self.with_tissue, map(mujoco.MjModel.from_xml_string, (xml, on_ball)))
-        return arm, turning
+        spec, turning = mujoco.MjSpec.from_string(xml), mujoco.MjModel.from_xml_string(on_ball)
+        self.add_motors(spec, _JOINTS)
+        return self.motors_apart(self.with_tissue(spec.compile())), self.with_tissue(turning)
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the base of the `side` arm feels, in its own axes."""
@@ -210,10 +267,10 @@ class SimulatedArm:
 
         A joint's motion goes on as it is: what is taken moves along, and what is dropped is gone.
         """
-        theta, velocity, gravity = self._theta.copy(), self._velocity.copy(), self.model.opt.gravity.copy()
+        theta, velocity, gravity = self.data.qpos.copy(), self.data.qvel.copy(), self.model.opt.gravity.copy()
         motion = self._turning_data.qvel[:3].copy(), self._turning_data.qacc[:3].copy()
         self._load((mass, *cog))
-        self._theta[:], self._velocity[:] = theta, velocity
+        self.data.qpos[:], self.data.qvel[:] = theta, velocity
         mujoco.mj_forward(self.model, self.data)
         self.move_base(gravity.tolist(), *(vector.tolist() for vector in motion))
 
@@ -224,8 +281,17 @@ class SimulatedArm:
         self.data = mujoco.MjData(self.model)
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
-        self._theta, self._velocity, self._torque = self.data.qpos, self.data.qvel, self.data.qfrc_applied
+        count = len(self.config.joint_stiffness)
+        self._theta, self._velocity = self.data.qpos[:count], self.data.qvel[:count]
+        self._torque = self.data.qfrc_applied
         self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
+        # Where the motor of each joint stands in `data`: with its link, or at the end.
+        self._motors: slice | np.ndarray = slice(count)
+        self._is_elastic = bool(self.config.elastic)
+        if self._is_elastic:
+            self._motors = np.arange(count)
+            self._motors[self.config.elastic] = range(count, self.model.nv)
+        self._substeps = round(STEP / self.model.opt.timestep)
 
     @property
     def positions(self) -> list[float]:
@@ -237,10 +303,21 @@ class SimulatedArm:
         """Joint velocities (n,) in rad/s."""
         return list(self._velocity.tolist())
 
+    @property
+    def motor_positions(self) -> list[float]:
+        """Angles of the joints' motors (n,) in rad; those of the links where the joints are rigid."""
+        return list(self.data.qpos[self._motors].tolist()) if self._is_elastic else self.positions
+
+    @property
+    def motor_velocities(self) -> list[float]:
+        """Velocities of the joints' motors (n,) in rad/s."""
+        return list(self.data.qvel[self._motors].tolist()) if self._is_elastic else self.velocities
+
     def reset(self, theta: Vector) -> None:
-        """Put the arm at rest at `theta`, (n,) rad."""
+        """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""
         mujoco.mj_resetData(self.model, self.data)
         self._theta[:] = floats("theta", theta, len(self._theta), -math.pi, math.pi, "rad")
+        self.data.qpos[self._motors] = self._theta
         mujoco.mj_forward(self.model, self.data)
 
     def move_base(
@@ -270,24 +347,32 @@ class SimulatedArm:
         of_motors: (n,) Nm, the part that gears carry; None: all of it.
         damping: (n,) Nm s/rad, of the motors, whose part of `torque` follows the velocity within a step; () for none.
         """
+        force = np.zeros(self.model.nv)
         self._damping[:] = self._viscous
         if any(damping):
-            self._damping += damping  # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
-            torque = self._velocity * damping + torque
-        self._torque[:] = torque
-        constant = self._coulomb
+            # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
+            self._damping[self._motors] += damping
+            force[self._motors] += self.data.qvel[self._motors] * damping
+        if of_motors is None or not self._is_elastic:
+            force[self._motors] += torque
+        else:
+            force[self._motors] += of_motors
+            force[: len(self._theta)] += np.subtract(torque, of_motors)
+        self._torque[:] = force
+        constant, count = self._coulomb, count * self._substeps
         if self._load_share.any():
             constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
-            self.model.dof_frictionloss[:] = constant
+            self.model.dof_frictionloss[self._motors] = constant
         if not (self._turns or self._stribeck.any()):
             mujoco.mj_step(self.model, self.data, count)
             return
+        links = slice(len(self._theta))
         for _ in range(count):
-            fading = np.exp(-np.square(self._velocity / self._speed))
-            self.model.dof_frictionloss[:] = constant + self._stribeck * fading
+            fading = np.exp(-np.square(self.data.qvel[self._motors] / self._speed))
+            self.model.dof_frictionloss[self._motors] = constant + self._stribeck * fading
             mujoco.mj_step1(self.model, self.data)
             if self._turns:
-                self._torque[:] = torque + self.data.qfrc_bias - self._turning_bias()
+                self._torque[links] = force[links] + self.data.qfrc_bias[links] - self._turning_bias()
             mujoco.mj_step2(self.model, self.data)
 
     def _turning_bias(self) -> np.ndarray:
@@ -317,7 +402,8 @@ def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
             worn = f"<body>{_tube(links.length[n], at, config.wearer_mass[n])}</body>"
         body = f"""
             <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
-              <joint axis="0 0 1" armature="{config.rotor_inertia[n]}" damping="{config.viscous_friction[n]}"
+              <joint name="{_JOINTS[n]}" axis="0 0 1" armature="{config.rotor_inertia[n]}"
+                damping="{config.viscous_friction[n]}"
                 stiffness="{config.spring_stiffness[n]}" springref="{config.spring_rest[n]}"
                 frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
                 range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>

@@ -129,8 +129,8 @@ class SimulatedDevice:
                 continue
             motor = self.motors[joint]
             self._frames[joint] += 1
-            position = arm.positions[joint] + self.encoder_error[joint]
-            reply = motor.receive(data, position, arm.velocities[joint], self.time, can_id)
+            position = arm.motor_positions[joint] + self.encoder_error[joint]
+            reply = motor.receive(data, position, arm.motor_velocities[joint], self.time, can_id)
             if reply is not None and not self.mute[joint]:
                 replies.append((joint, (motor.reply_id, reply)))
         return replies
@@ -139,9 +139,9 @@ class SimulatedDevice:
         """Return the present status frame of a V3 board; None if it cannot send, and for other boards."""
         if self.bus_silent or self.cut_off[joint] or self.mute[joint]:
             return None
-        return self.motors[joint].status(
-            self.arm.positions[joint] + self.encoder_error[joint], self.arm.velocities[joint]
-        )
+        arm = self.arm
+        position = arm.motor_positions[joint] + self.encoder_error[joint]
+        return self.motors[joint].status(position, arm.motor_velocities[joint])
 
     def run(
         self,
@@ -240,7 +240,7 @@ class SimulatedDevice:
             if self.time >= returns:
                 self._power_returns[joint] = math.inf
                 self.motors[joint].unplugged = False
-        at = zip(self.motors, theta, velocity, strict=True)
+        at = zip(self.motors, self.arm.motor_positions, self.arm.motor_velocities, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
         elapsed = self.time - self._script_start
         given = self.wearer.torque(elapsed, theta, velocity)

@@ -39,6 +39,8 @@ ARM_FIELDS = {
     "load_friction": "friction.load",
     "spring_stiffness": "joint_spring.stiffness",
     "spring_rest": "joint_spring.rest",
+    "joint_stiffness": "joint_stiffness",
+    "backlash": "backlash",
     "position_min": "stop.min",
     "position_max": "stop.max",
 }

@@ -71,11 +71,13 @@ class UrdfConfig(JointConfig):
                 _add_point(spec.body(name), worn, way * (cog / np.linalg.norm(way)))
         if mass:
             _add_point(spec.body(self.hand), mass, place)
-        arm = spec.compile()
+        elastic = spec.copy()
+        self.add_motors(elastic, self.joint_names)
+        arm = self.motors_apart(self._with_mechanics(elastic.compile()))
         root = spec.worldbody.first_body()
         root.add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
         root.mass, root.inertia, root.explicitinertial = 1.0, (1.0, 1.0, 1.0), True
-        return self._with_mechanics(arm), self._with_mechanics(spec.compile())
+        return arm, self._with_mechanics(spec.compile())
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the root link feels, each (3,) in its axes: those of the trunk, whatever the side."""
@@ -84,9 +86,8 @@ class UrdfConfig(JointConfig):
         return (x, y, z), state.angular_velocity, state.angular_acceleration
 
     def _with_mechanics(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Return `model` with the mechanics of the joints, which are the last ones."""
-        count = len(self.joint_names)
-        dofs, joints = slice(model.nv - count, None), slice(model.njnt - count, None)
+        """Return `model` with the mechanics of the joints."""
+        joints, angles, dofs = self.places(model)
         model.opt.timestep = STEP
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         model.dof_armature[dofs] = self.rotor_inertia
@@ -94,7 +95,7 @@ class UrdfConfig(JointConfig):
         model.dof_frictionloss[dofs] = self.coulomb_friction
         model.dof_solref[dofs], model.dof_solimp[dofs, : len(FRICTION.impedance)] = FRICTION
         model.jnt_stiffness[joints] = self.spring_stiffness
-        model.qpos_spring[model.nq - count :] = self.spring_rest
+        model.qpos_spring[angles] = self.spring_rest
         model.jnt_limited[joints] = True
         model.jnt_range[joints] = np.transpose((self.position_min, self.position_max))
         model.jnt_solref[joints], model.jnt_solimp[joints, : len(STOP.impedance)] = STOP

@@ -41,6 +41,7 @@ class CarriedArm(DirectController, VirtualArm):
     remembered: Nm that another tool has left in the motors' memory.
     bitrate: bit/s of a wire with arbitration; 0: frames take no time.
     is_fd: whether frames are those of CAN FD.
+    stiffness, play: of all joints, Nm/rad and rad; 0: rigid. The compensator knows the stiffness.
     """
 
     def __init__(
@@ -51,12 +52,16 @@ class CarriedArm(DirectController, VirtualArm):
         remembered: float = 0.0,
         bitrate: int = 0,
         is_fd: bool = False,
+        stiffness: float = 0.0,
+        play: float = 0.0,
     ) -> None:
         config = ArmConfig(
             wearer_mass=WORN_MASS,
             wearer_cog=WORN_COG,
             coulomb_friction=(0.1,) * len(joints),
             rotor_inertia=[joint.spec.rotor_inertia for joint in joints],
+            joint_stiffness=(stiffness,) * len(joints),
+            backlash=(play,) * len(joints),
         )
         device = SimulatedDevice(SimulatedArm(config), motors)
         device.is_fd = (is_fd,) * len(joints)
@@ -64,7 +69,8 @@ class CarriedArm(DirectController, VirtualArm):
             for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
                 device.exchange(*frame)
         settings = Settings("right", DEFAULT_LINKS, mode="zero_g", support=1.0, max_effort=peak, use_imu=False,
-                            wearer_mass=WORN_MASS, wearer_cog=WORN_COG)  # fmt: skip
+                            wearer_mass=WORN_MASS, wearer_cog=WORN_COG,
+                            joint_stiffness=(stiffness,) * len(joints))  # fmt: skip
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         limits = Limits(JOINTS, max_effort=peak, home_tolerance=tolerance)
         DirectController.__init__(self, Compensator(settings, JOINTS), limits)

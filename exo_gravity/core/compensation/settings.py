@@ -27,6 +27,7 @@ from exo_gravity.core.arm.arm import (
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.joint_stiffness import SOFTEST, STIFFEST, held
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Tissue, Wearer, load_by_moments
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
@@ -117,6 +118,13 @@ class Settings:
     terms: TermSettings = field(default_factory=TermSettings)
     model_error: ModelError = field(default_factory=ModelError)  #: for the bands of what is estimated
     joint_spring: JointSpring = field(default_factory=JointSpring)  #: the device's own; every law gets it
+    joint_stiffness: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "stiffness of each joint between its motor, where the encoder sits, and its link; 0: rigid. Not `joint_spring`",
+        (0.0, STIFFEST),
+        "Nm/rad",
+        expert=True,
+    )
     robot_by_mass: Arm | None = None  #: the robot by its masses, for `terms`; None: `robot`
     payload_mass: float = 0.0  #: kg in the hand
     payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in the frame of the hand
@@ -137,6 +145,8 @@ class Settings:
         if self.joint_spring.on and len(self.joint_spring.stiffness) != len(self.robot.scale):
             expected = f"{len(self.robot.scale)} numbers"
             raise ParameterError("joint_spring.stiffness", list(self.joint_spring.stiffness), expected)
+        if soft := [k for k in self.joint_stiffness if 0.0 < k < SOFTEST]:
+            raise ParameterError("joint_stiffness", soft, f"0 for a rigid joint, or at least {SOFTEST:g} Nm/rad")
         for name in ("wearer_first_moment", "wearer_off_axis"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if self.tissue.on and len(self.tissue.joint_stiffness) != len(self.robot.scale):
@@ -204,18 +214,25 @@ class Settings:
     def torque(self, theta: Sequence[float], tilt: Tilt, exact: bool = False) -> tuple[Torque, str]:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad; exact: by the exact law in any case.
 
+        theta: of the motors, behind which the links of elastic joints lie.
         The joints' own springs are included, in zero_g also `support` of the wearer's tissue. And why the chosen law
         does not apply here, or ''. Then the exact law replaces it.
         """
         reason = self.chosen.outside(theta, tilt)
         law = self.exact if exact or reason else self.chosen
+        if any(self.joint_stiffness):
+            return held(lambda links: self._of_links(law, links, tilt), theta, self.joint_stiffness), reason
+        return self._of_links(law, theta, tilt), reason
+
+    def _of_links(self, law: Law, theta: Sequence[float], tilt: Tilt) -> Torque:
+        """Return the torque (n,) in Nm by `law` with all springs for links at `theta` (n,) rad."""
         torque = law.torque(theta, tilt)
         if self.joint_spring.on:
             torque = tuple(map(operator.add, torque, self.joint_spring.torque(theta)))
         if self.mode == "zero_g" and self.tissue.on:
             share = self.support_now
             torque = tuple([tau + share * own for tau, own in zip(torque, self.tissue.torque(theta), strict=True)])
-        return torque, reason
+        return torque
 
 
 # fmt: off
@@ -258,6 +275,7 @@ COMPENSATOR = (
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
     *(replace(param, name=f"joint_spring.{param.name}") for param in params_of(JointSpring)),
+    param_of(Settings, "joint_stiffness"),
     *term_parameters(),
     *REAL_TIME_PARAMETERS,
 )

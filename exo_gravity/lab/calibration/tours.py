@@ -17,6 +17,7 @@ import numpy as np
 from exo_gravity.core.arm.arm import ModelError, papers
 from exo_gravity.core.arm.gravity import MOMENTS
 from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
@@ -123,7 +124,7 @@ def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np
 
 def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
-    model, (low, high) = model_of(arm), TORQUE_SCALE_BOUNDS
+    model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
     found = identify(observations, model)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
@@ -137,6 +138,14 @@ def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> Calibratio
     more = f"next best pose, if more is wanted: {' '.join(f'{angle:.0f}' for angle in np.degrees(best))} degrees"
     changes, lines = _changes(arm, model, found, scale), (*_lines(arm, found), more)
     return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
+
+
+def at_links(arm: AnyArm, observations: Sequence[Observation]) -> Sequence[Observation]:
+    """Return `observations` with the angles of the links, where the file gives a `joint_stiffness`."""
+    stiffness = arm.compensator["joint_stiffness"]
+    if not any(stiffness):
+        return observations
+    return [one._replace(theta=link_angles(one.theta, one.effort, stiffness)) for one in observations]
 
 
 def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
@@ -244,6 +253,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
 
     A joint that differs by more than the band of `model_error.torque` is a refusal.
     """
+    observations = at_links(arm, observations)
     held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
     error = np.array(for_joints(torque_error(arm), len(arm.joint_names), max))
     size = np.sqrt(np.mean(held**2, axis=0))

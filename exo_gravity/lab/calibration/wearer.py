@@ -20,7 +20,7 @@ from exo_gravity.core.numbers import COVER, for_joints, one_float
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tours import row, torque_error, tour_observations
+from exo_gravity.lab.calibration.tours import at_links, row, torque_error, tour_observations
 from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest
 from exo_gravity.lab.calibration.worn_arm import WornArm, worn_arm
 from exo_gravity.lab.inputs.arms import AnyArm
@@ -63,7 +63,7 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
     not show an arm.
     """
-    worn = worn_arm(arm)
+    worn, observations = worn_arm(arm), at_links(arm, observations)
     theta, direction, effort, spread = columns(observations)
     torque = effort - worn.robot(theta, direction) - joint_spring_of(arm.compensator).torques(theta)
     again, change = unrest(theta, torque)

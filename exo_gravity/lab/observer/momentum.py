@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -77,7 +78,7 @@ class MomentumObserver:
         self._gain, count = s.loaded.gain.tolist(), len(s.loaded.scale)
         self._wearer, self._tissue = s.worn(s.robot.massless(s.loaded.gravity)), s.tissue
         self._links = s.loaded.worn_links(s.wearer_mass, s.wearer_cog)
-        self._spring = s.joint_spring
+        self._spring, self._joint_stiffness = s.joint_spring, s.joint_stiffness
         friction = s.terms.friction
         self._is_known = any(friction.coulomb)
         self._coulomb = tuple(friction.coulomb) if self._is_known else for_joints(tuning.typical_coulomb, count, max)
@@ -104,6 +105,7 @@ class MomentumObserver:
         gravity_tilt: of gravity alone, for the weight; None: `tilt`, as if the trunk were not shaken.
         """
         theta, velocity, effort = joints
+        theta = link_angles(theta, effort, self._joint_stiffness)
         tuning, bandwidth = self._tuning, self._tuning.bandwidth
         columns = [self._whole.torque(theta, axis) for axis in AXES]
         felt = tuple([tilt.magnitude * component for component in tilt.direction])

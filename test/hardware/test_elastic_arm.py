@@ -1,0 +1,44 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""A worn arm with elastic joints in the real loop: start, proof of signs, a wearer who moves it and lets go."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.drive import State
+from exo_gravity.sim.judge import driven
+from exo_gravity.sim.motors import simulated
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.truth import TruthRecords
+from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from ..support.simulated_device import SPECS
+from .carried_arm import DRIVEN, ENERGY, POSE, CarriedArm
+
+PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
+REACH = TrialScript.parse(
+    {"name": "reach", "steps": [{"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5}, {"move": POSE, "over": 1.0}]}
+)
+
+
+@pytest.mark.parametrize(("stiffness", "play"), [(150.0, 0.0), (150.0, 0.02), (1000.0, 0.0), (1000.0, 0.01)])
+def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_leaves_it(
+    stiffness: float, play: float
+) -> None:
+    joints = [JointMotor(spec, number) for number, spec in enumerate(SPECS, 1)]
+    arm = CarriedArm(joints, [simulated(joint) for joint in joints], PEAK, stiffness=stiffness, play=play)
+    arm.carry()
+    arm.raise_to(POSE)
+    arm.device.start(VirtualWearer(REACH))
+    arm.run(3.0)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    left, truth = np.array(arm.device.arm.positions), TruthRecords()
+    arm.device.truth = truth
+    arm.run(4.0)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    caused = driven(truth.records)
+    assert caused.speed < DRIVEN
+    assert caused.energy < ENERGY
+    assert np.abs(np.array(arm.device.arm.positions) - left).max() < 0.03  # rad
