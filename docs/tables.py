@@ -11,7 +11,7 @@ import argparse
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,7 +159,7 @@ FIRMWARE_QUESTIONS: tuple[tuple[str, tuple[str, ...], Callable[[Firmware], str]]
 
 
 def parameter_table(node: str) -> str:
-    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts."""
+    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts, without ranges."""
     shared: dict[str, list[str]] = defaultdict(list)
     own = []
     for param in PARAMETERS[node]:
@@ -171,13 +171,14 @@ def parameter_table(node: str) -> str:
     as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
     usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
     text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _parameter_rows(usual)
-    return f"{text}\nFor experts:\n\n{_parameter_rows(expert)}" if expert else text
+    return f"{text}\nFor experts:\n\n{_parameter_rows(expert, {'range'})}" if expert else text
 
 
-def _parameter_rows(params: Sequence[Param]) -> str:
+def _parameter_rows(params: Sequence[Param], without: Set[str] = frozenset()) -> str:
     """Return a Markdown table; it says when a parameter may change where they differ in that."""
-    mixed = len({param.fixed for param in params}) > 1
-    keep = [n for n, title in enumerate(HEAD) if mixed or title != "change"]
+    if len({param.fixed for param in params}) == 1:
+        without = without | {"change"}
+    keep = [n for n, title in enumerate(HEAD) if title not in without]
     return markdown([HEAD[n] for n in keep], ([_row(param)[n] for n in keep] for param in params))
 
 
