@@ -301,6 +301,8 @@ def _default(param: Param) -> str:
 
 
 def _range(param: Param) -> str:
+    if param.name == "motor":
+        return "[motors.md](motors.md)"
     if param.choices:
         return ", ".join(param.choices)
     return f"{param.bounds[0]:g} to {param.bounds[1]:g}" if param.bounds else ""
