@@ -124,7 +124,7 @@ function showTitle({ arm, kind, unit, names, caption }) {
     mark.style.color = `var(${colourOf(n)})`;
     return mark;
   });
-  caption.replaceChildren(`${headText(arm)}: ${head}`, ...curves);
+  caption.replaceChildren(Object.assign(document.createElement("div"), { textContent: `${headText(arm)}: ${head}` }), ...curves);
 }
 
 function push({ data }, now, values) {
