@@ -144,7 +144,7 @@ function whyBlank({ data, kind }, arm) {
 function drawLimits(plot, limits) {
   const { ctx, bbox } = plot;
   limits.forEach((limit, n) => {
-    for (const value of [limit, -limit]) {
+    for (const value of limit ? [limit, -limit] : []) {
       const y = plot.valToPos(value, "y", true);
       if (!(y >= bbox.top && y <= bbox.top + bbox.height)) continue;
       ctx.strokeStyle = colour(colourOf(n));
