@@ -68,7 +68,7 @@ MOTOR_HEAD = (
     "angle after power-up",
     "shuts off, degC",
 )
-HEAD = ("parameter", "default", "range", "change", "meaning")
+HEAD = ("parameter", "default", "range", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -159,7 +159,7 @@ FIRMWARE_QUESTIONS: tuple[tuple[str, tuple[str, ...], Callable[[Firmware], str]]
 
 
 def parameter_table(node: str) -> str:
-    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts."""
+    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts, without ranges."""
     shared: dict[str, list[str]] = defaultdict(list)
     own = []
     for param in PARAMETERS[node]:
@@ -170,14 +170,22 @@ def parameter_table(node: str) -> str:
             own.append(param)
     as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
     usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
-    text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _parameter_rows(usual)
-    return f"{text}\nFor experts:\n\n{_parameter_rows(expert)}" if expert else text
+    text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(own) + _parameter_rows(usual)
+    return f"{text}\nFor experts:\n\n{_parameter_rows(expert, without='range')}" if expert else text
 
 
-def _parameter_rows(params: Sequence[Param]) -> str:
-    """Return a Markdown table; it says when a parameter may change where they differ in that."""
-    mixed = len({param.fixed for param in params}) > 1
-    keep = [n for n, title in enumerate(HEAD) if mixed or title != "change"]
+def _live_ones(params: Sequence[Param]) -> str:
+    """Return a sentence that says which parameters a running node accepts; '' where it accepts none."""
+    live, fixed = ([f"`{p.name}`" for p in params if p.fixed is wanted] for wanted in (False, True))
+    if not live:
+        return ""
+    few, what = (fixed, "All but these are live") if len(fixed) < len(live) else (live, "Live")
+    return f"{what}: {', '.join(few)}.\n\n" if few else "All are live.\n\n"
+
+
+def _parameter_rows(params: Sequence[Param], without: str = "") -> str:
+    """Return a Markdown table without the column of this title."""
+    keep = [n for n, title in enumerate(HEAD) if title != without]
     return markdown([HEAD[n] for n in keep], ([_row(param)[n] for n in keep] for param in params))
 
 
@@ -287,7 +295,7 @@ def stale_tables(text: str) -> list[str]:
 
 
 def _row(p: Param) -> tuple[str, ...]:
-    return f"`{p.name}`", _default(p), _range(p), "" if p.fixed else "live", p.description
+    return f"`{p.name}`", _default(p), _range(p), p.description
 
 
 def _default(param: Param) -> str:
@@ -295,11 +303,12 @@ def _default(param: Param) -> str:
         return "required"
     value = param.default
     each = isinstance(value, list) and len(value) > 1 and len(set(value)) == 1
-    words = (_shown(value[0] if each else value) or "empty", param.unit, "each" if each else "")
-    return " ".join(filter(None, words))
+    return " ".join(filter(None, (_shown(value[0] if each else value) or "empty", param.unit)))
 
 
 def _range(param: Param) -> str:
+    if param.name == "motor":
+        return "[motors.md](motors.md)"
     if param.choices:
         return ", ".join(param.choices)
     return f"{param.bounds[0]:g} to {param.bounds[1]:g}" if param.bounds else ""

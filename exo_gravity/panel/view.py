@@ -113,8 +113,10 @@ def difference(before: Values, load: Values) -> dict[str, Any] | None:
 
 def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
+    # With a URDF, 0 of the compensator stands for the limit in it.
+    given = [[limit for limit in column if limit > 0.0] for column in zip(*efforts, strict=True)]
     return {
-        "max_effort": [min(column) for column in zip(*efforts, strict=True)] if efforts else None,
+        "max_effort": [min(column, default=None) for column in given] if given else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},
         "source": source_of(bridge, False).value,
     }

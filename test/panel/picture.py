@@ -41,6 +41,8 @@ def _shoot(browser: Browser, stage: Stage, name: str, width: int, height: int) -
     page = open_page(browser, stage.url, width, height)
     wait_for_state(page, stage.arms.states["left"], "left")
     page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
+    if page.is_visible("#take"):  # the page before this one held control, and is gone
+        page.click("#take")
     page.wait_for_timeout(8000)
     page.screenshot(path=DOCS / f"{name}.png")
     page.context.close()

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which change of load the panel names after a fault."""
+"""Which change of load the panel names after a fault, and the torque limits that it shows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import Any
 import pytest
 
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.panel.view import NEWS_DELAY, LoadChanges
+from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.panel.view import NEWS_DELAY, LoadChanges, setup_of
 
 
 class PanelLook:
@@ -89,3 +92,11 @@ def test_support_that_does_not_act_and_parameters_that_are_not_known_are_no_chan
     look.go(1.0)
     look.go(1.0, **known)
     assert look.fail() is None
+
+
+def test_the_limit_of_a_joint_is_the_smaller_one_and_a_compensator_without_a_limit_of_its_own_has_none():
+    bridge = values_of(
+        CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "test", "max_effort": [3.0, 9.0, 3.0, 3.0]}
+    )
+    compensator = values_of(COMPENSATOR, {}) | {"max_effort": [0.0, 5.0, 0.0, 12.0]}
+    assert setup_of({"right": (bridge, compensator)})["arms"]["right"]["max_effort"] == [3.0, 5.0, 3.0, 3.0]

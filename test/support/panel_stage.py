@@ -125,9 +125,9 @@ class PlayedArms:
 
     def state(self, name: str, now: float) -> dict[str, Any]:
         """Return the state of one arm as the node makes it."""
-        names = [f"{name}_{leaf}" for leaf in LEAVES]
+        names = self.settings[name]["joint_names"]
         position = [middle + 0.3 * math.sin(0.5 * now + n) for n, middle in enumerate(self.pose)]
-        effort = [0.8 * math.sin(0.5 * now + n) for n in range(4)]
+        effort = [0.8 * math.sin(0.5 * now + n) for n in range(len(names))]
         state, fault = self.states[name], self.faults.get(name, "none")
         values = {"state": state, "fault": fault, "rate (Hz)": "250.0", "age of efforts (ms)": "4.1"}
         values |= {"limits acting": "none", **{f"{joint} temperature (degC)": "31" for joint in names}}

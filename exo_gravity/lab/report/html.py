@@ -35,7 +35,12 @@ figcaption { color: #5a646d; font-size: .9rem; }
 .source { display: inline-block; border: 2px dashed #5a646d; padding: .2rem .8rem; margin: .8rem 0 0;
           font-weight: 700; }
 .verdict ul { margin: .3rem 0 0; padding-left: 1.2rem; }
-.scroll { overflow-x: auto; }
+figure, .scroll { overflow-x: auto; }
+.scroll { background: linear-gradient(to right, #fff 30%, transparent) local,
+          linear-gradient(to left, #fff 30%, transparent) right local,
+          linear-gradient(to right, #0003, transparent) left scroll,
+          linear-gradient(to left, #0003, transparent) right scroll; background-repeat: no-repeat;
+          background-size: 3rem 100%, 3rem 100%, .7rem 100%, .7rem 100%; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .15rem .6rem; text-align: right; white-space: nowrap; }
 th { font-weight: 600; vertical-align: bottom; }
@@ -43,6 +48,10 @@ thead { border-bottom: 2px solid #9aa3ab; } tbody { border-bottom: 1px solid #d5
 tbody th { font-weight: inherit; text-align: left; }
 .joints th::before { content: "●"; margin-right: .4rem; }
 pre { background: #f4f6f8; padding: .7rem 1rem; overflow-x: auto; font-size: .85rem; }
+@media screen and (max-width: 40rem) {
+  body { margin: 1rem auto; } h1 { font-size: 1.5rem; } figure img { width: 48rem; }
+  table { font-size: .82rem; } th, td { padding-inline: .35rem; }
+}
 """ + "\n".join(
     f".joints tr:nth-child({n}) th::before {{ color: {c}; }}" for n, c in enumerate(JOINT_COLOURS + MORE_COLOURS, 1)
 )

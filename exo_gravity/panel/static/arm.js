@@ -1,7 +1,7 @@
 // The card of one arm: its state, why, what to do and the button that does it; below its mode, support, load and joints.
 
 import { showJointShares, showLoad, showShare } from "./load.js";
-import { changes, jointText, poseAsked, tell } from "./telling.js";
+import { changes, headText, jointText, poseAsked, tell } from "./telling.js";
 import { degrees, finite, has, number, t, translate, write } from "./texts.js";
 
 const SIGNS = { inactive: "○", disabled: "○", checking: "◔", "proving signs": "◑", "ramping in": "◕", active: "●", "letting down": "▼", fault: "✖", silent: "?", unseen: "?" };
@@ -73,7 +73,7 @@ export class ArmCard {
   }
 
   headText() {
-    return has(`head.${this.name}`) ? t(`head.${this.name}`) : this.name;
+    return headText(this.name);
   }
 
   get state() {

@@ -54,8 +54,8 @@ export class Picture {
     this.camera.up.set(0, 0, 1);
     this.scene = new T.Scene();
     this.scene.add(new T.HemisphereLight("#ffffff", "#8a94a0", 2.5));
-    const gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0x0a4f9e, 0.09, 0.05);
-    this.scene.add(gravity);
+    this.gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0, 0.09, 0.05);
+    this.scene.add(this.gravity);
     this.look();
   }
 
@@ -170,6 +170,7 @@ export class Picture {
       this.camera.updateProjectionMatrix();
     }
     this.scene.background = new this.three.Color(colour("--ground"));
+    this.gravity.setColor(colour("--accent"));
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }

@@ -5,7 +5,7 @@
 import { temperature } from "./arm.js";
 import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
-import { jointText } from "./telling.js";
+import { headText, jointText } from "./telling.js";
 import { degrees, finite, t, write } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
@@ -18,7 +18,9 @@ const KINDS = [
   ["torque", "Nm", (joint) => joint.effort],
   ["temperature", "°C", temperature],
 ];
-const of = (list, n) => list[n % list.length]; // an arm may have more joints
+// An arm may have more joints than there are colours: each further round has other dashes, so that no two look alike.
+const colourOf = (n) => COLOURS[n % COLOURS.length];
+const dashOf = (n) => (n + Math.floor(n / COLOURS.length)) % DASHES.length;
 
 export class Plots {
   constructor(place) {
@@ -51,7 +53,7 @@ export class Plots {
     }
     const missing = Object.keys(arms).filter((name) => !this.arms.has(name));
     this.note.hidden = this.arms.size > 0 && !missing.length;
-    const waiting = missing.map((name) => `${t(`head.${name}`)}: ${t("blank.waiting")}`).join(" ");
+    const waiting = missing.map((name) => `${headText(name)}: ${t("blank.waiting")}`).join(" ");
     write(this.note, this.note.hidden ? "" : waiting || t("blank.no_arm"));
     this.painter.request();
   }
@@ -92,17 +94,17 @@ export class Plots {
         { ...axis, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
         { ...axis, size: 50 },
       ],
-      series: [{}, ...names.map((_, n) => ({ stroke: () => colour(of(COLOURS, n)), dash: of(DASHES, n), width: 2 }))],
+      series: [{}, ...names.map((_, n) => ({ stroke: () => colour(colourOf(n)), dash: DASHES[dashOf(n)], width: 2 }))],
       hooks: { draw: [(plot) => kind === "torque" && drawLimits(plot, this.limits[arm] ?? [])] },
     };
     const data = [[], ...names.map(() => [])];
     const figure = { arm, kind, unit, names, values, element, caption, blank, plot: new uPlot(options, data, canvas), data };
-    write(caption, title(figure));
+    showTitle(figure);
     return figure;
   }
 
   translate() {
-    for (const { figures } of this.arms.values()) for (const figure of figures) write(figure.caption, title(figure));
+    for (const { figures } of this.arms.values()) for (const figure of figures) showTitle(figure);
   }
 
   resize() {
@@ -113,10 +115,16 @@ export class Plots {
   }
 }
 
-function title({ arm, kind, unit, names }) {
+// What the figure shows, and each curve's name behind its mark, both in its colour.
+function showTitle({ arm, kind, unit, names, caption }) {
   const words = kind === "rate" ? [`${t("rate")} (Hz)`, `${t("age")} (ms)`] : names.map((name) => jointText(arm, name));
   const head = kind === "rate" ? `${t("rate")}, ${t("age")}` : `${t(kind)} (${unit})`;
-  return `${t(`head.${arm}`)}: ${head}: ${words.map((word, n) => `${of(MARKS, n)} ${word}`).join(", ")}`;
+  const curves = words.map((word, n) => {
+    const mark = Object.assign(document.createElement("span"), { textContent: `${MARKS[dashOf(n)]} ${word}`, className: "curve" });
+    mark.style.color = `var(${colourOf(n)})`;
+    return mark;
+  });
+  caption.replaceChildren(Object.assign(document.createElement("div"), { textContent: `${headText(arm)}: ${head}` }), ...curves);
 }
 
 function push({ data }, now, values) {
@@ -136,10 +144,10 @@ function whyBlank({ data, kind }, arm) {
 function drawLimits(plot, limits) {
   const { ctx, bbox } = plot;
   limits.forEach((limit, n) => {
-    for (const value of [limit, -limit]) {
+    for (const value of limit ? [limit, -limit] : []) {
       const y = plot.valToPos(value, "y", true);
       if (!(y >= bbox.top && y <= bbox.top + bbox.height)) continue;
-      ctx.strokeStyle = colour(of(COLOURS, n));
+      ctx.strokeStyle = colour(colourOf(n));
       ctx.lineWidth = 1;
       ctx.beginPath();
       ctx.moveTo(bbox.left, y);

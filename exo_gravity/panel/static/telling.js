@@ -24,9 +24,13 @@ export function poseAsked(bridge) {
   return angles.length ? angles.map(Number) : null;
 }
 
+const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
+
+export const headText = (arm) => (has(`head.${arm}`) ? t(`head.${arm}`) : arm);
+
 export function jointText(arm, name) {
   const leaf = name.replace(`${arm}_`, "");
-  return has(`joint.${leaf}`) ? t(`joint.${leaf}`) : name;
+  return has(`joint.${leaf}`) ? t(`joint.${leaf}`) : capital(leaf.replaceAll("_", " "));
 }
 
 // Returns {why, todo, action, engineer}: texts, the name of the button, and whether an engineer must see the arm first.
