@@ -37,7 +37,7 @@ def test_a_tour_of_an_elastic_arm_ends_with_the_true_torques_of_its_links(
 
 def test_a_ringing_rotor_is_a_vibration_and_a_joint_that_leaves_its_friction_is_none() -> None:
     ringing = 0.15 * np.sin(2.0 * np.pi * 170.0 / 250.0 * np.arange(50))  # rad/s, an AK60-6 on 1,000 Nm/rad
-    leaving = [0.0, 0.0, 0.4, 0.5, 0.3, 0.1, *[0.0] * 20, -0.3, -0.4, -0.1, *[0.0] * 20]
+    leaving = [0.0, 0.0, 0.15, 0.3, 0.3, 0.15, *[0.0] * 20, -0.15, -0.25, -0.1, *[0.0] * 20]
     for speeds, vibrates in ((ringing, True), (leaving, False)):
         vibration = Vibration(1)
         seen = max(vibration.step(np.array([speed])) for speed in speeds)
