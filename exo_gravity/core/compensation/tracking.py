@@ -56,10 +56,10 @@ class TrackerTuning:
     #: times `soft_frequency`, where the low-pass filter begins; it costs 23 degrees of phase where the gain is 1
     filtered_from: float = 10.0
     filter_order: int = 2  #: of first-order filters in a row
-    #: rad/s, of the second difference of a motor's speed on average: ten times that of the velocity's 12-bit steps
-    vibration: float = 0.15
-    vibration_cycles: float = 12.0  #: over which it is averaged
-    largest_change: float = 0.3  #: rad/s that each counts at most: a joint that leaves its friction changes twice
+    #: rad/s, of the second difference of a motor's speed, as a root mean square: several times that of the velocity's
+    #: 12-bit steps. Once a rotor is free of its friction, its vibration grows tenfold in a few cycles.
+    vibration: float = 0.12
+    vibration_cycles: float = 10.0  #: over which it is averaged
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -197,11 +197,11 @@ class Vibration:
         self._mean = np.zeros(count)
 
     def step(self, velocity: np.ndarray) -> float:
-        """Return the mean size of the second difference in rad/s, of the worst joint; velocity: (n,) rad/s."""
-        change = np.minimum(np.abs(velocity - 2.0 * self._last[0] + self._last[1]), TRACKER.largest_change)
+        """Return the root mean square of the second difference in rad/s, of the worst joint; velocity: (n,) rad/s."""
+        change = velocity - 2.0 * self._last[0] + self._last[1]
         self._last = np.array((velocity, self._last[0]))
-        self._mean += (change - self._mean) / TRACKER.vibration_cycles
-        return float(self._mean.max())
+        self._mean += (change**2 - self._mean) / TRACKER.vibration_cycles
+        return math.sqrt(float(self._mean.max()))
 
 
 class Tracker:
