@@ -255,7 +255,7 @@ class SimulatedArm:
     def __deepcopy__(self, memo: dict[int, Any]) -> "SimulatedArm":
         """Return an arm in the same state, which moves on its own."""
         other = object.__new__(type(self))
-        memo[id(self)] = other
+        memo[id(self)], memo[id(self.config)] = other, self.config  # which never changes
         vars(other).update(copy.deepcopy(vars(self), memo))
         joints = slice(len(self._theta))
         other._theta, other._velocity = other.data.qpos[joints], other.data.qvel[joints]
