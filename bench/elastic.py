@@ -23,7 +23,7 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -104,7 +104,7 @@ class Device:
         wrong = mass * (1.0 + MOMENT_ERROR * rng.standard_normal(len(mass)))
         known = joint.stiffness * (1.0 + STIFFNESS_ERROR * rng.standard_normal(len(mass)))
         assumed = ArmModel(nominal.length, cog, wrong)
-        worn = {"mode": "zero_g", "support": 1.0, "max_effort": (18.0,) * len(mass), **WORN}
+        worn: dict[str, Any] = {"mode": "zero_g", "support": 1.0, "max_effort": (18.0,) * len(mass), **WORN}
         self.rigid = Settings("right", assumed, **worn)
         self.deflection = Settings("right", assumed, joint_stiffness=known.tolist(), **worn)
 

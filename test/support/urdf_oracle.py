@@ -70,9 +70,14 @@ class WornMujocoArm:
         rest: Sequence[float] = (),
     ) -> None:
         none = (0.0,) * len(joint_names)
-        springs = {"wearer_stiffness": tuple(stiffness) or none, "wearer_rest": tuple(rest) or none}
         config = UrdfConfig(
-            text=text, joint_names=joint_names, hand="hand", wearer_mass=mass, wearer_cog=cog, **springs
+            text=text,
+            joint_names=joint_names,
+            hand="hand",
+            wearer_mass=mass,
+            wearer_cog=cog,
+            wearer_stiffness=tuple(stiffness) or none,
+            wearer_rest=tuple(rest) or none,
         )
         self._model, _ = config.models(payload)
         self._model.opt.gravity = UPRIGHT

@@ -7,12 +7,6 @@ that of the way back gravity minus friction.
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
 is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have the same natural
 frequency, however they are coupled.
-
-Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
-which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
-sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
-Stribeck friction best, and once a motor vibrates it goes on with lower gains, of which a low-pass filter leaves nothing
-at the rotor's frequencies.
 """
 
 import math
@@ -50,16 +44,6 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
-    #: rad/s, of an arm whose motors vibrate; from 10 on a rotor of an AK60-6 behind 150 Nm/rad exceeds 1 rad/s
-    #: (measured), and 12 are unstable
-    soft_frequency: float = 8.0
-    #: times `soft_frequency`, where the low-pass filter begins; it costs 23 degrees of phase where the gain is 1
-    filtered_from: float = 10.0
-    filter_order: int = 2  #: of first-order filters in a row
-    #: rad/s, of the second difference of a motor's speed, as a root mean square: several times that of the velocity's
-    #: 12-bit steps. Once a rotor is free of its friction, its vibration grows tenfold in a few cycles.
-    vibration: float = 0.12
-    vibration_cycles: float = 10.0  #: over which it is averaged
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -174,36 +158,6 @@ def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
     return np.asarray(ways / (2.0 * MOTION.window * station.amplitude))
 
 
-class LowPass:
-    """First-order filters in a row; passed: share of a change that each passes on in a cycle. count: of values."""
-
-    def __init__(self, passed: float, count: int) -> None:
-        self._passed = passed
-        self._state = np.zeros((TRACKER.filter_order, count))
-
-    def step(self, value: np.ndarray) -> np.ndarray:
-        """Return the filtered value (n,)."""
-        for state in self._state:
-            state += self._passed * (value - state)
-            value = state
-        return value.copy()
-
-
-class Vibration:
-    """How much speeds change back and forth from one cycle to the next. count: of speeds."""
-
-    def __init__(self, count: int) -> None:
-        self._last = np.zeros((2, count))
-        self._mean = np.zeros(count)
-
-    def step(self, velocity: np.ndarray) -> float:
-        """Return the root mean square of the second difference in rad/s, of the worst joint; velocity: (n,) rad/s."""
-        change = velocity - 2.0 * self._last[0] + self._last[1]
-        self._last = np.array((velocity, self._last[0]))
-        self._mean += (change**2 - self._mean) / TRACKER.vibration_cycles
-        return math.sqrt(float(self._mean.max()))
-
-
 class Tracker:
     """Moves all joints along lines, one after the other, and takes the samples of sweeps.
 
@@ -211,8 +165,6 @@ class Tracker:
     before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
     behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    speed: (n,) rad/s of the joints, without vibration.
-    vibrates: whether a motor has vibrated, as it does behind an elastic joint: the gains are lower from then on.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
@@ -221,12 +173,7 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
-        self.speed = np.zeros(count)
-        self.vibrates = False
         self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
-        passed = 1.0 - math.exp(-TRACKER.filtered_from * TRACKER.soft_frequency / rate)
-        self._error, self._speed_error, self._speed = (LowPass(passed, count) for _ in range(3))
-        self._vibration = Vibration(count)
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
         self._slide = np.zeros(count)  # Nm that compensate friction
@@ -271,15 +218,9 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
-        self._watch_vibration(np.asarray(velocity))
         self._compensate_friction(dt, coming, speed_error)
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
-
-    def _watch_vibration(self, velocity: np.ndarray) -> None:
-        self.speed = self._speed.step(velocity)
-        if not self.vibrates and self._vibration.step(velocity) > TRACKER.vibration:
-            self.vibrates, self._frequency = True, min(self._frequency, TRACKER.soft_frequency)
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -291,11 +232,8 @@ class Tracker:
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
         frequency = self._frequency
-        smooth_error, smooth_speed = self._error.step(self.error), self._speed_error.step(speed_error)
         stiff = matrix @ self.error * frequency**2
         push = stiff + matrix @ speed_error * 2.0 * frequency
-        if self.vibrates:
-            push = matrix @ smooth_error * frequency**2 + matrix @ smooth_speed * 2.0 * frequency
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)

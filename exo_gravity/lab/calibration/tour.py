@@ -108,18 +108,18 @@ class Tour:
             self._uncertain = self._guess.torques(np.array([position]))[1][0]
         down = self._guess.model.down(tilt)
         effort = self._tracker.step(dt, position, velocity, expected, down, self._matrix)
-        self.trouble = self.trouble or self._wrong_motion(dt, tilt) or self._wrong_torque(dt)
+        self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
 
-    def _wrong_motion(self, dt: float, tilt: Tilt) -> str:
-        """Return what is wrong after `dt` s with the motion, or ''."""
+    def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
+        """Return what is wrong after `dt` s with the motion, or ''; velocity: (n,) rad/s."""
         if dt > MAX_GAP:
             return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
         if self._undecided > LONGEST_CHOICE:
             return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, self._tracker.speed, strict=True):
+        for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, velocity, strict=True):
             if not abs(behind) <= MAX_ERROR:
                 reason = "a hand is on the arm, or the joint is blocked"
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
@@ -321,7 +321,7 @@ def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()
     arm = arm_in_file(values, ": a calibration does not wait for a topic")
     rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
     arm = arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
-    return UrdfMoments(arm.with_wearer(*worn) if worn else arm, rotors, values["use_imu"])
+    return UrdfMoments(arm.with_wearer(worn[0], worn[1]) if worn else arm, rotors, values["use_imu"])
 
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:

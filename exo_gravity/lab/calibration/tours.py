@@ -145,7 +145,7 @@ def at_links(arm: AnyArm, observations: Sequence[Observation]) -> Sequence[Obser
     stiffness = arm.compensator["joint_stiffness"]
     if not any(stiffness):
         return observations
-    return [one._replace(theta=link_angles(one.theta, one.effort, stiffness)) for one in observations]
+    return [one._replace(theta=link_angles(tuple(one.theta), tuple(one.effort), stiffness)) for one in observations]
 
 
 def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:

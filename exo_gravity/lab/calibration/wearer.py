@@ -79,7 +79,8 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
         raise DataError("; ".join(restless))
     fit = fit_wearer(worn.columns(theta, direction), theta, torque, spread, worn.known)
     found = worn.found(fit, theta, direction)
-    poses = np.random.default_rng(0).uniform(*worn.comfortable, (WEARER.samples, len(arm.joint_names)))
+    low, high = worn.comfortable
+    poses = np.random.default_rng(0).uniform(low, high, (WEARER.samples, len(arm.joint_names)))
     unsure = fit.torque_error(worn.columns(poses, direction[0]), poses)
     refusals = found.refusals + tuple(
         f"{name}: a spring of {stiffness:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
