@@ -44,6 +44,7 @@ ROOMS = {
         "trunk_estimator",
         "imu_sources",
         "urdf_checks",
+        "urdf_links",
         "urdf_arm",
     ),
 }

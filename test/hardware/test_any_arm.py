@@ -141,9 +141,9 @@ class CarriedChain(VirtualArm):
     def raise_it(self) -> None:
         """Let the wearer raise the arm, and let go."""
         goal = [angle - math.copysign(LIFT, angle) for angle in self.home]  # away from the stops
-        steps = [{"move": goal, "over": 2.0}] * 2  # the second until the arm is calm
+        steps = [{"move": goal, "over": 4.0}, {"move": goal, "over": 2.0}]  # the second until the arm is calm
         self.device.start(VirtualWearer(TrialScript.parse({"name": "raise", "steps": steps})))
-        self.run(4.0 + HOLD)
+        self.run(6.0 + HOLD)
         self.check_controller()
         assert self.safety.state is State.ACTIVE, self.safety.fault
 

@@ -19,7 +19,14 @@ from .carried_arm import DRIVEN, ENERGY, POSE, CarriedArm
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
 REACH = TrialScript.parse(
-    {"name": "reach", "steps": [{"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5}, {"move": POSE, "over": 1.0}]}
+    {
+        "name": "reach, come back, and wait there until the arm is at rest",
+        "steps": [
+            {"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5},
+            {"move": POSE, "over": 1.5},
+            {"move": POSE, "over": 2.0},
+        ],
+    }
 )
 
 
@@ -32,7 +39,7 @@ def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_l
     arm.carry()
     arm.raise_to(POSE)
     arm.device.start(VirtualWearer(REACH))
-    arm.run(3.0)
+    arm.run(5.2)
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     left, truth = np.array(arm.device.arm.positions), TruthRecords()
     arm.device.truth = truth
@@ -41,4 +48,5 @@ def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_l
     caused = driven(truth.records)
     assert caused.speed < DRIVEN
     assert caused.energy < ENERGY
-    assert np.abs(np.array(arm.device.arm.positions) - left).max() < 0.03  # rad
+    # What the hand held bends the joint, and the link falls through its play.
+    assert np.abs(np.array(arm.device.arm.positions) - left).max() < 0.03 + play

@@ -15,18 +15,18 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
 
 ROWS = (
-    Row("paper", EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"),
-    Row("paper", EQUIPMENT[2], True, 100.0, "arrival, 16 ms timer of an FTDI adapter"),
-    Row("seven joints", EQUIPMENT[2], False, 100.0, ""),
+    (Row("paper", EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"), 0.5),
+    (Row("paper", EQUIPMENT[2], True, 100.0, "arrival, 16 ms timer of an FTDI adapter"), 0.5),
+    (Row("seven joints", EQUIPMENT[2], False, 100.0, ""), 1.2),  # Nm, of an arm that is twice as heavy
 )
 
 
-@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
-def test_ordinary_equipment_carries_an_arm_without_an_alarm(row):
+@pytest.mark.parametrize(("row", "most"), ROWS, ids=lambda value: getattr(value, "name", ""))
+def test_ordinary_equipment_carries_an_arm_without_an_alarm(row, most):
     result = row.play(1.0, carried=2.0)
     assert is_quiet(result), result
     assert result.starts and not result.refused_samples
-    assert 0.0 < result.largest_error < 0.5
+    assert 0.0 < result.largest_error < most
 
 
 def entered(*electronics: float) -> OrdinaryMotor:
