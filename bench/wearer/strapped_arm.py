@@ -86,6 +86,7 @@ class StrappedArm(SimulatedArm):
         super()._load(payload)
         robot, worn = (arms._mjcf(config) for config in (self.config, self._worn))
         inside = worn.partition("<worldbody>")[2].partition("</worldbody>")[0]
+        inside = inside.replace('joint name="', 'joint name="worn ')
         slides = "".join(
             f'<joint type="slide" axis="{axis}" stiffness="{SHOULDER}" damping="{SHOULDER_DAMPING}"/>'
             for axis in ("1 0 0", "0 1 0", "0 0 1")

@@ -177,4 +177,4 @@ def test_the_budget_of_a_forearm_in_several_links_is_what_mujoco_needs_in_its_wo
     text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
     oracle = WornMujocoArm(text, arm.joint_names, load.mass, load.cog)
     for number, joint in enumerate(found.joints):
-        assert joint.torque == pytest.approx(abs(oracle.torque(joint.worst[:-2])[number]), rel=1e-4)
+        assert joint.torque == pytest.approx(abs(oracle.torque(joint.worst[:-2])[number]), rel=1e-4, abs=1e-3)
