@@ -29,7 +29,6 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import mujoco
 import numpy as np
-from scipy.optimize import root
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -54,6 +53,8 @@ WORN = {"wearer_mass": (0.0, 0.0, 2.0, 1.5), "wearer_cog": (0.0, 0.0, 0.16, 0.18
 BOW = math.radians(15.0)
 FUNCTIONS, RIDGE = 2, 1e-2  # of the ANFIS: 3 functions have 108 consequents, too many for as many holds
 ANGLES = (-math.pi,) * 4, (math.pi,) * 4
+REST_STEPS, RELAXATION, AT_REST = 600, 0.1, 1e-6  # rad: the links find their rest step by step
+LITTLE = 0.02  # Nm, below which a link hangs within its play
 LAWS = ("rigid", "deflection", "ANFIS", "rigid + GP", "deflection + GP")
 
 
@@ -118,20 +119,19 @@ class Device:
         return np.array([self._resting(motors)[1:] for motors in poses])
 
     def _resting(self, motors: np.ndarray) -> np.ndarray:
-        model, data, count = self.arm.model, self.arm.data, len(motors)
-
-        def unbalanced(links: np.ndarray) -> np.ndarray:
-            data.qpos[:count], data.qpos[count:], data.qvel[:] = links, motors, 0.0
+        model, data, config, count = self.arm.model, self.arm.data, self.arm.config, len(motors)
+        data.qpos[count:], data.qvel[:] = motors, 0.0
+        links = motors
+        for _ in range(REST_STEPS):
+            data.qpos[:count] = links
             mujoco.mj_forward(model, data)
-            return np.asarray(data.qfrc_bias[:count] - data.qfrc_passive[:count])
-
-        carried = unbalanced(motors) + data.qfrc_passive[:count]  # about: it says on which side of the play it is
-        config = self.arm.config
-        begin = motors - carried / config.joint_stiffness - np.sign(carried) * np.divide(config.backlash, 2.0)
-        found = root(unbalanced, begin, tol=1e-9)
-        if np.abs(unbalanced(found.x)).max() > 1e-4:
-            raise RuntimeError(f"no rest behind motors at {motors.tolist()} rad: {found.message}")
-        return data.qfrc_bias[:count].copy()
+            torque, before = data.qfrc_bias[:count].copy(), links
+            side = np.clip(torque / LITTLE, -1.0, 1.0)  # of the play
+            rest = motors - torque / config.joint_stiffness - side * np.divide(config.backlash, 2.0)
+            links = before + RELAXATION * (rest - before)
+            if np.abs(rest - before).max() < AT_REST:
+                return torque
+        raise RuntimeError(f"no rest behind motors at {motors.tolist()} rad")
 
 
 def by(settings: Settings) -> Callable[[np.ndarray, Tilt], np.ndarray]:
