@@ -293,6 +293,15 @@ def test_a_watch_follows_the_load_in_the_settings():
     assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
 
 
+def test_a_watch_follows_the_stiffness_of_elastic_joints():
+    elastic = replace(SETTINGS, joint_stiffness=(150.0,) * 4)
+    held = gravity_torque(WHOLE, POSE, TILT.direction)
+    behind = gravity_torque(WHOLE, np.subtract(POSE, np.divide(held, 150.0)), TILT.direction)
+    estimate = watched(elastic, held.tolist())[1]
+    assert np.abs(held - behind).max() > 0.05
+    assert estimate.torque == pytest.approx(behind - held, abs=1e-9)
+
+
 def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
     count, rotor = 3, 0.01
     text, names = random_chain(count, seed=5)
