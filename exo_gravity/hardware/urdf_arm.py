@@ -94,7 +94,7 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
 
 
 class Skeleton(NamedTuple):
-    """What `can_bridge` is told of an arm of n joints, for its own computation of gravity: in the root link's axes."""
+    """What `can_bridge` needs to compute the gravity of an arm of n joints itself, in the root link's axes."""
 
     axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
     ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length

@@ -57,7 +57,7 @@ _OFFSET = (0.0, -math.pi / 2, 0.0, 0.0)
 _JOINTS = tuple(f"joint {n + 1}" for n in range(JOINT_COUNT))
 _TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin carbon tube
 _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
-_MIN_ROTOR = 1e-5  # kg m^2 that each motor of an elastic joint has beside its rotor's; MuJoCo needs some
+_MIN_ROTOR = 1e-5  # kg m^2, added to the rotor's own: MuJoCo needs bodies with inertia
 _STOPS = (-math.pi, math.pi)  # rad
 _BESIDE = (-MAX_OFFSET, MAX_OFFSET)  # m
 _ZEROS = (0.0,) * JOINT_COUNT
@@ -127,7 +127,7 @@ class JointConfig:
 
     @property
     def elastic(self) -> list[int]:
-        """The joints, from 0 on, whose motor is a body of its own."""
+        """The elastic joints, from 0 on: the motor of each is a separate body."""
         return [n for n, stiffness in enumerate(self.joint_stiffness) if stiffness]
 
     def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:

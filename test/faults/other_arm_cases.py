@@ -103,7 +103,7 @@ def rows(name: str, arm: dict[str, Any], lets_go: bool) -> tuple[FaultCase, ...]
 # fmt: off
 OTHER_ARMS = (
     *rows("elbow, AK80-64", ELBOW, lets_go=False),
-    # The rotor makes the fall so slow that nobody notices the loss: the brake alone holds the empty arm.
+    # The rotor slows the empty arm so much that its loss is not detected: the brake alone holds it.
     FaultCase("elbow, AK80-64: a load of 2 kg is dropped", take_and_drop, variant(Rig, **ELBOW), limit=None,
         outcomes=("active",), speed_limit=LOAD_LOST, ends_rig=True),
     *rows("seven Damiao joints", SEVEN, lets_go=True),

@@ -67,7 +67,7 @@ def test_an_empty_cuff_that_is_carried_again_rises_slowly():
 
 
 class Imu:
-    """An IMU that reads what it is told to."""
+    """An IMU whose reading the test sets."""
 
     def __init__(self) -> None:
         self.reading = UPRIGHT

@@ -32,7 +32,7 @@ UNCOPIED: dict[type, Any] = {
 
 
 def copied(arm: Arm) -> Arm:
-    """Return an arm in the state of `arm`, with what is returned beside it, which goes on apart from it.
+    """Return a copy of `arm`, or of a tuple of an arm and what belongs to it, that runs on independently.
 
     Functions that are bound to a part of the arm go along; a nested function or a lambda that captured a part does not.
     """

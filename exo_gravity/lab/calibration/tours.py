@@ -2,8 +2,7 @@
 """calibrate gravity, scale, friction and check: what slow tours of the arm show, live or from a recording.
 
 docs/calibration.md describes each. Live, `scale` makes two tours, without the weight and with it. A recording (`--bag`)
-is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known. `wearer`: the
-moments of the wearer's arm and springs in their joints explain what the robot's moments do not (wearer_fit.py).
+is one with the weight, of an arm that `calibrate gravity` has calibrated: what it holds without is known.
 """
 
 import argparse
