@@ -98,7 +98,7 @@ def run_loop(kind: str, rate: float, file: str, seconds: float, watch: Watch | N
             for part, *command in _peer_commands(kind, params, namespace, rate):
                 pids[f"{namespace[1:]}/{part}"] = stack.enter_context(_process(*command)).pid
         log.wait_for("wearer: move (0", len(namespaces), START_LIMIT, launcher.dead)
-        start = log.time_of_first(": active") - begin
+        start = log.time_of_first("active") - begin
         if line := log.find("not permitted"):
             raise RuntimeError(line)
         time.sleep(SETTLING)

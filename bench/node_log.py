@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -21,9 +22,10 @@ class NodeLog:
             self._lines.append((time.monotonic(), f"{node}: {line}"))
             self._changed.notify()
 
-    def time_of_first(self, ending: str) -> float:
-        """Return the time (monotonic s) of the first line with this `ending`, infinity without one."""
-        return next((time for time, line in self._lines if line.replace("INFO ", "").endswith(ending)), float("inf"))
+    def time_of_first(self, state: str) -> float:
+        """Return the time (monotonic s) of the first line in which a node says its `state`, infinity without one."""
+        said = re.compile(rf": (INFO|WARN) {state}\b")
+        return next((time for time, line in self._lines if said.search(line)), float("inf"))
 
     def find(self, text: str) -> str:
         """Return the first line that contains `text`, or ''."""

@@ -17,9 +17,8 @@ import pytest
 from exo_gravity.hardware.clock import favour
 
 from .support.ports import own_domain
-from .support.selection import missing_packages
+from .support.selection import UNDER_COLCON, missing_packages
 
-UNDER_COLCON = "COLCON" in os.environ
 LINTERS = "test_linters.py"  # elsewhere `make lint` runs it
 left_out: Counter[str] = Counter()
 
@@ -36,9 +35,9 @@ def machine() -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Leave out the tests that need a quiet machine, unless `-m` selects others."""
+    """Leave out what needs a quiet machine, and the longer tests, unless `-m` selects others."""
     if UNDER_COLCON and not config.option.markexpr:
-        config.option.markexpr = "not real_time"
+        config.option.markexpr = "not (real_time or browser or thorough)"
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
