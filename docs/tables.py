@@ -178,8 +178,8 @@ def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
 
 
 def _same(param: Param, other: Param) -> bool:
-    """Whether two nodes' parameters are the same to their user, except for when they may change."""
-    return replace(param, fixed=other.fixed, expert=other.expert) == other
+    """Whether two nodes' parameters are the same to their user, except for when they may change, and on another arm."""
+    return replace(param, fixed=other.fixed, expert=other.expert, vector=other.vector) == other
 
 
 def fault_table() -> str:
