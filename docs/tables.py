@@ -58,12 +58,12 @@ RANGES = ("position_range", "velocity_range", "torque_range")
 MOTOR_HEAD = (
     "`motor`",
     "`wire_format`",
-    "on the wire: rad / rad/s / Nm",
-    "rated / peak Nm",
-    "rated / no-load rad/s",
-    "gear; encoder",
+    "on the wire: rad, rad/s, Nm",
+    "rated, peak Nm",
+    "rated, no-load rad/s",
+    "gear, encoder",
     "rotor kg m²",
-    "shuts off, degC",
+    "off at, degC",
 )
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
@@ -218,10 +218,10 @@ def motor_table() -> str:
                 (
                     f"`{spec.name}`",
                     ", ".join(f"`{name}`" for name in formats) + (", FD" if spec.can_fd else ""),
-                    " / ".join(on_wire),
-                    f"{spec.rated_torque:g} / {spec.peak_torque:g}",
-                    " / ".join(speeds),
-                    f"{spec.gear_ratio:g}; {encoder}{star['output_encoder']}",
+                    ", ".join(on_wire),
+                    f"{spec.rated_torque:g}, {spec.peak_torque:g}",
+                    ", ".join(speeds),
+                    f"{spec.gear_ratio:g}, {encoder}{star['output_encoder']}",
                     f"{spec.rotor_inertia:.2g}",
                     f"{spec.shuts_off_at:g}{star['shuts_off_at']}",
                 )
