@@ -20,7 +20,7 @@ from xml.etree import ElementTree
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
-from exo_gravity.core.motors.families import MOTORS, OURS
+from exo_gravity.core.motors.families import OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
@@ -153,7 +153,8 @@ def parameter_table(node: str) -> str:
             own.append(param)
     as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
     usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
-    text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(PARAMETERS[node]) + _parameter_rows(usual, with_range=True)
+    before = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(PARAMETERS[node])
+    text = before + _parameter_rows(usual, with_range=True)
     return f"{text}\nFor experts:\n\n{_parameter_rows(expert, with_range=False)}" if expert else text
 
 
@@ -173,7 +174,8 @@ def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
         first, *others = group
         names = ", ".join(f"`{param.name}`" for param in (first, *others))
         meaning = first.description.replace("along x", "along x, y, z") if others else first.description
-        rows.append((names, " ".join(filter(None, (_default(first), with_range and _range(first)))), meaning))
+        permitted = _range(first) if with_range else ""
+        rows.append((names, f"{_default(first)} {permitted}".rstrip(), meaning))
     return markdown(("parameter", "default (range)" if with_range else "default", "meaning"), rows)
 
 

@@ -251,8 +251,7 @@ COMPENSATOR = (
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
     Param("robot.first_moment", [0.0] * JOINT_COUNT, "M1 to M4 along the links, by `calibrate`, for the law exact; all "
           "0: by mass and cog", (0.0, MAX_MOMENT), "kg m", expert=True),
-    Param("robot.off_axis", [0.0] * JOINT_COUNT, "W, Z, Y3, Y4 across them, by `calibrate`: W of link 1 along z_1 and "
-          "of link 2 along y_2, Z of links 2 to 4 along z_2, Y3 and Y4 of links 3 and 4 along their y",
+    Param("robot.off_axis", [0.0] * JOINT_COUNT, "W, Z, Y3, Y4 across them, by `calibrate`, for the law exact",
           (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),

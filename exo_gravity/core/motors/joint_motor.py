@@ -224,7 +224,8 @@ MOTOR_PARAMETERS = (
           unit="rad/s", fixed=True),
     Param("torque_range", [0.0] * 4, "range of the firmware's wire format; 0: the motor's usual one",
           unit="Nm", fixed=True),
-    Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one", (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
+    Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one",
+          (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
     Param("motor_timeout", [0.0] * 4, "after which the firmware lets go without a command, 0.15 to 0.5; 0: never (not "
           "Damiao)", unit="s", fixed=True),
 )
