@@ -255,7 +255,7 @@ COMPENSATOR = (
           (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("wearer.body_mass", 0.0, "for wearer.mass and wearer.cog, if these are 0", (0.0, 300.0), "kg"),
+    Param("wearer.body_mass", 0.0, "body mass; for wearer.mass and wearer.cog, if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m", vector=True),
     Param("wearer.first_moment", [0.0] * JOINT_COUNT, "what the wearer's arm adds to M1 to M4, by `calibrate wearer`; "

@@ -229,7 +229,7 @@ class Limits:
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", False, "configure and activate once, without an operator", fixed=True),
+    Param("autostart", False, "configure and activate once at the start", fixed=True),
     Param("rate", 250.0, "control cycles, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
     Param(
