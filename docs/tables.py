@@ -195,15 +195,16 @@ def firmware_table() -> str:
     What is not known is marked: there the worst case is played.
     """
     mit, v3 = ({name: f for name, f in FIRMWARES.items() if _is_v3(f) is wanted} for wanted in (False, True))
-    return f"{_answers(mit, (*MIT_QUESTIONS, *QUESTIONS))}\n{_answers(v3, QUESTIONS)}"
+    both = _answers("V1 and V2 boards", mit, (*MIT_QUESTIONS, *QUESTIONS)), _answers("V3 boards", v3, QUESTIONS)
+    return "\n".join(both)
 
 
-def _answers(firmwares: Mapping[str, Firmware], questions: Iterable[Question]) -> str:
+def _answers(boards: str, firmwares: Mapping[str, Firmware], questions: Iterable[Question]) -> str:
     rows = []
     for question, names, answer in questions:
         marks = ("*" if firmware.assumed & set(names) else "" for firmware in firmwares.values())
         rows.append((question, *(f"{answer(f)}{mark}" for f, mark in zip(firmwares.values(), marks, strict=True))))
-    return markdown(("", *(f"`{name}`" for name in firmwares)), rows)
+    return markdown((boards, *(f"`{name}`" for name in firmwares)), rows)
 
 
 def motor_table() -> str:
