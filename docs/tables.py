@@ -63,7 +63,6 @@ MOTOR_HEAD = (
     "rated, no-load rad/s",
     "gear, encoder",
     "rotor kg m²",
-    "off at, degC",
 )
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
@@ -226,7 +225,6 @@ def motor_table() -> str:
                     ", ".join(speeds),
                     f"{spec.gear_ratio:g}, {encoder}{star['output_encoder']}",
                     f"{spec.rotor_inertia:.2g}",
-                    f"{spec.shuts_off_at:g}{star['shuts_off_at']}",
                 )
             )
     return markdown(MOTOR_HEAD, rows)
