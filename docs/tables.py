@@ -8,21 +8,19 @@ A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -
 from __future__ import annotations
 
 import argparse
-import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
-from exo_gravity.core.motors.families import MOTORS, OURS
+from exo_gravity.core.motors.families import OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.drive import FaultCode
@@ -55,20 +53,17 @@ PARAMETERS = {
 }
 BASES = ("can_bridge", "compensator")
 # Their tables name the parameters that they share with one of BASES, and leave them out.
-REPEATING = ("simulator", "calibrator", "urdf_arm")
+REPEATING = ("compensator", "simulator", "calibrator", "urdf_arm")
 RANGES = ("position_range", "velocity_range", "torque_range")
 MOTOR_HEAD = (
     "`motor`",
     "`wire_format`",
-    "on the wire: rad / rad/s / Nm",
-    "rated / peak Nm",
-    "rated / no-load rad/s",
-    "gear",
+    "on the wire: rad, rad/s, Nm",
+    "rated, peak Nm",
+    "rated, no-load rad/s",
+    "gear, encoder",
     "rotor kg m²",
-    "angle after power-up",
-    "shuts off, degC",
 )
-HEAD = ("parameter", "default", "range", "meaning")
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -76,29 +71,19 @@ def _is_v3(firmware: Firmware) -> bool:
     return firmware.wire_format == MIT_V3.name
 
 
-def _command_while_off(f: Firmware) -> str:
-    if _is_v3(f):
-        return "switches the motor on"
-    return "kept for ENTER; replies" if f.remembers_off else "ignored; replies"
-
-
 def _enter(f: Firmware) -> str:
-    if _is_v3(f):
-        return "no such frame"
     if f.exit_clears:
         return "carries out a command that came while off; EXIT clears the last one"
     return "resumes the last command" + ("" if f.remembers_off else " of motor mode")
 
 
 def _set_zero(f: Firmware) -> str:
-    if _is_v3(f):
-        return "no such frame"
     reply = f"no reply, silent for {f.zero_silence:g} s" if f.zero_silence else "replies at once"
     return reply + ("" if f.zero_while_on else "; ignored while on")
 
 
 def _timeout(f: Firmware) -> str:
-    return f"{1000.0 * f.timeout:g} ms: torque and gains are 0 at once, until the next command" if f.timeout else "none"
+    return f"{1000.0 * f.timeout:g} ms" if f.timeout else "none"
 
 
 def _reply(f: Firmware) -> str:
@@ -109,8 +94,6 @@ def _reply(f: Firmware) -> str:
 
 
 def _special(f: Firmware) -> str:
-    if _is_v3(f):
-        return "none"
     return "FF x 7 and FC, FD, FE" if f.first_special == FIRST_SPECIAL else "FF x 7 and EE to FE: FB leaves the bus"
 
 
@@ -125,53 +108,53 @@ def _also_obeyed(f: Firmware) -> str:
 
 
 # What docs/motors.md asks of a firmware, the fields that may be assumed, and the answer.
-FIRMWARE_QUESTIONS: tuple[tuple[str, tuple[str, ...], Callable[[Firmware], str]], ...] = (
-    ("a command while off", ("remembers_off",), _command_while_off),
+Question = tuple[str, tuple[str, ...], Callable[[Firmware], str]]
+MIT_QUESTIONS: tuple[Question, ...] = (
+    (
+        "a command while off",
+        ("remembers_off",),
+        lambda f: "kept for ENTER; replies" if f.remembers_off else "ignored; replies",
+    ),
     ("ENTER", ("remembers_off", "exit_clears"), _enter),
     ("SET_ZERO", ("zero_silence", "zero_while_on"), _set_zero),
-    (
-        "zero after a power cycle",
-        ("zero_kept",),
-        lambda f: "-" if _is_v3(f) else "the new one" if f.zero_kept else "the old one",
-    ),
-    ("CAN time-out", ("timeout",), _timeout),
+    ("zero after a power cycle", ("zero_kept",), lambda f: "the new one" if f.zero_kept else "the old one"),
     (
         "error byte",
         (),
         lambda f: f"mask: 2 above {WARM_ABOVE:g} degC, 6 and off at {SHUT_OFF_AT:g}" if f.error_is_mask else "a code",
     ),
+    ("position range", (), lambda f: f"{f.position_range} rad" if f.position_range else "usual"),
+    ("special frames", (), _special),
+)
+QUESTIONS: tuple[Question, ...] = (
+    ("CAN time-out", ("timeout",), _timeout),
     (
         "switching on with an encoder error",
         ("refuses_encoder_error",),
-        lambda f: "refused, as if nothing were wrong" if f.refuses_encoder_error else "obeyed",
+        lambda f: "refused in silence" if f.refuses_encoder_error else "obeyed",
     ),
     ("reply or status", ("reports",), _reply),
-    ("position range", (), lambda f: f"{f.position_range} rad" if f.position_range else "that of the wire format"),
-    ("special frames", (), _special),
     ("also obeyed", ("shortest_command",), _also_obeyed),
-    (
-        "Nm per A of an AK60-6",
-        (),
-        lambda f: f"{f.torque_per_ampere.get('AK60-6', MOTORS['AK60-6'].torque_per_ampere):.4g}" if _is_v3(f) else "-",
-    ),
     ("after a bus error", ("retransmits",), lambda f: "sends again" if f.retransmits else "the frame is lost"),
 )
 
 
 def parameter_table(node: str) -> str:
     """Return the Markdown tables of one node's parameters: the usual ones, then those for experts, without ranges."""
+    bases = [base for base in BASES if base != node]
     shared: dict[str, list[str]] = defaultdict(list)
     own = []
     for param in PARAMETERS[node]:
-        base = next((base for base in BASES if any(_same(param, other) for other in PARAMETERS[base])), None)
+        base = next((base for base in bases if any(_same(param, other) for other in PARAMETERS[base])), None)
         if base and node in REPEATING:
             shared[base].append(f"`{param.name}`")
         else:
             own.append(param)
     as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
     usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
-    text = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(own) + _parameter_rows(usual)
-    return f"{text}\nFor experts:\n\n{_parameter_rows(expert, without='range')}" if expert else text
+    before = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(PARAMETERS[node])
+    text = before + _parameter_rows(usual, with_range=True)
+    return f"{text}\nFor experts:\n\n{_parameter_rows(expert, with_range=False)}" if expert else text
 
 
 def _live_ones(params: Sequence[Param]) -> str:
@@ -183,35 +166,44 @@ def _live_ones(params: Sequence[Param]) -> str:
     return f"{what}: {', '.join(few)}.\n\n" if few else "All are live.\n\n"
 
 
-def _parameter_rows(params: Sequence[Param], without: str = "") -> str:
-    """Return a Markdown table without the column of this title."""
-    keep = [n for n, title in enumerate(HEAD) if title != without]
-    return markdown([HEAD[n] for n in keep], ([_row(param)[n] for n in keep] for param in params))
+def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
+    """Return a Markdown table, with one row for the components x, y and z of a vector."""
+    rows = []
+    for _, group in groupby(params, lambda param: re.sub("_[xyz]$", "_", param.name)):
+        first, *others = group
+        names = ", ".join(f"`{param.name}`" for param in (first, *others))
+        meaning = first.description.replace("along x", "along x, y, z") if others else first.description
+        permitted = _range(first) if with_range else ""
+        rows.append((names, f"{_default(first)} {permitted}".rstrip(), meaning))
+    return markdown(("parameter", "default (range)" if with_range else "default", "meaning"), rows)
 
 
 def _same(param: Param, other: Param) -> bool:
-    """Whether two nodes' parameters are the same to their user, except for when they may change."""
-    return replace(param, fixed=other.fixed, expert=other.expert) == other
+    """Whether two nodes' parameters are the same to their user, except for when they may change, and on another arm."""
+    return replace(param, fixed=other.fixed, expert=other.expert, vector=other.vector) == other
 
 
 def fault_table() -> str:
-    """Return the Markdown table of the fault codes, with the default of each limit that a meaning names."""
-    limited = (p for p in CAN_BRIDGE if p.bounds and np.any(p.default))
-    limits = {p.name: f"`{p.name}` {_default(p)}" for p in limited}
-    rows = []
-    for code in FaultCode:
-        named = [limits[name] for name in re.findall(r"`(\w+)`", code.meaning) if name in limits]
-        rows.append((f"`{code}`", code.meaning, "; ".join(named)))
-    return markdown(("fault", "meaning", "default limit"), rows)
+    """Return the Markdown table of the fault codes."""
+    return markdown(("fault", "meaning"), ((f"`{code}`", code.meaning) for code in FaultCode))
 
 
 def firmware_table() -> str:
-    """Return the Markdown table of what each firmware does; what is not known is marked as the worst case."""
+    """Return the Markdown tables of what each firmware does, of V1 and V2 boards, then of V3 boards.
+
+    What is not known is marked: there the worst case is played.
+    """
+    mit, v3 = ({name: f for name, f in FIRMWARES.items() if _is_v3(f) is wanted} for wanted in (False, True))
+    both = _answers("V1 and V2 boards", mit, (*MIT_QUESTIONS, *QUESTIONS)), _answers("V3 boards", v3, QUESTIONS)
+    return "\n".join(both)
+
+
+def _answers(boards: str, firmwares: Mapping[str, Firmware], questions: Iterable[Question]) -> str:
     rows = []
-    for question, names, answer in FIRMWARE_QUESTIONS:
-        marks = ("; worst case" if firmware.assumed & set(names) else "" for firmware in FIRMWARES.values())
-        rows.append((question, *(f"{answer(f)}{mark}" for f, mark in zip(FIRMWARES.values(), marks, strict=True))))
-    return markdown(("", *(f"`{name}`" for name in FIRMWARES)), rows)
+    for question, names, answer in questions:
+        marks = ("*" if firmware.assumed & set(names) else "" for firmware in firmwares.values())
+        rows.append((question, *(f"{answer(f)}{mark}" for f, mark in zip(firmwares.values(), marks, strict=True))))
+    return markdown((boards, *(f"`{name}`" for name in firmwares)), rows)
 
 
 def motor_table() -> str:
@@ -223,18 +215,16 @@ def motor_table() -> str:
             speeds = (f"{getattr(spec, name):.3g}{star[name]}" for name in ("rated_speed", "no_load_speed"))
             on_wire = (f"{getattr(spec, name):g}{star[name]}" for name in RANGES)
             formats = [name for name, board in family.formats.items() if _has_ranges(board, spec)]
-            encoder = "output" if spec.output_encoder else f"rotor: {math.degrees(spec.rotor_turn):.3g} deg"
+            encoder = "output" if spec.output_encoder else "rotor"
             rows.append(
                 (
                     f"`{spec.name}`",
                     ", ".join(f"`{name}`" for name in formats) + (", FD" if spec.can_fd else ""),
-                    " / ".join(on_wire),
-                    f"{spec.rated_torque:g} / {spec.peak_torque:g}",
-                    " / ".join(speeds),
-                    f"{spec.gear_ratio:g}",
+                    ", ".join(on_wire),
+                    f"{spec.rated_torque:g}, {spec.peak_torque:g}",
+                    ", ".join(speeds),
+                    f"{spec.gear_ratio:g}, {encoder}{star['output_encoder']}",
                     f"{spec.rotor_inertia:.2g}",
-                    encoder + star["output_encoder"],
-                    f"{spec.shuts_off_at:g}{star['shuts_off_at']}",
                 )
             )
     return markdown(MOTOR_HEAD, rows)
@@ -294,10 +284,6 @@ def stale_tables(text: str) -> list[str]:
     return [old[2] for old, new in pairs if old[0] != new[0]]
 
 
-def _row(p: Param) -> tuple[str, ...]:
-    return f"`{p.name}`", _default(p), _range(p), p.description
-
-
 def _default(param: Param) -> str:
     if param.required:
         return "required"
@@ -307,11 +293,12 @@ def _default(param: Param) -> str:
 
 
 def _range(param: Param) -> str:
+    """Return the values other than the default that are permitted, in parentheses; '' if all of the type are."""
     if param.name == "motor":
-        return "[motors.md](motors.md)"
-    if param.choices:
-        return ", ".join(param.choices)
-    return f"{param.bounds[0]:g} to {param.bounds[1]:g}" if param.bounds else ""
+        return "([motors.md](motors.md))"
+    if others := [choice for choice in param.choices if choice not in _shown(param.default).split(", ")]:
+        return f"(or {', '.join(others)})"
+    return f"({param.bounds[0]:g}..{param.bounds[1]:g})" if param.bounds else ""
 
 
 def _shown(value: Any) -> str:

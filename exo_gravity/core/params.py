@@ -201,7 +201,7 @@ JOINT_NAMES = Param(
     "the joints from the shoulder on, as in joint_states", fixed=True)
 REAL_TIME_PARAMETERS = (
     Param("thread_priority", 0,
-          "above 0: SCHED_FIFO priority of the control loop's threads, and locked memory, where permitted", (0, 99),
+          "above 0: SCHED_FIFO priority of the control loop, and locked memory, where permitted", (0, 99),
           fixed=True, expert=True),
 )
 # fmt: on

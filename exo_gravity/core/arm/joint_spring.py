@@ -29,8 +29,7 @@ class JointSpring:
 
     stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "stiffness of the device's own springs across each joint, such as its cables, by `calibrate`; "
-        "0: none. Not the term `spring`",
+        "of the device's own springs across each joint, such as cables, by `calibrate`; 0: none. Not the term `spring`",
         (0.0, MAX_STIFFNESS),
         "Nm/rad",
         expert=True,

@@ -71,7 +71,7 @@ class Tissue:
 
     joint_stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "stiffness of the wearer's relaxed joints, by `calibrate wearer`; zero_g compensates `support` of it",
+        "of the wearer's relaxed joints, by `calibrate wearer`; zero_g compensates `support` of it",
         (0.0, MAX_TISSUE),
         "Nm/rad",
         expert=True,

@@ -86,7 +86,7 @@ class Settings:
     side: str  #: 'left' or 'right'; 'left' for any arm from a URDF, whose root link's axes are not mirrored
     robot: Arm  #: the arm alone
     law: str = owned("exact", "law that computes the gravity torque", choices=LAWS)
-    mode: str = owned("one_g", "one_g compensates the robot; zero_g also compensates the wearer's arm", choices=MODES)
+    mode: str = owned("one_g", "one_g: the robot; zero_g: also the wearer's arm", choices=MODES)
     support: float = owned(0.0, "share of the wearer's arm that zero_g compensates", (0.0, 1.0))
     support_adapts: bool = owned(False, "the support rises above `support` while the wearer's arm sinks")
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
@@ -105,10 +105,10 @@ class Settings:
     tilt_timeout: float = owned(
         0.08, "age of the trunk tilt at which the efforts are withdrawn", (0.01, 0.5), "s", expert=True
     )
-    inertial: bool = owned(False, "also compensate the trunk's acceleration, as its IMU measures it")
+    inertial: bool = owned(False, "also compensate the trunk's measured acceleration")
     shoulder_from_imu: tuple[float, float, float] = owned(
         (0.0, 0.0, 0.0),
-        "the arm's base from the IMU along the trunk's axes, for `inertial`",
+        "from the IMU to the arm's base along the trunk's axes, for `inertial`",
         (-1.0, 1.0),
         "m",
         vector=True,
@@ -120,7 +120,7 @@ class Settings:
     joint_spring: JointSpring = field(default_factory=JointSpring)  #: the device's own; every law gets it
     joint_stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "stiffness of each joint between its motor, where the encoder sits, and its link; 0: rigid. Not `joint_spring`",
+        "stiffness of each joint between its motor, with the encoder, and its link; 0: rigid. Not `joint_spring`",
         (0.0, STIFFEST),
         "Nm/rad",
         expert=True,
@@ -249,14 +249,13 @@ COMPENSATOR = (
     Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (0.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("robot.first_moment", [0.0] * JOINT_COUNT, "M1 to M4 by `calibrate`, for the law exact: of link n along it, "
-          "with all mass beyond; all 0: by mass and cog", (0.0, MAX_MOMENT), "kg m", expert=True),
-    Param("robot.off_axis", [0.0] * JOINT_COUNT, "W, Z, Y3, Y4 by `calibrate`, for the law exact: W of link 1 along "
-          "z_1 and of link 2 along y_2, Z of links 2 to 4 along z_2, Y3 and Y4 of links 3 and 4 along their y",
+    Param("robot.first_moment", [0.0] * JOINT_COUNT, "M1 to M4 along the links, by `calibrate`, for the law exact; all "
+          "0: by mass and cog", (0.0, MAX_MOMENT), "kg m", expert=True),
+    Param("robot.off_axis", [0.0] * JOINT_COUNT, "W, Z, Y3, Y4 across them, by `calibrate`, for the law exact",
           (-MAX_MOMENT, MAX_MOMENT), "kg m", expert=True),
     Param("wearer.mass", [0.0, 0.0, 0.0, 0.0], "mass of the wearer's arm on each link", (0.0, MAX_MASS), "kg"),
     Param("wearer.cog", [0.0, 0.0, 0.0, 0.0], "centre of gravity of that mass from joint n", (0.0, MAX_LENGTH), "m"),
-    Param("wearer.body_mass", 0.0, "body mass; computes wearer.mass and wearer.cog if these are 0", (0.0, 300.0), "kg"),
+    Param("wearer.body_mass", 0.0, "body mass; for wearer.mass and wearer.cog, if these are 0", (0.0, 300.0), "kg"),
     Param("wearer.sex", "male", "selects the column of the segment table", choices=SEX),
     Param("wearer.segment_length", list(TYPICAL_LENGTH), "upper arm, forearm, hand", (0.0, 0.6), "m", vector=True),
     Param("wearer.first_moment", [0.0] * JOINT_COUNT, "what the wearer's arm adds to M1 to M4, by `calibrate wearer`; "
@@ -266,7 +265,7 @@ COMPENSATOR = (
     *(replace(param, name=f"wearer.{param.name}") for param in params_of(Tissue)),
     Param("payload.mass", 0.0, "load in the hand, carried in full in both modes; 0 once it was dropped",
           (0.0, MAX_PAYLOAD), "kg"),
-    Param("payload.cog", [0.0] * 3, "its centre of gravity in frame 4: from the end of link 4, along x_4, y_4, z_4",
+    Param("payload.cog", [0.0] * 3, "its centre of gravity from the end of link 4, along x_4, y_4, z_4",
           (-MAX_REACH, MAX_REACH), "m", vector=True),
     replace(param_of(Settings, "max_effort"), bounds=(0.0, MAX_EFFORT)),
     param_of(Settings, "max_effort_rate"),

@@ -211,24 +211,23 @@ MOTOR_PARAMETERS = (
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
           fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
-    Param("torque_scale_slope", [0.0] * 4, "share by which torque_scale changes per kelvin of the motor's temperature, "
-          "about -0.001 of a neodymium magnet; 0: it does not, or is not known", SCALE_SLOPE_BOUNDS, "1/K", fixed=True),
+    Param("torque_scale_slope", [0.0] * 4, "change of torque_scale per kelvin of the motor's temperature, about -0.001 "
+          "of a neodymium magnet; 0: none, or not known", SCALE_SLOPE_BOUNDS, "1/K", fixed=True),
     Param("torque_scale_temperature", [SCALE_TEMPERATURE] * 4, "motor temperature at which torque_scale is true",
           SCALE_TEMPERATURE_BOUNDS, "degC", fixed=True),
-    Param("wire_format", ["mit"] * 4, "wire format of the motor's board: mit_v3 for V3 boards of AK motors, mit for "
-          "others", choices=FORMATS, fixed=True),
-    Param("master_id", [0] * 4, "CAN ID of a Damiao motor's replies; 0: its can_id + 16", (0, MAX_MASTER_ID),
+    Param("wire_format", ["mit"] * 4, "mit_v3 for V3 boards of AK motors, mit for others", choices=FORMATS, fixed=True),
+    Param("master_id", [0] * 4, "CAN ID of a Damiao motor's replies; 0: can_id + 16", (0, MAX_MASTER_ID),
           fixed=True),
-    Param("position_range", [0.0] * 4, "position range of the firmware's wire format; 0: the usual one of the motor",
+    Param("position_range", [0.0] * 4, "range of the firmware's wire format; 0: the motor's usual one",
           (0.0, POSITION_RANGE_BOUNDS[1]), "rad", fixed=True),
-    Param("velocity_range", [0.0] * 4, "velocity range of the firmware's wire format; 0: the usual one of the motor",
+    Param("velocity_range", [0.0] * 4, "range of the firmware's wire format; 0: the motor's usual one",
           unit="rad/s", fixed=True),
-    Param("torque_range", [0.0] * 4, "torque range of the firmware's wire format; 0: the usual one of the motor",
+    Param("torque_range", [0.0] * 4, "range of the firmware's wire format; 0: the motor's usual one",
           unit="Nm", fixed=True),
-    Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one of the "
-          "motor", (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
-    Param("motor_timeout", [0.0] * 4, "time without a command after which the firmware lets go, 0.15 to 0.5; 0: never, "
-          "not for Damiao", unit="s", fixed=True),
+    Param("torque_per_ampere", [0.0] * 4, "by which a V3 board divides torque for its current; 0: the usual one",
+          (0.0, TORQUE_PER_AMPERE_BOUNDS[1]), "Nm/A", fixed=True),
+    Param("motor_timeout", [0.0] * 4, "after which the firmware lets go without a command, 0.15 to 0.5; 0: never (not "
+          "Damiao)", unit="s", fixed=True),
 )
 # fmt: on
 # Of parameters whose bounds begin at 0, which stands for the usual value: those of any other value.

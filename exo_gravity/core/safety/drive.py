@@ -94,11 +94,11 @@ class FaultCode(str, Enum):
     MOTOR_ERROR = "motor_error", "a motor reports an error"
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
     TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK
-    TORQUE_DIPPED = "torque_dipped", "a joint fell while the loop stood still: its motor's own time-out is too short"
+    TORQUE_DIPPED = "torque_dipped", "a joint fell while the loop stood still: its motor's time-out is too short"
     # The motion
     OVER_SPEED = "over_speed", "a joint turns faster than 5 rad/s, the elbow 6"
-    OUTSIDE_LIMITS = "outside_limits", "a joint is more than 0.1 rad beyond `position_min` or `position_max`"
-    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than the speed of `over_speed` allows"
+    OUTSIDE_LIMITS = "outside_limits", "a joint is over 0.1 rad beyond `position_min` or `position_max`"
+    POSITION_JUMP = "position_jump", "an angle changed by 0.05 rad more than `over_speed` allows"
     READINGS_CONTRADICT = (
         "readings_contradict",
         "a motor's angle has turned otherwise than its velocity says: wrong `velocity_range`, or a slipping encoder",

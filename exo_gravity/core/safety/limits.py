@@ -103,7 +103,7 @@ class Limits:
     )
     driven_speed: float = owned(
         1.5,
-        "speed from which a joint is braked that its own motor drives; 1 rad/s beyond, the motor drives it no more",
+        "a joint that its motor drives is braked from this speed on; from 1 rad/s more, the motor drives it no more",
         (0.5, 4.0),
         "rad/s",
         expert=True,
@@ -113,39 +113,39 @@ class Limits:
     reply_timeout: float = READING.reply_timeout
     start_pose: str = owned(
         "confirm",
-        "who vouches that the arm hangs as its angles say, before a start from unknown zeros: confirm: the operator, "
-        "by the service `~/confirm_pose`, the page or the launcher; hanging: the person who starts the nodes",
+        "who vouches, before a start from unknown zeros, that the arm hangs as its angles say: confirm: the operator; "
+        "hanging: who starts the nodes",
         choices=START_POSES,
     )
-    enable_timeout: float = owned(10.0, "time for the checks of a start to pass, else it is refused", (2.0, 60.0), "s")
+    enable_timeout: float = owned(10.0, "time in which the checks of a start must pass", (2.0, 60.0), "s")
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
     largest_moment: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "M1 to M4, the largest first moments of robot plus wearer, as `budget` prints them: efforts that no load up to "
-        "these needs are a fault; zeros: not checked",
+        "M1 to M4 of robot plus heaviest wearer, by `budget`: efforts that no load up to these needs are a fault; "
+        "zeros: not checked",
         (0.0, MAX_MOMENT),
         "kg m",
     )
     largest_addition: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "torque that efforts may add to gravity compensation when `largest_moment` is given: the sum of the bounds of "
-        "assistance and terms in use, `inertial`, a calibration, and the torque of `joint_spring`",
+        "torque beyond what `largest_moment` needs: the sum of the bounds of assistance and terms in use, of "
+        "`inertial`, and of `joint_spring`",
         (0.0, 10.0),
         "Nm",
     )
     axis_x: Sequence[float] = _direction(
-        "along x of the root link, of each joint's axis while all angles are 0, by `budget`; 0 on the paper's arm"
+        "each joint's axis along x of the root link while all angles are 0, by `budget`; zeros: the paper's arm"
     )
     axis_y: Sequence[float] = _direction("the same along y")
     axis_z: Sequence[float] = _direction("the same along z")
-    link_x: Sequence[float] = _direction("along x of the root link, of the way from each joint to the next, likewise")
+    link_x: Sequence[float] = _direction("the way from each joint to the next along x of the root link, likewise")
     link_y: Sequence[float] = _direction("the same along y")
     link_z: Sequence[float] = _direction("the same along z")
     home: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "angles of the arm while it hangs, where a start from unknown zeros begins",
+        "angles of the hanging arm, where a start from unknown zeros begins",
         (-3.15, 3.15),
         "rad",
     )
@@ -229,13 +229,13 @@ class Limits:
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)
 CAN_BRIDGE = (
     JOINT_NAMES,
-    Param("autostart", False, "configure and activate once at the start, without an operator", fixed=True),
-    Param("rate", 250.0, "control cycles per second, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
+    Param("autostart", False, "configure and activate once at the start", fixed=True),
+    Param("rate", 250.0, "control cycles, as far as the CAN bus allows", (20.0, 2000.0), "Hz", fixed=True),
     *MOTOR_PARAMETERS,
     Param(
         "can.serial",
         "",
-        "serial number of the CAN adapter, with two buses one per motor; empty: any adapter",
+        "serial number of the adapter, with two buses one per motor; empty: any",
         fixed=True,
     ),
     *LIMIT_PARAMETERS,

@@ -7,20 +7,20 @@ from exo_gravity.core.trunk import imu_checks
 # fmt: off
 IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
 IMU = (
-    Param("source", "topic", "the IMU: a driver's topic, a chip on I2C, or a sensor on a serial port", fixed=True,
+    Param("source", "topic", "a driver's topic, a chip on I2C, or a sensor on a serial port", fixed=True,
           choices=IMU_SOURCES),
-    Param("input_topic", "/imu/data_raw", "topic of the IMU driver's sensor_msgs/Imu", fixed=True),
+    Param("input_topic", "/imu/data_raw", "the driver's topic, a sensor_msgs/Imu", fixed=True),
     Param("i2c.bus", 1, "number n of the bus /dev/i2c-n", (0, 255), fixed=True),
     Param("i2c.address", 0, "address of the chip; 0: the usual one of its boards", (0, 0x77), fixed=True),
     Param("serial.port", "", "the sensor's port, best a name in /dev/serial/by-id", fixed=True),
     Param("serial.baud", 115200, "the sensor's baud rate", (4800, 921600), fixed=True),
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
-    Param("rotation_trunk_from_imu", [0.0] * 4, "mounting of the IMU, unit quaternion x, y, z, w; required",
+    Param("rotation_trunk_from_imu", [0.0] * 4, "its mounting, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True, vector=True),
-    Param("rate", 100.0, "nominal sample rate of the IMU", (imu_checks.RateLimits.least, 2000.0), "Hz", fixed=True),
-    Param("gyroscope_range", imu_checks.GYROSCOPE_RANGE, "rate at which the gyroscope saturates",
+    Param("rate", 100.0, "nominal sample rate", (imu_checks.RateLimits.least, 2000.0), "Hz", fixed=True),
+    Param("gyroscope_range", imu_checks.GYROSCOPE_RANGE, "rate at which it saturates",
           imu_checks.GYROSCOPE_RANGES, "rad/s", fixed=True),
-    Param("accelerometer_range", imu_checks.ACCELEROMETER_RANGE, "acceleration at which the accelerometer saturates",
+    Param("accelerometer_range", imu_checks.ACCELEROMETER_RANGE, "where it saturates",
           imu_checks.ACCELEROMETER_RANGES, "m/s^2", fixed=True),
     Param("timeout", 0.1, "time without IMU data that is an error", (0.02, 1.0), "s", fixed=True),
 )
