@@ -535,6 +535,17 @@ def test_a_plot_without_a_curve_says_why(visit, stage):
     wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
 
 
+def test_every_plot_is_as_wide_as_its_place(visit, stage):
+    stage.arms.silent = {"right", "left"}
+    page = visit(width=1280)  # two plots in a row
+    page.wait_for_selector("#plots-blank:visible")
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # all has its size
+    stage.arms.silent = set()
+    wait_until(page, lambda: page.locator("#plots figure").count() == 8)
+    widths = "figures => figures.map(figure => [figure.clientWidth, figure.querySelector('.u-wrap').clientWidth])"
+    wait_until(page, lambda: all(a == b for a, b in page.eval_on_selector_all("#plots figure", widths)))
+
+
 def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, stage):
     page, weigh, carry = visit(), of_arm(".weigh"), of_arm(".carry")
     assert page.is_disabled(weigh) and not page.is_visible(carry)
