@@ -315,7 +315,8 @@ def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_m
 @pytest.mark.parametrize("width", [390, 768])
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_while_recording_nothing_is_cut_off_and_source_and_connection_stay_in_sight(visit, stage, width, language):
-    stage.arms.states["right"] = "active"
+    stage.arms.settings["right"].update(mode="zero_g", support=1.0)
+    stage.arms.states["right"] = "ramping in"  # the longest name of a state
     stage.arms.fail("left", "implausible_zero")
     recording = {"on": True, "foreign": False, "folder": f"/home/clinic/recordings/{'P' * 60}", "seconds": 3600}
     stage.files.content["recording"] = recording
@@ -323,7 +324,7 @@ def test_while_recording_nothing_is_cut_off_and_source_and_connection_stay_in_si
     page.select_option("#language", language)
     page.wait_for_selector("#light:visible")
     page.evaluate("scrollTo(0, document.body.scrollHeight)")
-    for part in ("#source", "#connection", "#light"):
+    for part in ("#source", "#connection", "#light", "#chips .badge >> nth=0"):
         box = page.locator(part).bounding_box()
         assert box is not None and 0 <= box["y"] < 120 and box["x"] + box["width"] <= width
     assert page.evaluate("document.documentElement.scrollWidth") <= width
