@@ -315,7 +315,8 @@ def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_m
 @pytest.mark.parametrize("width", [390, 768])
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_while_recording_nothing_is_cut_off_and_source_and_connection_stay_in_sight(visit, stage, width, language):
-    stage.arms.states["right"] = "active"
+    stage.arms.settings["right"].update(mode="zero_g", support=1.0)
+    stage.arms.states["right"] = "ramping in"  # the longest name of a state
     stage.arms.fail("left", "implausible_zero")
     recording = {"on": True, "foreign": False, "folder": f"/home/clinic/recordings/{'P' * 60}", "seconds": 3600}
     stage.files.content["recording"] = recording
@@ -323,7 +324,7 @@ def test_while_recording_nothing_is_cut_off_and_source_and_connection_stay_in_si
     page.select_option("#language", language)
     page.wait_for_selector("#light:visible")
     page.evaluate("scrollTo(0, document.body.scrollHeight)")
-    for part in ("#source", "#connection", "#light"):
+    for part in ("#source", "#connection", "#light", "#chips .badge >> nth=0"):
         box = page.locator(part).bounding_box()
         assert box is not None and 0 <= box["y"] < 120 and box["x"] + box["width"] <= width
     assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -533,6 +534,17 @@ def test_a_plot_without_a_curve_says_why(visit, stage):
     page.wait_for_selector(".blank:has-text('report no temperature')")
     stage.arms.reports.clear()
     wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
+
+
+def test_every_plot_is_as_wide_as_its_place(visit, stage):
+    stage.arms.silent = {"right", "left"}
+    page = visit(width=1280)  # two plots in a row
+    page.wait_for_selector("#plots-blank:visible")
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")  # all has its size
+    stage.arms.silent = set()
+    wait_until(page, lambda: page.locator("#plots figure").count() == 8)
+    widths = "figures => figures.map(figure => [figure.clientWidth, figure.querySelector('.u-wrap').clientWidth])"
+    wait_until(page, lambda: all(a == b for a, b in page.eval_on_selector_all("#plots figure", widths)))
 
 
 def test_a_load_is_weighed_after_a_question_and_carried_after_another(visit, stage):

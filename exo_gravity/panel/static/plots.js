@@ -10,6 +10,7 @@ import { degrees, finite, t, write } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
 const HEIGHT = 160; // px
+const AGES = [30, 20, 10, 0]; // s, which the time axis names
 const COLOURS = ["--curve-1", "--curve-2", "--curve-3", "--curve-4"]; // of panel.css
 const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]]; // so that colour is not all
 const MARKS = ["——", "– –", "····", "–·–"];
@@ -28,7 +29,6 @@ export class Plots {
     this.note = document.getElementById("plots-blank");
     this.arms = new Map(); // name -> {figures}
     this.limits = {};
-    this.width = 0;
     this.painter = new Painter(() => this.draw());
     this.visible = new IntersectionObserver((entries) => {
       for (const entry of entries) entry.target.dataset.visible = entry.isIntersecting ? "yes" : "";
@@ -85,13 +85,13 @@ export class Plots {
     this.visible.observe(element);
     const axis = { stroke: () => colour("--ink"), grid: { stroke: () => colour("--grid") }, ticks: { stroke: () => colour("--grid") } };
     const options = {
-      width: Math.max(200, element.clientWidth),
+      width: widthOf(element),
       height: HEIGHT,
       legend: { show: false },
       cursor: { show: false },
       scales: { x: { time: false } },
       axes: [
-        { ...axis, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
+        { ...axis, size: 30, splits: agesOf, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
         { ...axis, size: 50 },
       ],
       series: [{}, ...names.map((_, n) => ({ stroke: () => colour(colourOf(n)), dash: DASHES[dashOf(n)], width: 2 }))],
@@ -108,12 +108,15 @@ export class Plots {
   }
 
   resize() {
-    if (this.place.clientWidth === this.width) return; // only the height has changed, by the plots themselves
-    this.width = this.place.clientWidth;
     for (const { figures } of this.arms.values())
-      for (const { plot, element } of figures) plot.setSize({ width: Math.max(200, element.clientWidth), height: HEIGHT });
+      for (const { plot, element } of figures) {
+        const width = widthOf(element);
+        if (plot.width !== width) plot.setSize({ width, height: HEIGHT }); // the first one was made while it had the row alone
+      }
   }
 }
+
+const widthOf = (element) => Math.max(200, element.clientWidth);
 
 // What the figure shows, and each curve's name behind its mark, both in its colour.
 function showTitle({ arm, kind, unit, names, caption }) {
@@ -131,6 +134,11 @@ function push({ data }, now, values) {
   data[0].push(now);
   values.forEach((value, n) => data[n + 1].push(value ?? null));
   if (data[0].length > LENGTH) for (const column of data) column.shift();
+}
+
+// Where the time axis has its marks: seconds before the newest state, as far back as there are states.
+function agesOf(plot, axis, first, newest) {
+  return AGES.map((age) => newest - age).filter((mark) => mark >= first);
 }
 
 // Why a figure has no curve; '' if it has one.
