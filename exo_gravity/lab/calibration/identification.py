@@ -12,7 +12,7 @@ Of an arm from a URDF the places of the joints are unknowns, too, as small turns
 error of its encoder's zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about
 another axis. The zero of the last joint does not, nor that of one whose next axis is parallel: they look like a moment
 across the link. A turn of the first joint is one of the whole arm: with an IMU it is part of its mounting. What does
-not show stays as it is. The closed forms of the paper's arm have fixed axes: `askew` says what that may cost.
+not show stays within its prior. The closed forms of the paper's arm have fixed axes: `askew` says what that may cost.
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known

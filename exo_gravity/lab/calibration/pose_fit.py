@@ -8,7 +8,7 @@ the measured to the true one (an IMU is mounted, and a stand placed, to no bette
 URDF small turns of its joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
 linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do not
 show: those whose standard error exceeds `NATURAL`. Angles and turns are known to some degrees before: what the poses do
-not show of them stays 0, and is part of the errors.
+not show of them stays within that, and is part of the errors.
 
 Further unknowns, the extras, are 0 unless the poses ask for them: a spring across each joint in Nm/rad (where it is
 slack is part of the offset), and the slope of each scale over the motor's temperature. `asked_for` decides by an
