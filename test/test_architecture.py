@@ -45,6 +45,7 @@ ROOMS = {
         "imu_sources",
         "urdf_checks",
         "urdf_links",
+        "urdf_held",
         "urdf_arm",
     ),
 }

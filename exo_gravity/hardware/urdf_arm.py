@@ -5,9 +5,6 @@ A URDF gives each link's mass, centre of gravity and inertia, and each joint's p
 and accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`).
 Gravity comes as a vector in the root link's axes, so that the base may tilt. The root link has the trunk's axes
 (REP-103).
-
-What the arm holds, a load or a wearer, are points of mass on its links. A wearer's segment lies on the line from its
-link's joint to the next joint, or from the last joint to the hand.
 """
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ import math
 import os
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +29,6 @@ from exo_gravity.core.arm.arm import (
     MAX_MASS,
     MAX_PAYLOAD,
     MAX_REACH,
-    NO_PAYLOAD,
     STANDARD_GRAVITY,
 )
 from exo_gravity.core.arm.gravity import Torque
@@ -40,10 +37,12 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError, with_extra
 from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
+from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
 
 PACKAGE = "package://"
-MOMENT_NAMES = tuple(f"urdf.moment_{axis}" for axis in "xyz")  # the compensator's parameters
+# The compensator's parameters.
+MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for what in ("moment", "turn"))
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
@@ -80,7 +79,8 @@ def arm_from(values: Mapping[str, Any], text: str) -> UrdfArm:
     arm = UrdfArm(text, names, values["urdf.hand"])
     if values.get("command_interface") != "multi_array":
         arm.follow(names, [0.0] * len(names))
-    return arm.corrected(np.transpose([values[name] for name in MOMENT_NAMES]))
+    moments, turn = (np.transpose([values[name] for name in names]) for names in (MOMENT_NAMES, TURN_NAMES))
+    return arm.corrected(moments).turned(turn)
 
 
 def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
@@ -129,12 +129,11 @@ class UrdfArm:
             raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
         self._joints = [self._model.getJointId(name) for name in names]
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
-        self.payload = NO_PAYLOAD
+        self._held = Held()
         self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
-        self._worn: tuple[tuple[float, ...], ...] = ()  # mass and centre of gravity of the wearer, by link
-        self._worn_moments = np.zeros((len(names), 3))  # kg m, of the wearer, in place of `_worn`
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
+        self._turn = np.zeros((len(names), 3))  # rad, likewise
         self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
         self._identity = text, tuple(names)
         self._bare = self._by_mass = self._model  # without load and wearer
@@ -146,6 +145,7 @@ class UrdfArm:
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
         self._along = self._ways()
+        self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
         self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
     def __eq__(self, other: object) -> bool:
@@ -156,8 +156,13 @@ class UrdfArm:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        held = self.payload, self._worn, self._worn_moments.tobytes(), self._own_mass
-        return (*self._identity, self._hand, self._rotors, self.scale, *held, self._change.tobytes())
+        own = self._own_mass, self._change.tobytes(), self._turn.tobytes()
+        return (*self._identity, self._hand, self._rotors, self.scale, self._held, *own)
+
+    @property
+    def payload(self) -> tuple[float, float, float, float]:
+        """The load in the hand: kg, and its centre of gravity in m in the frame of the hand."""
+        return self._held.payload
 
     @cached_property
     def scale(self) -> tuple[float, ...]:
@@ -172,7 +177,7 @@ class UrdfArm:
     @property
     def given_mass(self) -> float:
         """Kg of load and wearer: the URDF states the rest."""
-        return self.payload[0] + sum(mass for mass, _ in self._worn)
+        return self._held.mass
 
     @property
     def has_hand(self) -> bool:
@@ -247,9 +252,25 @@ class UrdfArm:
         if np.array_equal(change, self._change):
             return self
         arm = copy.copy(self)
-        arm._bare = self._shifted(self._bare, change - self._change, "urdf.moment")
+        arm._bare = self._bodies.shifted(self._bare, change - self._change, "urdf.moment")
         arm._change = np.array(change)
-        return arm._held()
+        return arm._holding_all()
+
+    def turned(self, turn: np.ndarray) -> UrdfArm:
+        """Return this arm with joints whose axes lie otherwise, in place of any other turn.
+
+        turn: (n, 3) rad, rotation vector by which the place of each joint differs from the URDF's, in the joint's
+        frame. `base` remains that of the URDF: axes that are nearly parallel show next to nothing more.
+        """
+        if np.array_equal(turn, self._turn):
+            return self
+        arm, _ = copy.copy(self), self.base
+        arm._bare = self._bare.copy()
+        for joint, old, new in zip(self._joints, self._turn, turn, strict=True):
+            place = arm._bare.jointPlacements[joint]
+            place.rotation = place.rotation @ self._pin.exp3(old).T @ self._pin.exp3(new)
+        arm._turn = np.array(turn)
+        return arm._holding_all()
 
     def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> UrdfArm:
         """Return this arm plus a share `support` (0..1) of what a wearer's arm adds to the first moments of the links.
@@ -257,20 +278,8 @@ class UrdfArm:
         moments: (n, 3) kg m, along x, y, z of each joint's frame, in place of any other wearer. The inertia is that of
         the arm alone. Raises ParameterError.
         """
-        arm = copy.copy(self)
-        arm._worn, arm._worn_moments = (), one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
-        return arm._held()
-
-    def _shifted(self, model: Any, moments: np.ndarray, what: str) -> Any:
-        """Return a copy of `model` whose links have these `moments` (n, 3) kg m more: their centres of gravity move."""
-        shifted = model.copy()
-        for joint, name, own in zip(self._joints, self._moves.names, moments, strict=True):
-            link = shifted.inertias[joint]
-            if any(own) and not link.mass:
-                raise ParameterError(f"{what} of {name}", own.tolist(), "0: its link has no mass in the URDF")
-            if any(own):
-                shifted.inertias[joint] = self._pin.Inertia(link.mass, link.lever + own / link.mass, link.inertia)
-        return shifted
+        carried = one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
+        return self._with(replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
 
     @property
     def directions(self) -> np.ndarray:
@@ -282,6 +291,11 @@ class UrdfArm:
     def change(self) -> np.ndarray:
         """By what `corrected` changed the moments, (n, 3) kg m."""
         return self._change
+
+    @property
+    def turn(self) -> np.ndarray:
+        """By what `turned` turned the joints' places, (n, 3) rad."""
+        return self._turn
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -330,12 +344,11 @@ class UrdfArm:
         torque = [np.divide(self._holding(pose.tolist(), way.tolist(), ZERO), self.gain) for pose, way in sampled]
         return np.asarray(np.linalg.lstsq(np.concatenate(columns), np.concatenate(torque), rcond=None)[0])
 
-    def with_moments(self, moments: np.ndarray) -> UrdfArm:
-        """Return this arm with the `moments` (k,) kg m of `base`, of the robot alone. Raises ParameterError."""
+    def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
+        """Return this arm with `moments` (k,) kg m of `base` added to those of the robot. Raises ParameterError."""
         change = self._change.copy()
-        own = self.with_payload(0.0).with_wearer(*np.zeros((2, len(self.gain)))).moments
-        for (n, way), difference in zip(self.base, moments - own, strict=True):
-            change[n] += difference * way
+        for (n, way), more in zip(self.base, moments, strict=True):
+            change[n] += more * way
         return self.corrected(change)
 
     @cached_property
@@ -348,6 +361,29 @@ class UrdfArm:
             jacobian = np.reshape(pin.getJointJacobian(model, self._data, joint, own), (6, -1))
             axes.append(jacobian[3:, model.joints[joint].idx_v].copy())
         return np.array(axes)
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
+        return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
+
+    def frames(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Return how the joints' frames are turned at `theta` (n,) rad, (n, 3, 3) to the root link's axes.
+
+        First as they would be with the joint itself at 0, then as they are.
+        """
+        with self._lock:
+            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
+            parents = [self._data.oMi[self._model.parents[joint]].rotation for joint in self._joints]
+            after = np.array([self._data.oMi[joint].rotation for joint in self._joints])
+        places = [self._model.jointPlacements[joint].rotation for joint in self._joints]
+        return np.array(parents) @ np.array(places), after
+
+    @property
+    def moved_by(self) -> np.ndarray:
+        """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
+        supports = [set(self._model.supports[joint].tolist()) for joint in self._joints]
+        return np.array([[joint in support for support in supports] for joint in self._joints])
 
     def _across(self, n: int) -> np.ndarray:
         """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
@@ -428,12 +464,11 @@ class UrdfArm:
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
         arm = self.scaled(np.ones(len(self.gain)).tolist(), gravity)
-        arm.payload, arm._worn, arm._own_mass = NO_PAYLOAD, (), 0.0
-        arm._worn_moments = np.zeros_like(self._worn_moments)
+        arm._own_mass = 0.0
         arm._bare = self._bare.copy()
         for joint in range(arm._bare.njoints):
             arm._bare.inertias[joint] = self._pin.Inertia.Zero()
-        return arm._held()
+        return arm._with(Held())
 
     def with_payload(self, mass: float, cog: Vector = ZERO) -> UrdfArm:
         """Return this arm with a load of `mass` kg in its hand, instead of any other. Raises ParameterError.
@@ -443,10 +478,8 @@ class UrdfArm:
         mass = one_float("payload.mass", mass, 0.0, MAX_PAYLOAD, "kg")
         if mass and not self._hand:
             raise ParameterError("payload.mass", mass, "0 without urdf.hand, which says where a load is held")
-        arm = copy.copy(self)
         x, y, z = floats("payload.cog", cog, 3, -MAX_REACH, MAX_REACH, "m").tolist()
-        arm.payload = mass, x, y, z
-        return arm._held()
+        return self._with(replace(self._held, payload=(mass, x, y, z)))
 
     def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> UrdfArm:
         """Return this arm plus a share `support` (0..1) of the wearer's arm. Raises ParameterError.
@@ -461,10 +494,8 @@ class UrdfArm:
         for number, (own, length) in enumerate(zip(carried, self.length, strict=True), start=1):
             if own and length < LEAST_LENGTH:
                 raise ParameterError("wearer.mass", mass, f"0 on link {number}, which has no length and no direction")
-        arm = copy.copy(self)
-        arm._worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
-        arm._worn_moments = np.zeros_like(self._worn_moments)
-        return arm._held()
+        worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
+        return self._with(replace(self._held, worn=worn, moments=()))
 
     def _anew(self) -> UrdfArm:
         """Forget what was computed for the arm that this is a copy of."""
@@ -473,24 +504,16 @@ class UrdfArm:
         self._data = self._model.createData()
         return self
 
-    def _held(self) -> UrdfArm:
-        """Put load and wearer on the links."""
-        self._model, load = self._bare.copy(), self.payload
-        if load[0]:
-            frame = self._model.frames[self._model.getBodyId(self._hand)]
-            self._add(frame.parentJoint, load[0], frame.placement.act(np.array(load[1:])))
-        for joint, (mass, cog), way in zip(self._joints, self._worn, self._along, strict=False):
-            if mass:
-                self._add(joint, mass, way * (cog / np.linalg.norm(way)))
-        self._by_mass = self._model  # moments alone have no inertia
-        if np.any(self._worn_moments):
-            self._model = self._shifted(self._model, self._worn_moments, "wearer.moment")
-        return self._anew()
+    def _with(self, held: Held) -> UrdfArm:
+        """Return this arm with all that it is to hold."""
+        arm = copy.copy(self)
+        arm._held = held
+        return arm._holding_all()
 
-    def _add(self, joint: int, mass: float, place: np.ndarray) -> None:
-        """Add a point of `mass` kg to the link of `joint`, at `place` (3,) m in the joint's frame."""
-        point = self._pin.Inertia(mass, place, np.zeros((3, 3)))
-        self._model.appendBodyToJoint(joint, point, self._pin.SE3.Identity())
+    def _holding_all(self) -> UrdfArm:
+        """Put load and wearer on the links."""
+        self._by_mass, self._model = self._held.on(self._bodies, self._bare)
+        return self._anew()
 
     def _holding(self, theta: Sequence[float], gravity: Sequence[float], turning: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm where gravity is `gravity` (3,) m/s^2, as the root link feels it.

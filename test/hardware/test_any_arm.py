@@ -50,7 +50,7 @@ SPEC = MOTORS["AK80-9"]
 CODE = 2.0 * SPEC.torque_range / 4095  # Nm
 RATE = 250.0  # Hz
 LIFT = 0.35  # rad, by which the wearer moves each joint
-HOLD = 3.0  # s after that
+LIFTED, HOLD = 4.0, 3.0  # s of that, and after it
 FREE = 2.5  # rad from zero, so that the stops are far
 UPRIGHT, TILTED = TrunkState(), TrunkState(0.4, -0.3)
 
@@ -141,9 +141,9 @@ class CarriedChain(VirtualArm):
     def raise_it(self) -> None:
         """Let the wearer raise the arm, and let go."""
         goal = [angle - math.copysign(LIFT, angle) for angle in self.home]  # away from the stops
-        steps = [{"move": goal, "over": 4.0}, {"move": goal, "over": 2.0}]  # the second until the arm is calm
+        steps = [{"move": goal, "over": LIFTED}]
         self.device.start(VirtualWearer(TrialScript.parse({"name": "raise", "steps": steps})))
-        self.run(6.0 + HOLD)
+        self.run(LIFTED + HOLD)
         self.check_controller()
         assert self.safety.state is State.ACTIVE, self.safety.fault
 

@@ -142,16 +142,14 @@ class Settings:
         check_owned(self, len(self.robot.scale))
         for name in ("wearer_mass", "wearer_cog"):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
-        if self.joint_spring.on and len(self.joint_spring.stiffness) != len(self.robot.scale):
-            expected = f"{len(self.robot.scale)} numbers"
-            raise ParameterError("joint_spring.stiffness", list(self.joint_spring.stiffness), expected)
+        for prefix, springs in (("joint_spring.", self.joint_spring), ("wearer.", self.tissue)):
+            if springs.on:  # else the default, of any length
+                with named(prefix):
+                    check_owned(springs, len(self.robot.scale))
         if soft := [k for k in self.joint_stiffness if 0.0 < k < SOFTEST]:
             raise ParameterError("joint_stiffness", soft, f"0 for a rigid joint, or at least {SOFTEST:g} Nm/rad")
         for name in ("wearer_first_moment", "wearer_off_axis"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
-        if self.tissue.on and len(self.tissue.joint_stiffness) != len(self.robot.scale):
-            stiffness = list(self.tissue.joint_stiffness)
-            raise ParameterError("wearer.joint_stiffness", stiffness, f"{len(self.robot.scale)} numbers")
         self._carry(self.robot)
         object.__setattr__(self, "chosen", LAWS[self.law](self))
         object.__setattr__(self, "exact", ExactLaw(self.arm))
@@ -304,6 +302,9 @@ URDF = (
           "robot does not carry it", (0, MAX_JOINTS), vector=True, fixed=True),
     *(Param(f"urdf.moment_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: what the first moment of each joint's "
             f"link has beyond the URDF's, along {axis} of the joint's frame", (-MAX_MOMENT, MAX_MOMENT), "kg m",
+            fixed=True, expert=True) for axis in "xyz"),
+    *(Param(f"urdf.turn_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: by what the place of each joint, and so "
+            f"its axis, is turned beyond the URDF's, about {axis} of the joint's frame", (-0.2, 0.2), "rad",
             fixed=True, expert=True) for axis in "xyz"),
     *(Param(name, [0.0] * JOINT_COUNT, "by `calibrate wearer`: what the wearer's arm adds to the first moment of each "
             f"joint's link, along {name[-1]} of the joint's frame; all 0: by mass and cog",

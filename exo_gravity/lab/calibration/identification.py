@@ -8,6 +8,12 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint, and a slope of its
 scale over the motor's temperature, are identified only where the poses ask for them (`pose_fit.asked_for`).
 
+Of an arm from a URDF the places of the joints are unknowns, too, as small turns: about a joint's axis, which is an
+error of its encoder's zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about
+another axis. The zero of the last joint does not, nor that of one whose next axis is parallel: they look like a moment
+across the link. A turn of the first joint is one of the whole arm: with an IMU it is part of its mounting. What does
+not show stays within its prior. The closed forms of the paper's arm have fixed axes: `askew` says what that may cost.
+
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
 weight; nor can they tell a moment across link 3 or 4 from an error of that joint's zero.
@@ -32,7 +38,8 @@ from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
+from exo_gravity.lab.calibration.askew import error_of_axes
+from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
@@ -60,6 +67,7 @@ class Acceptance:
     least_misfit: float = 0.1  #: Nm
     least_zero_error: float = 0.5  #: deg worth a sentence
     slope: float = 0.005  #: 1/K; magnets lose 0.001 to 0.002
+    turn: float = 6.0  #: deg of a zero or an axis; more is no error of what was measured or drawn
     least_torque: float = 0.3  #: Nm, root mean square of a joint in any pose, from which it is compared with the URDF's
 
 
@@ -106,10 +114,16 @@ class Identified:
     tilt_covariance: np.ndarray  #: (3, 3); one lean of the stand does not show the turn about gravity, two do
     stiffness: np.ndarray  #: (n,) Nm/rad of the springs across the joints, 0 where the poses ask for none
     stiffness_error: np.ndarray  #: (n,), standard errors, 0 where no spring was fitted
-    rest: np.ndarray  #: (n,) rad, where they are slack: a joint with a spring has its offset in it
+    #: (n,) rad, where they are slack as the encoders say: a joint with a spring has its offset in it
+    rest: np.ndarray
     slope: np.ndarray  #: (n,) 1/K of the scales over the motors' temperatures, 0 where the poses ask for none
     slope_error: np.ndarray  #: (n,), standard errors, 0 where no slope was fitted
     temperature: np.ndarray  #: (n,) degC, mean of the motors, at which `scale` is true; NaN where not known
+    #: (n, 3) rad by which the joints' places are turned: about the axis, by which a joint is farther than its encoder
+    #: says, and about two directions across it; (0, 3) if they are not identified
+    turn: np.ndarray
+    turn_error: np.ndarray  #: likewise, standard errors
+    of_axes: np.ndarray  #: (n,) Nm, error of the torque in other poses from axes that are not as drawn
 
     @property
     def left_offset(self) -> np.ndarray:
@@ -117,12 +131,14 @@ class Identified:
         return self.offset + self.stiffness * self.rest / self.scale
 
 
-def identify(observations: Sequence[Observation], model: MomentModel) -> Identified:
+def identify(observations: Sequence[Observation], model: MomentModel, axis_error: float = FIT.axis_error) -> Identified:
     """Return what the observations show of an arm.
+
+    axis_error: rad, assumed standard error of the directions of its axes.
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    at, plain = layout_of(model), rows_of(observations, model)
+    at, plain = layout_of(model), rows_of(observations, model, axis_error)
     extras = asked_for(plain, possible_extras(plain), robust)
     while True:
         rows = plain.with_extras(extras)
@@ -146,6 +162,7 @@ def identify(observations: Sequence[Observation], model: MomentModel) -> Identif
     error = np.where(hidden, np.inf, np.sqrt(np.diag(covariance)))
     moments, scale = unknowns[at.moment], np.exp(unknowns[at.scale])
     check_physical(moments, error[at.moment], scale, direction, model)
+    _check_turns(np.degrees(unknowns[at.turn]).reshape(-1, TURNS))
     stiffness, slope = unknowns[at.spring], unknowns[at.slope]
     _check_extras(stiffness, slope)
     slack = -unknowns[at.offset] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
@@ -160,6 +177,8 @@ def identify(observations: Sequence[Observation], model: MomentModel) -> Identif
         error[at.spring] * (stiffness > 0.0), np.clip(slack, -MAX_REST, MAX_REST), slope,
         error[at.slope] * (slope != 0.0),
         temperatures(observations).mean(axis=0),
+        unknowns[at.turn].reshape(-1, TURNS), error[at.turn].reshape(-1, TURNS),
+        np.zeros(at.joints) if model.turns else error_of_axes(model, used, solution, axis_error),
     )  # fmt: skip
 
 
@@ -180,6 +199,18 @@ def _names(model: MomentModel) -> tuple[str, ...]:
     """Return the names of moments, scales and offsets."""
     joints = range(1, model.count + 1)
     return (*model.names, *(f"{what} {n}" for what in ("torque scale", "offset") for n in joints))
+
+
+def _check_turns(turns: np.ndarray) -> None:
+    """Raise DataError unless the joints of an arm can be turned by `turns` (n, 3) degrees."""
+    for joint, (zero, *across) in enumerate(turns.tolist(), start=1):
+        for what, off, advice in (
+            ("zero", zero, "set it by a jig or a stop, or check the URDF"),
+            ("axis", math.hypot(*across), "check the URDF"),
+        ):
+            if abs(off) > ACCEPTED.turn:
+                most = f"must be within {ACCEPTED.turn:g}"
+                raise DataError(f"joint {joint}: its {what} is {off:+.1f} degrees off: {most}: {advice}")
 
 
 def _check_extras(stiffness: np.ndarray, slope: np.ndarray) -> None:

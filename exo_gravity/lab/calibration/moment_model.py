@@ -7,14 +7,15 @@ of its regressor leaves. Both are first moments in kg m.
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import MOMENTS, Torque, exact_torque, load_moments, moments_of, regressor
-from exo_gravity.core.arm.kinematics import LinkInertia
-from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.kinematics import NO_LENGTH, LinkInertia, frames
+from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.urdf_arm import UrdfArm
@@ -24,7 +25,9 @@ Holder = Callable[[Sequence[float], Tilt], Torque]
 TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
+TURNS = 3  # of a joint's place: about its axis, and about two directions across it
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
+FITTED = 60  # of them, in which the moments of an arm with turned axes are found
 STEP = 10.0  # deg, of their angles
 
 
@@ -36,7 +39,8 @@ class MomentModel(Protocol):
     moments: np.ndarray  #: (k,) kg m, as far as known
     start: np.ndarray  #: (k,) kg m, from which the fit begins
     gravity: float  #: m/s^2
-    angles: tuple[tuple[int, int], ...]  #: of a weight, as in `pose_fit.FitLayout`
+    beside: int  #: directions in which a weight may lie beside the last link or links
+    turns: int  #: of the joints' places that are fitted: 3 n or 0
     compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
     positive: tuple[int, ...]  #: numbers of the moments that are at least 0
     optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
@@ -54,6 +58,18 @@ class MomentModel(Protocol):
 
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (k,) of `mass` kg on the last link, `lever` m from its joint. Raises ParameterError."""
+        ...
+
+    def load_beside(self, mass: float, lever: float) -> np.ndarray:
+        """Return the change (k, `beside`) of these moments per rad by which the weight lies beside the link."""
+        ...
+
+    def turned(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` at `theta` (m, n) by turns of the joints' frames.
+
+        Of each joint by a turn of its place about its own axis, which is an error of its zero, and about two directions
+        across it: so is an axis askew. In Nm per kg m and rad.
+        """
         ...
 
     def holding(self, moments: np.ndarray) -> Holder:
@@ -78,13 +94,36 @@ def along_axes(model: MomentModel, theta: np.ndarray) -> np.ndarray:
     return np.stack([model.rows(theta, axis) for axis in np.eye(3)], axis=-1)
 
 
+def turned_by(
+    axes: np.ndarray, turns: np.ndarray, moments: np.ndarray, link: np.ndarray, moved_by: np.ndarray
+) -> np.ndarray:
+    """Return the derivative (m, n, k, 3, 3 n) of `along_axes` per m/s^2 of gravity by turns of the joints' places.
+
+    axes: (m, n, 3), of the joints. turns: (m, n, 3, 3), of each joint the three directions about which its place turns.
+    moments: (m, k, 3), directions of the moments. All in the base frame. link: (k,), that has each moment. moved_by:
+    (n, n), whether a joint moves the link of another.
+
+    A moment v loads the joint with axis a by -(a x v) . gravity. A turn w of joint j turns all that j moves, except the
+    moment along its axis, which counts as one of the link before: a fit takes what is missing for moments of that link.
+    """
+    moved = moved_by[:, link]  # (n, k)
+    cross = np.cross(axes[:, :, None], moments[:, None]) * moved[..., None]  # (m, n, k, 3)
+    # By joint j and its turn t: (m, n, k, j, t, 3)
+    both = np.cross(turns[:, None, None], cross[:, :, :, None, None])
+    swept = np.cross(turns[:, None], moments[:, :, None, None])  # (m, k, j, t, 3)
+    alone = np.cross(axes[:, :, None, None, None], swept[:, None]) * moved[..., None, None, None]
+    with_axis, with_link = moved_by.T[:, None, :, None, None], moved.T[:, :, None, None]
+    change = -np.where(with_axis, both, alone) * with_link
+    return np.moveaxis(change, -1, 3).reshape(*cross.shape, -1)
+
+
 class PapersMoments:
     """The paper's arm. arm: of which the moments are known, and the lengths."""
 
     count = JOINT_COUNT
     names: tuple[str, ...] = MOMENTS
     start = np.array((0.0, *TYPICAL_MOMENTS[1:]))
-    angles: tuple[tuple[int, int], ...] = (2, 6), (3, 7), (3, 5)  # from M3 to Y3, from M4 to Y4, and from M4 to Z
+    beside, turns = 3, 0
     compared: tuple[int, ...] = 1, 2, 3  # joint 1 carries nothing while its axis is vertical
     positive: tuple[int, ...] = (0,)  # M1, the least certain
     optional: tuple[int, ...] = 0, 4, 8, 12  # M1, W, scale and offset of joint 1
@@ -105,6 +144,24 @@ class PapersMoments:
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (8,) of `mass` kg on link 4, `lever` m from the elbow. Raises ParameterError."""
         return load_moments(self.length.tolist(), mass, lever)
+
+    def load_beside(self, mass: float, lever: float) -> np.ndarray:
+        """Return the change (8, 3) of these moments: from M3 to Y3, from M4 to Y4, and from M4 to Z."""
+        load, change = self.load(mass, lever), np.zeros((len(MOMENTS), self.beside))
+        for angle, (along, across) in enumerate(((2, 6), (3, 7), (3, 5))):
+            change[across, angle] = load[along]
+        return change
+
+    def turned(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative (m, 4, 8, 3, 12) of `along_axes` by turns of the joints' places."""
+        links = np.array([frames(NO_LENGTH, pose) for pose in theta.tolist()])  # (m, 4, 3, 3): place, axis, along
+        axes, along = links[:, :, 1], links[:, :, 2]
+        beside = [axes[:, 1], axes[:, 2], *(np.cross(axes[:, 2], along[:, link]) for link in (2, 3))]
+        moments = np.stack((*np.swapaxes(along, 0, 1), *beside), axis=1)
+        before = np.concatenate((np.broadcast_to(np.eye(3)[:1], along[:, :1].shape), along[:, :-1]), axis=1)
+        turns = np.stack((axes, before, np.cross(axes, before)), axis=2)
+        link = np.tile(np.arange(self.count), 2)
+        return self.gravity * turned_by(axes, turns, moments, link, np.tri(self.count, dtype=bool).T)
 
     def holding(self, moments: np.ndarray) -> Holder:
         """Return the exact law in plain floats, of an arm for each joint."""
@@ -137,7 +194,7 @@ class UrdfMoments:
     Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
 
-    angles: tuple[tuple[int, int], ...] = ()
+    beside = 2
     positive: tuple[int, ...] = ()
     optional: tuple[int, ...] = ()
     expects_scales = True
@@ -149,6 +206,7 @@ class UrdfMoments:
         self.arm, self.gravity, self.moments = arm, arm.gravity, arm.moments
         self._rotors, self.shows_tilt = np.diag(rotors), shows_tilt
         self.count, self.start = len(arm.names), self.moments
+        self.turns = TURNS * self.count
         numbers = [n for n, _ in arm.base]
         self.names = tuple(f"{arm.names[n]} {numbers[:k].count(n) + 1}" for k, n in enumerate(numbers))
         self.compared = tuple(range(self.count))
@@ -168,6 +226,46 @@ class UrdfMoments:
     def load(self, mass: float, lever: float) -> np.ndarray:
         """Return the moments (k,) of `mass` kg on the way from the last joint to the hand. Raises ParameterError."""
         return np.asarray(self._with(mass, lever).moments - self.moments) if mass else np.zeros(len(self.names))
+
+    def load_beside(self, mass: float, lever: float) -> np.ndarray:
+        """Return the change (k, 2) of these moments with the weight in the two directions across its way."""
+        return mass * lever * self._across
+
+    @cached_property
+    def _across(self) -> np.ndarray:
+        """What 1 kg m on the last link in either direction across its way adds to the moments, (k, 2)."""
+        last = np.eye(self.count)[-1]
+        ways = np.linalg.svd(self.arm.directions[-1:])[2][1:]
+        if not self.arm.bodies()[0][-1]:
+            return np.zeros((len(self.names), len(ways)))
+        bare, *changed = [self.arm.with_wearer_moments(np.outer(last, way)).moments for way in (0.0 * ways[0], *ways)]
+        return np.transpose(changed) - bare[:, None]
+
+    def turned(self, theta: np.ndarray) -> np.ndarray:
+        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places."""
+        frames = np.array([self.arm.frames(pose) for pose in theta.tolist()])
+        before, after = frames[:, 0], frames[:, 1]
+        link, ways = np.array([n for n, _ in self.arm.base]), np.array([way for _, way in self.arm.base])
+        moments = np.einsum("mkab,kb->mka", after[:, link], ways)
+        turns = np.einsum("mnab,ntb->mnta", before, self.arm.turns)
+        return self.gravity * turned_by(turns[:, :, 0], turns, moments, link, self.arm.moved_by)
+
+    def found(self, moments: np.ndarray, turn: np.ndarray) -> UrdfArm:
+        """Return the arm with these `moments` (k,) kg m and `turn` (n, 3) rad of the joints' axes, as a fit found them.
+
+        The turns about the axes are errors of the zeros, and not part of it. The fit has turned no moment along an
+        axis: what that changes in an arm whose places are turned, the moments make up for.
+        """
+        across = np.einsum("nt,ntb->nb", turn[:, 1:], self.arm.turns[:, 1:])
+        poses, down = self.suggested[:FITTED], np.eye(3)[np.arange(FITTED) % 3]
+        askew = (turn * (0.0, 1.0, 1.0)).ravel()
+        wanted = self.rows(poses, down) @ moments
+        wanted += np.einsum("mnkat,ma,k,t->mn", self.turned(poses), down, moments, askew, optimize=True)
+        turned = self.arm.turned(self.arm.turn + across)
+        tilts = [Tilt.of_gravity(SIDES[0], way) for way in down]
+        own = [turned.torque(pose, tilt) for pose, tilt in zip(poses.tolist(), tilts, strict=True)]
+        rows = turned.regressor(poses, down).reshape(-1, len(moments))
+        return turned.with_more_moments(np.linalg.lstsq(rows, (wanted - own).ravel(), rcond=None)[0])
 
     def holding(self, moments: np.ndarray) -> Holder:
         """Return what multiplies the regressor of one pose with the moments of each joint."""

@@ -2,11 +2,13 @@
 """Weighted least squares for the unknowns of an arm in held poses.
 
 The unknowns are the moments of an arm of n joints (moment_model.py) in kg m, the logarithm of its torque scales, the
-offsets in Nm, of the paper's arm three angles by which a known weight seems to lie off the links (a zero of joint 3 or
-4 that is off by a degree moves a weight by more than a light forearm's own moment), and the rotation of gravity's
-direction from the measured to the true one: an IMU is mounted, and a stand placed, to no better than a degree. The
-commanded effort is `torque(moments + load) / scale + offset`: nearly linear, so a few Gauss-Newton steps solve it. Each
-step leaves out the combinations of unknowns that the poses do not show: those whose standard error exceeds `NATURAL`.
+offsets in Nm, the angles by which a known weight seems to lie beside the links (a zero of the paper's joint 3 or 4 that
+is off by a degree moves a weight by more than a light forearm's own moment), the rotation of gravity's direction from
+the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and of an arm from a
+URDF small turns of its joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
+linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do not
+show: those whose standard error exceeds `NATURAL`. Angles and turns are known to some degrees before: what the poses do
+not show of them stays within that, and is part of the errors.
 
 Further unknowns, the extras, are 0 unless the poses ask for them: a spring across each joint in Nm/rad (where it is
 slack is part of the offset), and the slope of each scale over the motor's temperature. `asked_for` decides by an
@@ -25,11 +27,12 @@ import numpy as np
 
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
+from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel, along_axes
 
 TURN = np.cross(np.eye(3), np.eye(3)[:, None])  # (3, 3, 3): v @ TURN has the rows v x X, v x Y and v x Z
-# kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K: a combination of unknowns that may be wrong by this much is not known.
-NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005)
+# kg m, logarithm, Nm, rad, rad, Nm/rad, 1/K, rad: a combination of unknowns that may be wrong by this much is not
+# known.
+NATURAL = (0.1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.005, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +46,8 @@ class FitLayout:
     tilt: slice  #: rad, the rotation vector of gravity in the base frame
     spring: slice  #: Nm/rad
     slope: slice  #: 1/K, of the torque scale over the motor's temperature
+    turn: slice  #: rad, of the joints' places: about each joint's axis, its zero, and about two directions across it
     joints: int  #: how many the arm has
-    angles: tuple[tuple[int, int], ...]  #: of a weight, the numbers of the moment along a link and of that across it
     natural: np.ndarray  #: `NATURAL` of each unknown, (count,)
 
     @property
@@ -55,7 +58,7 @@ class FitLayout:
     @property
     def count(self) -> int:
         """How many unknowns there are."""
-        return int(self.slope.stop)
+        return int(self.turn.stop)
 
     @property
     def extras(self) -> tuple[int, ...]:
@@ -70,11 +73,11 @@ class FitLayout:
 def layout_of(model: MomentModel) -> FitLayout:
     """Return where the unknowns of an arm stand."""
     joints = model.count
-    sizes = len(model.names), joints, joints, len(model.angles), 3, joints, joints
+    sizes = len(model.names), joints, joints, model.beside, 3, joints, joints, model.turns
     ends = np.cumsum((0, *sizes)).tolist()
-    moment, scale, offset, angle, tilt, spring, slope = map(slice, ends[:-1], ends[1:])
+    moment, scale, offset, angle, tilt, spring, slope, turn = map(slice, ends[:-1], ends[1:])
     natural = np.repeat(NATURAL, sizes)
-    return FitLayout(moment, scale, offset, angle, tilt, spring, slope, joints, model.angles, natural)
+    return FitLayout(moment, scale, offset, angle, tilt, spring, slope, turn, joints, natural)
 
 
 @dataclass(frozen=True)
@@ -87,6 +90,9 @@ class Fit:
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
+    zero_error: float = 0.026  #: rad, of an encoder's zero in a file: 1.5 degrees
+    #: rad, of a joint's axis in each direction across it: 1 degree, as of printed and welded brackets
+    axis_error: float = 0.0175
     scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
     pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each
@@ -113,10 +119,12 @@ class Rows(NamedTuple):
     """What is fitted, for m poses of an arm with n joints and k moments."""
 
     along: np.ndarray  #: (m, n, k, 3) Nm per kg m, the torque with gravity along each axis of the base frame
+    turned: np.ndarray  #: (m, n, k, 3, t) Nm per kg m and rad, its derivative by the turns that are fitted
     theta: np.ndarray  #: (m, n) rad
     warmth: np.ndarray  #: (m, n) K of the motors, beyond the mean of their poses; 0 where it is not known
     direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (m, k) kg m, moments of the weight
+    beside: np.ndarray  #: (m, k, a) kg m per rad, their change with the angles
     effort: np.ndarray  #: (m, n) Nm
     sigma: np.ndarray  #: (m, n) Nm, standard error of `effort`
     layout: FitLayout
@@ -126,7 +134,7 @@ class Rows(NamedTuple):
 
     def only(self, keep: np.ndarray) -> "Rows":
         """Return the poses that `keep` (m,) selects."""
-        return Rows._make([*(column[keep] for column in self[:7]), *self[7:]])
+        return Rows._make([*(column[keep] for column in self[:9]), *self[9:]])
 
     def holding(self, indices: Sequence[int]) -> "Rows":
         """Return the rows with these unknowns held at their start."""
@@ -147,33 +155,37 @@ class Rows(NamedTuple):
         at, (rows, torque, given) = self.layout, self._parts(unknowns)
         own = np.eye(at.joints)[None]  # what belongs to a joint changes that joint's effort alone
         effort = torque * given
-        angles = [rows[:, :, across] * self.load[:, None, along] for along, across in at.angles]
+        angles, moments = rows @ self.beside, self._moments(unknowns)
         turns = np.einsum("mi,ita->mta", self.direction, TURN)
-        turned = np.einsum("mnka,mta,mk->mnt", self.along, turns, self._moments(unknowns), optimize=True)
+        tilted = np.einsum("mnka,mta,mk->mnt", self.along, turns, moments, optimize=True)
         warming = self.warmth / (1.0 + unknowns[at.slope] * self.warmth)
         parts = (
             rows * given[..., None],
             -own * effort[..., None],
             np.broadcast_to(own, (len(effort), at.joints, at.joints)),
-            np.stack(angles, axis=-1) * given[..., None] if angles else np.zeros((*effort.shape, 0)),
-            turned * given[..., None],
+            angles * given[..., None],
+            tilted * given[..., None],
             own * (self.theta * given)[..., None],
             -own * (effort * warming)[..., None],
+            self.by_turns(self.turned, unknowns),
         )
         return np.concatenate(parts, axis=-1)
 
+    def by_turns(self, turned: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
+        """Return the derivative (m, n, t) of `predicted` by turns, by which `along` has the derivative `turned`."""
+        _, _, given = self._parts(unknowns)
+        torque = np.einsum("mnkat,ma,mk->mnt", turned, self.direction, self._moments(unknowns), optimize=True)
+        return np.asarray(torque * given[..., None])
+
     def _moments(self, unknowns: np.ndarray) -> np.ndarray:
         """Return the moments of arm and weight, (m, k) kg m."""
-        turn = np.eye(self.layout.moments)
-        for (along, across), angle in zip(self.layout.angles, unknowns[self.layout.angle], strict=True):
-            turn[along, across] = angle
-        return np.asarray(unknowns[self.layout.moment] + self.load @ turn)
+        return np.asarray(unknowns[self.layout.moment] + self.load + self.beside @ unknowns[self.layout.angle])
 
     def _parts(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the regressor (m, n, k), the torque of gravity and springs (m, n), and what a command is of it."""
         at = self.layout
         direction = self.direction + self.direction @ (unknowns[at.tilt] @ TURN)
-        rows = np.einsum("mnka,ma->mnk", self.along, direction)
+        rows = np.einsum("mnka,ma->mnk", self.along + self.turned @ unknowns[at.turn], direction)
         torque = np.einsum("mnk,mk->mn", rows, self._moments(unknowns)) + unknowns[at.spring] * self.theta
         return rows, torque, np.exp(-unknowns[at.scale]) / (1.0 + unknowns[at.slope] * self.warmth)
 
@@ -192,8 +204,11 @@ class Solution(NamedTuple):
     inverse: np.ndarray  #: (count, m n + c), change of the unknowns with each effort and condition, by its error
 
 
-def rows_of(observations: Sequence[Observation], model: MomentModel) -> Rows:
-    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation."""
+def rows_of(observations: Sequence[Observation], model: MomentModel, axis_error: float) -> Rows:
+    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation.
+
+    axis_error: rad, assumed standard error of the directions of its axes.
+    """
     if not observations:
         raise DataError("no pose was observed")
     theta, direction, effort, spread = found = columns(observations)
@@ -201,17 +216,35 @@ def rows_of(observations: Sequence[Observation], model: MomentModel) -> Rows:
         for index in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
             raise DataError(f"pose {index + 1}: {name} = {values[index].tolist()}: must be finite numbers")
     at = layout_of(model)
-    load = np.array([model.load(one.load_mass, one.load_lever) for one in observations])
+    weights = [(one.load_mass, one.load_lever) for one in observations]
+    load, beside = (np.array([of(*weight) for weight in weights]) for of in (model.load, model.load_beside))
     unit = np.eye(at.count)
     # Without a weight a common factor of scales and moments does not show.
     product = unit[at.scale][list(model.compared)].sum(axis=0, keepdims=True) * (not np.any(load))
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
     scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
-    anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, product / EXACT))
+    turned_by = np.resize((FIT.zero_error, axis_error, axis_error), model.turns)
+    if model.shows_tilt:
+        turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
+    turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]
+    anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, turns, product / EXACT))
     along, sigma = along_axes(model, theta), np.hypot(spread, FIT.least_spread)
+    turned = model.turned(theta)[..., : model.turns]
     temperature = temperatures(observations)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
-    return Rows(along, theta, warmth, direction, load, effort, sigma, at, at.start(model.start), anchor)
+    start = at.start(model.start)
+    return Rows(along, turned, theta, warmth, direction, load, beside, effort, sigma, at, start, anchor)
+
+
+def unmeasured(model: MomentModel, theta: np.ndarray, direction: np.ndarray, start: np.ndarray) -> Rows:
+    """Return rows without efforts, weights, and effect of the turns.
+
+    theta: (m, n) rad. direction: (m, 3). start: (count,).
+    """
+    at, along, none = layout_of(model), along_axes(model, theta), np.zeros_like(theta)
+    turned, load = np.zeros((*along.shape, model.turns)), np.zeros((len(theta), at.moments))
+    beside = np.zeros((*load.shape, model.beside))
+    return Rows(along, turned, theta, none, direction, load, beside, none, none, at, start, np.zeros((0, at.count)))
 
 
 def temperatures(observations: Sequence[Observation]) -> np.ndarray:

@@ -18,8 +18,8 @@ from exo_gravity.core.compensation.tracking import MOTION, Line, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.limits import WALL, Limits
-from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
-from exo_gravity.lab.calibration.pose_fit import Rows, layout_of
+from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.calibration.pose_fit import layout_of, unmeasured
 
 
 @dataclass(frozen=True)
@@ -261,10 +261,8 @@ def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.nda
 
 def _sensitivity(theta: np.ndarray, direction: Vector, moments: Vector, model: MomentModel) -> np.ndarray:
     """Return the derivative of the efforts in the poses (m, n) by the unknowns, by their noise: (m, n, count)."""
-    at, unused = layout_of(model), np.zeros((len(theta), model.count))  # what was measured
-    down, no_load = np.broadcast_to(direction, (len(theta), 3)), np.zeros((len(theta), at.moments))
-    unknowns, no_anchor = at.start(np.asarray(moments)), np.zeros((0, at.count))
-    along = along_axes(model, theta)
-    rows = Rows(along, theta, unused, down, no_load, unused, unused, at, unknowns, no_anchor)
+    at = layout_of(model)
+    unknowns = at.start(np.asarray(moments))
+    rows = unmeasured(model, theta, np.broadcast_to(direction, (len(theta), 3)), unknowns)
     noise = np.hypot(CHOICE.noise, CHOICE.noise_share * rows.predicted(unknowns))
     return np.asarray(rows.jacobian(unknowns) / noise[..., None] * (np.arange(at.count) < at.tilt.start))

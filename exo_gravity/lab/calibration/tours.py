@@ -22,13 +22,13 @@ from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
-from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints
-from exo_gravity.hardware.urdf_arm import MOMENT_NAMES
+from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
-from exo_gravity.lab.calibration.pose_fit import columns, temperatures
+from exo_gravity.lab.calibration.pose_fit import FIT, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -37,6 +37,7 @@ from exo_gravity.lab.inputs.arms import AnyArm
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
+MOST_ASKEW = 5.0  # deg, of an axis that can be assumed
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 
 
@@ -57,7 +58,13 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier) if options.earlier else []
-    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}))
+    axis_error = axis_error_of(options.axes)
+    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), axis_error)
+
+
+def axis_error_of(degrees: float | None) -> float:
+    """Return the assumed standard error of an axis in rad, by default the usual one. Raises ParameterError."""
+    return FIT.axis_error if degrees is None else math.radians(one_float("axes", degrees, 0.0, MOST_ASKEW, "degrees"))
 
 
 def tour_observations(
@@ -83,6 +90,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     model.load(mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
+    axis_error = axis_error_of(options.axes)
     earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
     bare = tour_observations(options, arm, say, poses)
@@ -94,7 +102,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
         hang = _request(arm, mass, lever)
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = tour_observations(options, arm, say, changes, hang)
-    return moments_from(arm, earlier + bare + weighed)
+    return moments_from(arm, earlier + bare + weighed, axis_error)
 
 
 def _request(arm: AnyArm, mass: float, lever: float) -> str:
@@ -121,10 +129,15 @@ def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np
     return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
 
 
-def moments_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
-    """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does."""
+def moments_from(
+    arm: AnyArm, observations: Sequence[Observation], axis_error: float = FIT.axis_error
+) -> CalibrationResult:
+    """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does.
+
+    axis_error: rad, assumed standard error of the directions of its axes.
+    """
     model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
-    found = identify(observations, model)
+    found = identify(observations, model, axis_error)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
@@ -162,11 +175,11 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
     moments = np.where(np.isfinite(error), found.moments, before)
     if isinstance(model, UrdfMoments):
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-        new = model.arm.with_moments(moments)
-        for name, values in zip(MOMENT_NAMES, new.change.T, strict=True):
-            yield Change(
-                node, name, (values.round(5) + 0.0).tolist(), f"{known}, was {row(np.array(arm.compensator[name]))}"
-            )
+        new = model.found(moments, found.turn)
+        for names, parts, what in ((MOMENT_NAMES, new.change, known), (TURN_NAMES, new.turn, "rad")):
+            for name, values in zip(names, parts.T, strict=True):
+                note = f"{what}, was {row(np.array(arm.compensator[name]))}"
+                yield Change(node, name, (values.round(5) + 0.0).tolist(), note)
         return
     for name, part in MOMENT_PARAMETERS.items():
         note = f"{' '.join(MOMENTS[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
@@ -178,12 +191,14 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
     node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
     changes += [
         Change(f"{arm.namespace}/can_bridge", "torque_scale", scale, f"+-{row(found.scale_error)}"),
+        *_zero_changes(arm, found),
         *_temperature_changes(arm, found),
         *_spring_changes(arm, found),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
         left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2) * found.scale
-        changes.append(Change(node, "model_error.torque", left_out.round(3).tolist(), "Nm, of poses left out"))
+        note = f"Nm: {row(left_out)} of poses left out, {row(found.of_axes)} of axes that may be askew"
+        changes.append(Change(node, "model_error.torque", np.hypot(left_out, found.of_axes).round(3).tolist(), note))
     if not found.relative:
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
@@ -193,6 +208,17 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
     if any(gain != 1.0 for gain in arm.compensator["gain"]):
         changes.append(Change(node, "gain", [1.0] * len(scale), "now part of the moments and of torque_scale"))
     return tuple(changes)
+
+
+def _zero_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
+    """Yield the zeros of the encoders, where they were identified."""
+    if not len(found.turn):
+        return
+    bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
+    zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
+    unshown = f"+-{math.degrees(FIT.zero_error):.2g}: the poses do not show it"
+    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}; {unshown}"
+    yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
 
 
 def _temperature_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
@@ -213,7 +239,8 @@ def _spring_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
     if not (np.any(found.stiffness) or before.on):
         return
-    new = JointSpring(found.stiffness.round(4).tolist(), found.rest.round(4).tolist())
+    rest = found.rest + (found.turn[:, 0] if len(found.turn) else 0.0)
+    new = JointSpring(found.stiffness.round(4).tolist(), rest.round(4).tolist())
     note = f"Nm/rad, +-{row(found.stiffness_error)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")

@@ -21,7 +21,7 @@ from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tours import at_links, row, torque_error, tour_observations
-from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest
+from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest, visits
 from exo_gravity.lab.calibration.worn_arm import WornArm, worn_arm
 from exo_gravity.lab.inputs.arms import AnyArm
 
@@ -66,10 +66,13 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     worn, observations = worn_arm(arm), at_links(arm, observations)
     theta, direction, effort, spread = columns(observations)
     torque = effort - worn.robot(theta, direction) - joint_spring_of(arm.compensator).torques(theta)
-    again, change = unrest(theta, torque)
+    pairs = visits(theta)
+    again = len({other for _, other in pairs})
     least = min(WEARER.least_poses, WEARER.least_of_one + len(arm.joint_names) - 1)
     if len(observations) - again < least:
         raise DataError(f"{len(observations) - again} different poses were measured, must be at least {least}")
+    fit = fit_wearer(worn.columns(theta, direction), theta, torque, spread, worn.known)
+    change = unrest(pairs, fit.remainder)
     restless = [
         f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
         for name, off in zip(arm.joint_names, change, strict=True)
@@ -77,7 +80,6 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     ]
     if restless:
         raise DataError("; ".join(restless))
-    fit = fit_wearer(worn.columns(theta, direction), theta, torque, spread, worn.known)
     found = worn.found(fit, theta, direction)
     low, high = worn.comfortable
     poses = np.random.default_rng(0).uniform(low, high, (WEARER.samples, len(arm.joint_names)))

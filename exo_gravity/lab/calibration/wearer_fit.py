@@ -14,6 +14,7 @@ person who carries a constant share of their arm looks like one with a lighter a
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,18 +112,19 @@ def fit_wearer(
     return WearerFit(best[:moments], stiffness, rest, covariance, middle, remainder)
 
 
-def unrest(theta: np.ndarray, torque: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return how many poses were visited again, and the largest change (n,) in Nm of what held the arm there.
+def visits(theta: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs of poses, of theta (p, n) rad, that are visits of one."""
+    pairs = itertools.combinations(range(len(theta)), 2)
+    return [(one, other) for one, other in pairs if np.abs(theta[one] - theta[other]).max() < PRIOR.same_pose]
 
-    theta: (p, n) rad. torque: (p, n) Nm.
+
+def unrest(pairs: Sequence[tuple[int, int]], remainder: np.ndarray) -> np.ndarray:
+    """Return the largest change (n,) in Nm of what held the arm between two visits of a pose.
+
+    remainder: (p, n) Nm, less what a fit predicts: the visits may be some degrees apart.
     """
-    pairs = [
-        (one, other)
-        for one, other in itertools.combinations(range(len(theta)), 2)
-        if np.abs(theta[one] - theta[other]).max() < PRIOR.same_pose
-    ]
-    changes = [np.abs(torque[one] - torque[other]) for one, other in pairs]
-    return len({other for _, other in pairs}), np.max([np.zeros(theta.shape[1]), *changes], axis=0)
+    changes = [np.abs(remainder[one] - remainder[other]) for one, other in pairs]
+    return np.max([np.zeros(remainder.shape[1]), *changes], axis=0)
 
 
 def _with_springs(columns: np.ndarray, theta: np.ndarray, middle: Vector) -> np.ndarray:

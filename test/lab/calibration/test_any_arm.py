@@ -11,23 +11,26 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from bench.calibration.tour import player_of
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, UrdfArm
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.live import tour_parameters
-from exo_gravity.lab.calibration.moment_model import along_axes
+from exo_gravity.lab.calibration.moment_model import PapersMoments, UrdfMoments, along_axes
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.result import page_of, write_changes
 from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
 from exo_gravity.lab.inputs.arms import AnyArm, any_arm, carried_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.inputs.ros_yaml import text_of
+from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ...support.chains import random_chain
 from ...support.urdf_oracle import MujocoArm, WornMujocoArm
@@ -37,6 +40,8 @@ DOWN = gravity_in_trunk(0.0, 0.0)
 MEDIAN, WORST = 0.01, 0.03  # of the peak torque
 POSES = 12
 NOISE = 0.004  # Nm, standard deviation of a pose's effort: half a code of an AK60-6
+ZERO = 1.5  # deg, the largest error of an encoder's zero
+ASKEW = 1.5  # deg, by which each axis lies otherwise than in the file's URDF
 OFF = 0.2  # share by which each mass of the file's URDF is wrong
 
 
@@ -45,6 +50,16 @@ def with_wrong_masses(text: str, seed: int) -> str:
     random, root = np.random.default_rng(seed), ElementTree.fromstring(text)
     for mass in root.iter("mass"):
         mass.set("value", str(float(mass.get("value", "")) * random.choice((1.0 - OFF, 1.0 + OFF))))
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def turned(text: str, joint: str, turn: np.ndarray) -> str:
+    """Return a URDF in which the place of `joint` is turned by `turn` (3,) rad in the joint's frame."""
+    root = ElementTree.fromstring(text)
+    (origin,) = [one.find("origin") for one in root.findall("joint") if one.get("name") == joint]
+    rpy = np.array([float(angle) for angle in origin.get("rpy", "0 0 0").split()])
+    matrix = pin.rpy.rpyToMatrix(rpy) @ pin.exp3(turn)
+    origin.set("rpy", " ".join(map(repr, pin.rpy.matrixToRpy(matrix).tolist())))
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -61,6 +76,7 @@ class Bench:
     params: Path
     arm: AnyArm
     text: str
+    off: np.ndarray  # (n,) rad by which each joint is farther than its encoder says
 
     @classmethod
     def of(cls, name: str, folder: Path) -> Bench:
@@ -70,7 +86,8 @@ class Bench:
         nodes = load(packaged_config(f"{name}.yaml"))
         nodes["/right/compensator"]["urdf.file"] = str(wrong)
         params.write_text(text_of(nodes))
-        return cls(params, any_arm(params, "right"), text)
+        arm = any_arm(params, "right")
+        return cls(params, arm, text, np.zeros(len(arm.joint_names)))
 
     def observed(self, scales: np.ndarray, weight: tuple[float, float] = (0.0, 0.0)) -> list[Observation]:
         """What a tour through the best poses would show of motors with these true torque scales (n,)."""
@@ -81,7 +98,7 @@ class Bench:
             taken.append(poses[next_pose(taken, poses, DOWN, model.moments + model.load(*weight), model)])
         seen = []
         for theta in taken:
-            effort = truth.torque(theta) / scales + random.normal(0.0, NOISE, len(theta))
+            effort = truth.torque(theta + self.off) / scales + random.normal(0.0, NOISE, len(theta))
             spread = np.full(len(theta), NOISE)
             seen.append(Observation(theta, DOWN, effort, spread, spread, *weight, temperature=(30.0,) * len(theta)))
         return seen
@@ -92,7 +109,10 @@ class Bench:
         poses = random.uniform(self.arm.low, self.arm.high, (300, len(scales)))
         truth = true_arm(self.text, self.arm.joint_names)
         true = np.array([truth.torque(pose) for pose in poses])
-        law = np.array([new.settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
+        moved = np.multiply(
+            self.arm.can_bridge["direction"], np.subtract(self.arm.can_bridge["zero"], new.can_bridge["zero"])
+        )
+        law = np.array([new.settings.torque(pose - self.off + moved, Tilt.of("left"))[0] for pose in poses])
         given = law / np.array(new.can_bridge["torque_scale"]) * scales
         off = np.abs(given - true).max(axis=1) / np.abs(true).max()
         return float(np.median(off)), float(off.max())
@@ -123,6 +143,76 @@ def test_a_known_weight_shows_wrong_torque_scales(name: str, tmp_path: Path) -> 
     seen = [*bench.observed(scales), *bench.observed(scales, (1.0, lever))]
     after, worst = bench.errors(bench.calibrated(seen), scales)
     assert after < MEDIAN and worst < WORST
+
+
+@pytest.mark.parametrize("name", SHIPPED[1:])  # those of a single joint look like a moment across its link
+def test_zeros_and_axes_that_are_askew_are_found_where_the_poses_show_them(name: str, tmp_path: Path) -> None:
+    bench, random = Bench.of(name, tmp_path), np.random.default_rng(3)
+    for joint, (_, *across) in zip(
+        bench.arm.joint_names, UrdfArm(bench.text, bench.arm.joint_names).turns, strict=True
+    ):
+        way = random.normal(size=2) @ across
+        bench.text = turned(bench.text, joint, np.radians(ASKEW) * way / np.linalg.norm(way))
+    right = np.ones(len(bench.arm.joint_names))
+    bench.off = np.radians(np.resize((ZERO, -ZERO, ZERO), len(right)))
+    median, worst = bench.errors(bench.calibrated(bench.observed(right)), right)
+    assert median < 0.5 * MEDIAN and worst < 0.25 * WORST
+
+
+def test_a_weight_that_hangs_a_little_beside_its_link_is_no_error_of_a_zero(tmp_path: Path) -> None:
+    bench, lever = Bench.of("three_joints", tmp_path), 0.2
+    hung = np.radians((0.0, 0.0, 3.0))  # the weight is farther round the elbow than said
+    bare, right = bench.observed(np.ones(3)), np.ones(3)
+    truth, none = true_arm(bench.text, bench.arm.joint_names, (1.0, lever)), true_arm(bench.text, bench.arm.joint_names)
+    weighed = []
+    for one in bench.observed(right, (1.0, lever)):
+        theta = np.asarray(one.theta)
+        beside = none.torque(theta) + truth.torque(theta + hung) - none.torque(theta + hung)
+        weighed.append(one._replace(effort=beside))
+    found = identify([*bare, *weighed], model_of(bench.arm))
+    assert np.degrees(np.abs(found.turn[:, 0])).max() < 1.0
+    assert np.abs(found.scale - 1.0).max() < 0.01
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_the_derivatives_by_turns_of_the_joints_are_mujocos(count: int) -> None:
+    text, names = random_chain(count, seed=20 + count)
+    arm = UrdfArm(text, names, "hand")
+    model, random, step = UrdfMoments(arm, [0.0] * count, True), np.random.default_rng(count), 1e-4
+    poses, down = random.uniform(-2.0, 2.0, (10, count)), gravity_in_trunk(0.3, -0.2)
+    shown = np.einsum("mnkat,a,k->tmn", model.turned(poses), down, arm.moments)
+    moments = model.rows(poses, down).reshape(-1, len(model.names))
+    for number, (turn, derivative) in enumerate(zip(arm.turns.reshape(-1, 3), shown, strict=True)):
+        arms = [MujocoArm(turned(text, names[number // 3], sign * step * turn), names) for sign in (1.0, -1.0)]
+        ends = np.array([[one.torque(theta, 9.80665 * down) for theta in poses] for one in arms])
+        wrong = (derivative - (ends[0] - ends[1]) / (2.0 * step)).ravel()
+        if number % 3:  # a moment along the joint's axis turns, too, which looks like moments of the link before
+            wrong -= moments @ np.linalg.lstsq(moments, wrong, rcond=None)[0]
+        assert np.abs(wrong).max() < 1e-5
+
+
+def test_the_papers_derivatives_by_turns_are_pinocchios() -> None:
+    pin, model = pinocchio_model(DEFAULT_LINKS)
+    data, theta, step = model.createData(), np.array((0.4, 0.9, -0.3, 0.8)), 1e-5
+    down = np.array((0.2, -0.3, 0.93))
+    model.gravity.linear[:] = 9.80665 * down
+    moments = PapersMoments(DEFAULT_LINKS)
+    shown = np.einsum("nkat,a,k->tn", moments.turned(theta[None])[0], down, moments.moments)
+    for number, derivative in enumerate(shown):
+        joint, way = 1 + number // 3, np.eye(3)[(2, 0, 1)[number % 3]]
+        place, ends = model.jointPlacements[joint].copy(), []
+        for sign in (1.0, -1.0):
+            model.jointPlacements[joint] = place * pin.SE3(pin.exp3(sign * step * way), np.zeros(3))
+            ends.append(pin.computeGeneralizedGravity(model, data, theta).copy())
+        model.jointPlacements[joint] = place
+        np.testing.assert_allclose(derivative, (ends[0] - ends[1]) / (2.0 * step), atol=1e-6)
+
+
+def test_a_zero_that_no_jig_could_have_missed_by_so_much_is_refused(tmp_path: Path) -> None:
+    bench = Bench.of("seven_joints", tmp_path)
+    bench.off[2] = np.radians(12.0)
+    with pytest.raises(DataError, match=r"joint 3: its zero is \+8\.\d degrees off: must be within 6"):
+        moments_from(bench.arm, bench.observed(np.ones(7)))
 
 
 def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> None:
@@ -163,7 +253,7 @@ def test_poses_that_do_not_show_a_moment_are_refused_and_the_missing_one_is_name
 def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refused(tmp_path: Path) -> None:
     bench = Bench.of("three_joints", tmp_path)
     values = {**bench.arm.compensator, "motor": bench.arm.can_bridge["motor"]}
-    none = dict.fromkeys(MOMENT_NAMES, [0.0] * 2)
+    none = dict.fromkeys((*MOMENT_NAMES, *TURN_NAMES), [0.0] * 2)
     with pytest.raises(ParameterError, match=r"urdf\.file = '': must be a file: a calibration does not wait"):
         urdf_moments({**values, "urdf.file": ""})
     with pytest.raises(ParameterError, match=r"joint_names = .*: must be all joints that move the arm's links"):
@@ -175,7 +265,7 @@ def test_the_moments_of_any_chain_give_mujocos_torque(count: int) -> None:
     text, names = random_chain(count, seed=count)
     arm, truth, random = UrdfArm(text, names, "hand"), MujocoArm(text, names), np.random.default_rng(count)
     changed = with_wrong_masses(text, count)
-    other = arm.with_moments(UrdfArm(changed, names, "hand").moments)
+    other = arm.with_more_moments(UrdfArm(changed, names, "hand").moments - arm.moments)
     rows, moments, base = arm.regressor, arm.moments, MujocoArm(changed, names)
     for _ in range(20):
         theta, tilt = random.uniform(-3.0, 3.0, count), Tilt.of("left", *random.uniform(-1.0, 1.0, 2))

@@ -22,9 +22,11 @@ from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
 from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS
+from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import FIT
+from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 
@@ -139,6 +141,44 @@ def test_a_weight_shows_an_error_of_joint_3s_zero():
     said = next(sentence for sentence in found.unknown if "The weight shows joint 3's zero" in sentence)
     assert float(said.split("zero ")[1].split()[0]) == pytest.approx(np.degrees(0.05), abs=1.0)
     assert not any("The weight shows" in sentence for sentence in identify(Device(17).tour(), PAPERS).unknown)
+
+
+def askew_torque(turn, theta, direction):
+    """Return the torque (m, 4) in Nm by Pinocchio of an arm whose axes are turned; turn: (4, 2) rad, about x and y."""
+    pin, model = pinocchio_model(DEFAULT_LINKS)
+    for joint, (x, y) in enumerate(turn, start=1):
+        model.jointPlacements[joint] = model.jointPlacements[joint] * pin.SE3(
+            pin.exp3(np.array((x, y, 0.0))), np.zeros(3)
+        )
+    data, model.gravity.linear = model.createData(), STANDARD_GRAVITY * np.asarray(direction)
+    return np.array([pin.computeGeneralizedGravity(model, data, np.array(pose)) for pose in theta])
+
+
+def test_the_band_contains_what_axes_leave_that_are_askew():
+    leans = LEANING, Tilt.of("right", -0.1, 0.25).direction
+    new = np.random.default_rng(9).uniform((-0.8, 0.3, -0.2, 0.2), (0.8, 1.3, 1.2, 1.4), (200, 4))
+    within, wide = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        angle = rng.uniform(0.0, 2.0 * np.pi, 4)
+        turn, tour = np.radians(1.5) * np.column_stack((np.cos(angle), np.sin(angle))), []
+        for down in leans:
+            for theta in best(down, 8):
+                effort = askew_torque(turn, [theta], down)[0] + rng.normal(0.0, CODE / 2.0, 4)
+                spread = np.full(4, CODE / 2.0)
+                tour.append(Observation(theta, np.array(down), effort, spread, spread))
+        found = identify(tour, PapersMoments(DEFAULT_LINKS))
+        mounted = np.array(UPRIGHT) + np.cross(found.tilt, UPRIGHT)
+        springs = found.stiffness * (new - found.rest)
+        law = (regressor(new, mounted / np.linalg.norm(mounted)) @ found.moments + springs) / found.scale
+        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2)
+        wrong = np.abs(law - askew_torque(turn, new, UPRIGHT))
+        within.append([wrong < COVER * error for error in (np.hypot(left_out, found.of_axes), left_out)])
+        wide.append(found.of_axes)
+        assert np.all(identify(tour, PapersMoments(DEFAULT_LINKS), 0.0).of_axes < 1e-5)
+    covered, without = np.mean(within, axis=(0, 2))
+    assert covered.min() > 0.93 and without.min() < 0.6
+    assert np.max(wide) < 0.05  # Nm
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
