@@ -10,16 +10,17 @@ chunk's content, once decompressed, is such records again. This module extracts 
 chunk that is cut, and create an object for each message, while seven million must be read in seconds.
 """
 
+import mmap
 import re
 import shutil
 import sqlite3
 import struct
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from io import BytesIO
 from itertools import islice
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -47,6 +48,7 @@ HEAD = np.dtype(LAYOUT)  # of a message's record; the serialised message follows
 LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most
+KEPT_BATCHES = 16  # of an MCAP file, in memory at once: to release each costs more time
 CACHED_ROWS = 4_000  # of a database, at once: more leave the processor's cache before they are put together
 BLOCK = 2**20  # bytes that are decompressed at once
 REPAIRED = "_repaired"  # with which the names of complete copies end
@@ -177,9 +179,12 @@ class Storage:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
-            data = mmap(stream.fileno(), 0, access=ACCESS_READ)
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         reading = _McapFile(self, wanted)
-        yield from reading.rows(data, len(MAGIC))
+        for number, rows in enumerate(reading.rows(data, len(MAGIC)), 1):
+            yield rows
+            if number % KEPT_BATCHES == 0 and sys.platform != "win32":
+                data.madvise(mmap.MADV_DONTNEED)  # else the whole file counts as memory of this process
         if not reading.is_complete:
             where = "without an index" if reading.at == len(data) else "within a record, or is damaged"
             self.cut_short = f"{file.name} ends {where}"
@@ -228,7 +233,7 @@ class _McapFile:
         self.chosen: dict[int, Topic] = {}  # the wanted topics by channel
         self.at, self.is_complete = 0, False
 
-    def rows(self, data: bytes | mmap, at: int) -> Iterator[StoredRows]:
+    def rows(self, data: bytes | mmap.mmap, at: int) -> Iterator[StoredRows]:
         """Yield the messages among the records from `at` on, also those in chunks, up to a cut or damage."""
         end, size, unpack, buffer = len(data), RECORD.size, RECORD.unpack_from, np.frombuffer(data, np.uint8)
         found: list[int] = []  # where records of messages begin
