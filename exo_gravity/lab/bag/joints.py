@@ -15,6 +15,7 @@ from exo_gravity.lab.bag.content import JOINT_STATE
 from exo_gravity.lab.bag.layout import Batch, Decoder
 
 FIELDS = ("position", "velocity", "effort")
+GROWTH = 1.2  # by which arrays that are full become larger
 
 
 class JointSeries(NamedTuple):
@@ -30,13 +31,50 @@ class JointSeries(NamedTuple):
         return JointSeries(*(column[chosen] for column in self))
 
 
-def joined(parts: Sequence[JointSeries]) -> JointSeries:
-    """Return parts, of which there is at least one, as one."""
-    return JointSeries(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+class GrowingSeries:
+    """Messages of the same joints, in arrays that grow in place: parts that are joined in the end need twice as much.
+
+    `series` is valid until messages are added or left out.
+    """
+
+    def __init__(self, first: JointSeries) -> None:
+        self._columns = [np.array(column) for column in first]
+        self._count = len(first.ordinal)
+
+    @property
+    def series(self) -> JointSeries:
+        """The messages."""
+        return JointSeries(*(column[: self._count] for column in self._columns))
+
+    def add(self, more: JointSeries) -> None:
+        """Add messages."""
+        begin, self._count = self._count, self._count + len(more.ordinal)
+        if self._count > len(self._columns[0]):
+            self._resize(int(GROWTH * self._count))
+        for column, values in zip(self._columns, more, strict=True):
+            column[begin : self._count] = values
+
+    def leave_out(self, begin: int, left_out: np.ndarray) -> None:
+        """Forget the messages under the mask `left_out` (k,), the first of which is that of the `begin`-th message."""
+        kept = np.flatnonzero(~left_out) + begin
+        tail = slice(begin + len(left_out), self._count)
+        self._count -= len(left_out) - len(kept)
+        for column in self._columns:
+            rows = np.concatenate((column[kept], column[tail]))
+            column[begin : self._count] = rows
+
+    def trimmed(self) -> JointSeries:
+        """Return the messages, in arrays without room for more. Nothing can be added then."""
+        self._resize(self._count)
+        return self.series
+
+    def _resize(self, count: int) -> None:
+        for column in self._columns:
+            column.resize((count, *column.shape[1:]), refcheck=False)  # nothing else refers to it: see the class
 
 
 class JointArrays:
-    """Collects the joint states of one topic: `count`, and as `parts` by the joints, in order of appearance.
+    """Collects the joint states of one topic: `count`, and `by_joints`, in order of appearance.
 
     fields: those of a message that are kept.
     every: of the messages with the same joints, the first of so many is kept.
@@ -45,7 +83,7 @@ class JointArrays:
     def __init__(self, topic: str, fields: Sequence[str] = FIELDS, every: int = 1) -> None:
         self.topic, self.fields, self.every, self.count = topic, tuple(fields), every, 0
         self.decoder = Decoder(JOINT_STATE)
-        self.parts: dict[tuple[str, ...], list[JointSeries]] = {}
+        self.by_joints: dict[tuple[str, ...], GrowingSeries] = {}
         self._seen: dict[tuple[str, ...], int] = {}  # messages by their joints, also those that are not kept
 
     def add(self, ordinals: np.ndarray, batch: Batch) -> None:
@@ -69,8 +107,11 @@ class JointArrays:
                 for number, field in enumerate(self.fields):
                     if field in given:
                         values[:, number] = numbers[field]
-            part = JointSeries(ordinals[index], batch.arrival[index], stamp, values)
-            self.parts.setdefault(names, []).append(part)
+            found = JointSeries(ordinals[index], batch.arrival[index], stamp, values)
+            if names in self.by_joints:
+                self.by_joints[names].add(found)
+            else:
+                self.by_joints[names] = GrowingSeries(found)
             self.count += len(index)
 
     @property
@@ -80,7 +121,7 @@ class JointArrays:
 
     def has(self, joints: Collection[str]) -> bool:
         """Return whether some messages have all of these joints."""
-        return any(set(joints) <= set(names) for names in self.parts)
+        return any(set(joints) <= set(names) for names in self.by_joints)
 
     def arrays(self, joints: Sequence[str]) -> tuple[JointSeries, int]:
         """Return the messages that have all `joints`, in their order, and the number of those that have not.
@@ -89,17 +130,19 @@ class JointArrays:
         """
         chosen: list[JointSeries] = []
         others = 0
-        for names, parts in self.parts.items():
+        for names in [*self.by_joints]:
+            found = self.by_joints.pop(names)
             if set(joints) <= set(names):
+                series = found.trimmed()
                 order = [names.index(joint) for joint in joints]
                 is_same = names == tuple(joints)
-                chosen += parts if is_same else [part._replace(values=part.values[:, :, order]) for part in parts]
+                chosen.append(series if is_same else series._replace(values=series.values[:, :, order]))
             else:
                 others += self._seen[names]
-        self.parts = {}
         if not chosen:
             raise DataError(f"{self.topic}: no message has the joints {', '.join(joints)}")
-        series = joined(chosen)
+        columns = zip(*chosen, strict=True)
+        series = chosen[0] if len(chosen) == 1 else JointSeries(*(np.concatenate(parts) for parts in columns))
         if np.any(np.diff(series.ordinal) < 0):
             series = series.of(np.argsort(series.ordinal, kind="stable"))
         return series, others

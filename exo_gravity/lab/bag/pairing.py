@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.lab.bag.clock import Timeline, without_outliers
-from exo_gravity.lab.bag.joints import JointArrays, JointSeries, joined
+from exo_gravity.lab.bag.joints import JointArrays, JointSeries
 
 
 @dataclass(frozen=True)
@@ -74,28 +74,27 @@ class Thinning:
 
     def __init__(self) -> None:
         self._seen = 0  # commands, when this looked last
-        self._settled: dict[tuple[str, ...], int] = {}  # parts by their joints, from the first on, that stay
+        self._settled: dict[tuple[str, ...], int] = {}  # commands by their joints, from the first on, that stay
 
     def apply(self, commands: JointArrays, states: JointArrays) -> None:
         """Forget commands, if there are enough new ones."""
-        known = [part for parts in states.parts.values() for part in parts]
+        known = [growing.series for growing in states.by_joints.values()]
         if not known or commands.count - self._seen < PAIRING.pending:
             return
         self._seen = commands.count
-        instants = _clocks(joined(known))
-        newest = max(known, key=lambda part: int(part.ordinal[-1]))
+        instants = [np.concatenate(clock) for clock in zip(*map(_clocks, known), strict=True)]
+        newest = max(known, key=lambda series: int(series.ordinal[-1]))
         settled_before = int(_known_arrival(newest)[-1]) - 2 * PAIRING.clock_offset
-        for names, parts in commands.parts.items():
-            first = self._settled.get(names, 0)
-            series = joined(parts[first:])
-            clocks = _clocks(series)
+        for names, growing in commands.by_joints.items():
+            begin = self._settled.get(names, 0)
+            clocks = _clocks(growing.series.of(slice(begin, None)))
             is_new = np.maximum(*clocks) >= settled_before
             count = int(np.argmax(is_new)) if is_new.any() else len(is_new) - 1
             needed = np.zeros(count, bool)
             for sent, of_states in zip(clocks, instants, strict=True):
                 needed |= _is_needed(sent[: count + 1], of_states)
-            parts[first:] = [series.of(slice(count)).of(needed), series.of(np.arange(count, len(is_new)))]
-            self._settled[names] = first + 1
+            growing.leave_out(begin, ~needed)
+            self._settled[names] = begin + int(needed.sum())
 
 
 def _is_needed(sent: np.ndarray, states: np.ndarray) -> np.ndarray:
