@@ -184,7 +184,8 @@ class Storage:
         for number, rows in enumerate(reading.rows(data, len(MAGIC)), 1):
             yield rows
             if number % KEPT_BATCHES == 0 and sys.platform != "win32":
-                data.madvise(mmap.MADV_DONTNEED)  # else the whole file counts as memory of this process
+                with suppress(OSError):  # of a process whose memory is locked
+                    data.madvise(mmap.MADV_DONTNEED)  # else the whole file counts as memory of this process
         if not reading.is_complete:
             where = "without an index" if reading.at == len(data) else "within a record, or is damaged"
             self.cut_short = f"{file.name} ends {where}"
