@@ -208,7 +208,7 @@ class Storage:
                         return
                     yield from self._whole(found, chosen)
                     found = []
-            except sqlite3.Error as error:  # the rows before the damage are kept
+            except (sqlite3.Error, UnicodeDecodeError) as error:  # the rows before the damage are kept
                 self.cut_short = f"{file.name} {error}"
             yield from self._whole(found, chosen)
 
@@ -430,6 +430,9 @@ def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int
         database.text_factory = lambda data: data.decode(errors="replace")
         rows = database.execute("SELECT id, name, type FROM topics").fetchall()
         database.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").fetchall()
+    except UnicodeDecodeError as error:  # sqlite3 decodes its messages, which name what is damaged
+        database.close()
+        raise sqlite3.DatabaseError(str(error)) from None
     except sqlite3.Error:
         database.close()
         raise
