@@ -195,7 +195,7 @@ class Storage:
             try:
                 database, topics = _open_database(file, stack)
             except (sqlite3.Error, OSError) as error:
-                raise DataError(f"{file}: not a rosbag2 database ({error})") from None
+                raise DataError(f"{file}: not a rosbag2 database ({_one_line(error)})") from None
             self.topics.update(topics.values())
             chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
@@ -209,7 +209,7 @@ class Storage:
                     yield from self._whole(found, chosen)
                     found = []
             except (sqlite3.Error, UnicodeDecodeError) as error:  # the rows before the damage are kept
-                self.cut_short = f"{file.name} {error}"
+                self.cut_short = f"{file.name} {_one_line(error)}"
             yield from self._whole(found, chosen)
 
     def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[StoredRows]:
@@ -438,6 +438,11 @@ def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int
         raise
     stack.callback(database.close)
     return database, {key: (str(topic), str(kind)) for key, topic, kind in rows}
+
+
+def _one_line(error: Exception) -> str:
+    """Return the text of an error, which may quote several lines of a damaged file."""
+    return " ".join(str(error).split())
 
 
 def _natural(path: Path) -> list[int | str]:

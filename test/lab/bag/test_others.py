@@ -180,11 +180,15 @@ def test_the_timeline_keeps_the_order_of_the_file_and_the_length_of_each_part():
 # Files
 
 
-def test_a_database_whose_tables_are_damaged_is_refused_in_one_sentence(tmp_path):
+@pytest.mark.parametrize(
+    ("was", "becomes"), [(b"CREATE TABLE topics", b"CREA\xccE TABLE topics"), (b"data BLOB NOT", b"data BLOB`NOT")]
+)
+def test_a_database_whose_tables_are_damaged_is_refused_in_one_sentence(tmp_path, was, becomes):
     file = made.write_bag(tmp_path / "bag", CONTENT, StoragePlugin.SQLITE3) / "bag.db3"
-    file.write_bytes(file.read_bytes().replace(b"CREATE TABLE topics", b"CREA\xccE TABLE topics"))
-    with pytest.raises(DataError, match="not a rosbag2 database"):
+    file.write_bytes(file.read_bytes().replace(was, becomes))
+    with pytest.raises(DataError, match="not a rosbag2 database") as raised:
         read_bag(file)
+    assert "\n" not in str(raised.value)
 
 
 def test_of_two_files_that_hold_the_same_the_one_that_the_metadata_name_is_read(tmp_path):
