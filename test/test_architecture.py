@@ -178,3 +178,16 @@ def test_what_serves_real_arms_needs_no_simulator() -> None:
     imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
     program = f"import sys; sys.modules['mujoco'] = None; {imports}"
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)
+
+
+@pytest.mark.parametrize(
+    ("modules", "later"),
+    [
+        (("core.compensation.compensator", "core.safety.machine", "hardware.urdf_arm"), "importlib.metadata"),
+        (("tools.report", "lab.report.cohort", "lab.report.trial_report"), "matplotlib"),
+    ],
+)
+def test_a_start_does_not_wait_for_what_is_only_used_later(modules: tuple[str, ...], later: str) -> None:
+    imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
+    program = f"import sys; sys.modules[{later!r}] = None; {imports}"
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)

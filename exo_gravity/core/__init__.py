@@ -1,11 +1,18 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument)."""
+"""The mathematics: standard library and NumPy only. No ROS, no input or output, no clock (time is an argument).
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
-from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.laws import LAWS
+The names are imported when they are used: a node or a tool imports only what it needs from the modules below.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+    from exo_gravity.core.arm.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+    from exo_gravity.core.arm.tilt import Tilt
+    from exo_gravity.core.arm.wearer import Wearer
+    from exo_gravity.core.compensation.laws import LAWS
 
 __all__ = [
     "LAWS",
@@ -17,3 +24,22 @@ __all__ = [
     "paper_mobile_torque",
     "paper_static_torque",
 ]
+MODULES = {
+    "arm.arm": ("STANDARD_GRAVITY", "ArmModel"),
+    "arm.gravity": ("gravity_torque", "paper_mobile_torque", "paper_static_torque"),
+    "arm.tilt": ("Tilt",),
+    "arm.wearer": ("Wearer",),
+    "compensation.laws": ("LAWS",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__} has no attribute {name}")
+
+
+def __dir__() -> list[str]:
+    """Return the names, also those not imported yet: the documents list what is here."""
+    return __all__

@@ -22,7 +22,6 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 
@@ -63,6 +62,8 @@ Stopping = threading.Event
 
 def node_modules() -> dict[str, str]:
     """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
+    from importlib.metadata import PackageNotFoundError, distribution  # slow to import
+
     try:
         scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
     except PackageNotFoundError:

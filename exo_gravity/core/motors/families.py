@@ -9,7 +9,6 @@ on: an ordinary start does not pay for them.
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from importlib.metadata import entry_points
 from typing import TypeVar
 
 from exo_gravity.core.errors import DataError, ParameterError
@@ -59,6 +58,8 @@ def _joined(of: Callable[[Family], Mapping[str, Item]], families: tuple[Family, 
 @cache
 def others() -> tuple[Family, ...]:
     """Return the families of other distributions. Raises DataError that names the entry point that does not work."""
+    from importlib.metadata import entry_points  # slow to import
+
     found: list[Family] = []
     for entry in entry_points(group=GROUP):
         try:

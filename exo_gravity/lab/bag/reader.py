@@ -1,10 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A rosbag2 recording -> the arrays of each arm, its script, faults and parameters.
 
-An arm is a namespace with a `joint_states` topic. Each of its `effort_commands` carries the stamp of the joint state
-that it answers, so each joint state is paired with the last command that answers an earlier one. Time is that of the
-header stamps; where these run backwards or are far from the recorder's clock, it is the time of arrival. Whether an arm
-was carried comes from the key `state` of its can_bridge on /diagnostics, never from the text.
+An arm is a namespace with a `joint_states` topic. Each joint state is paired with the command that was in force. Time
+is that of the header stamps; where these run backwards or are far from the recorder's clock, it is the time of arrival.
+Whether an arm was carried comes from the key `state` of its can_bridge on /diagnostics, never from the text.
 """
 
 import json
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
@@ -25,7 +25,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
-from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline, without_outliers
+from exo_gravity.lab.bag.clock import CLOCK, Timeline, timeline
 from exo_gravity.lab.bag.content import (
     BRIDGE,
     COMMANDS,
@@ -40,21 +40,11 @@ from exo_gravity.lab.bag.content import (
 )
 from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
+from exo_gravity.lab.bag.pairing import Thinning, arrival_of, clocks_of, efforts_in_force
 from exo_gravity.lab.bag.storage import Storage, StoredRows
+from exo_gravity.lab.inputs.parameter_file import Loader
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
-
-
-@dataclass(frozen=True)
-class Pairing:
-    """Which messages belong together."""
-
-    command_age: int = 200_000_000  #: ns; an older command is no longer in force
-    clock_offset: int = 1_000_000_000  #: ns between stamp and arrival
-    state_gap: float = 1.0  #: s; can_bridge reports its state twice a second, except while it ends
-
-
-PAIRING = Pairing()
 
 
 @dataclass(frozen=True)
@@ -66,6 +56,7 @@ class Plausible:
 
 
 PLAUSIBLE = Plausible()
+STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
 
@@ -80,9 +71,7 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
     Raises DataError, one sentence, if there is nothing to report: no recording, an empty one, or no arm in it.
     """
     storage, contents = Storage(path), _Contents(every)
-    for rows in storage.rows(content.is_wanted):
-        contents.add(rows)
-    contents.conclude(storage)
+    contents.read(storage)
     states = sorted(name for name, joints in contents.joints.items() if leaf(name) == STATES and joints.count)
     if not states and not contents.problems:
         problem = (
@@ -99,7 +88,7 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
     start = min(int(line.times(one.ordinal, one.arrival).min()) for one in series.values())
     contents.note_steps(line, start)
     seconds = _Seconds(line, start)
-    recordings = tuple(r for name, one in series.items() if (r := contents.recording(name, one, seconds)))
+    recordings = tuple(r for name in [*series] if (r := contents.recording(name, series.pop(name), seconds)))
     if not recordings:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
     if contents.losses:
@@ -196,6 +185,7 @@ class _Contents:
         self.problems: list[str] = []
         self.is_cut = False  # the file was cut short
         self.is_partial = False  # it was, or an arm was not down at the end
+        self._thinnings: dict[str, Thinning] = {}  # of an arm's commands, by the topic of its joint states
         self._names: dict[str, tuple[str, ...]] = {}  # of an arm's joints, by the topic of its joint states
         self._count = 0  # of the messages so far
         self._damaged: dict[str, int] = {}  # messages by topic
@@ -204,7 +194,7 @@ class _Contents:
         self._states: dict[str, list[tuple[Row, str]]] = {}  # by arm: row, state
         self._last: dict[str, tuple[int, str]] = {}  # node -> level and text of its last status
 
-    def add(self, rows: StoredRows) -> None:
+    def _add_rows(self, rows: StoredRows) -> None:
         """Add messages. A topic with an invalid message becomes a problem, and its rest is ignored."""
         for (topic, msgtype), chosen, batch in rows.by_topic():
             ordinals = self._count + chosen
@@ -218,6 +208,9 @@ class _Contents:
             elif topic not in self._unreadable:
                 self._add_messages(topic, msgtype, ordinals, batch)
         self._count += len(rows.topic)
+        for states, joints in self.joints.items() if self.every > 1 else ():
+            if leaf(states) == STATES:
+                self._thinnings.setdefault(states, Thinning()).apply(self._commands_of(states), joints)
 
     def _add_messages(self, topic: str, msgtype: str, ordinals: np.ndarray, batch: Batch) -> None:
         for *row, data in zip(ordinals.tolist(), batch.arrival.tolist(), batch.messages(), strict=True):
@@ -233,8 +226,10 @@ class _Contents:
                 self.problems.append(str(error))
                 return
 
-    def conclude(self, storage: Storage) -> None:
-        """Note what the files lack, and which messages are damaged."""
+    def read(self, storage: Storage) -> None:
+        """Add the messages of a recording. Note what the files lack, and which messages are damaged."""
+        for rows in storage.rows(content.is_wanted):
+            self._add_rows(rows)
         self.notes += storage.notes
         if storage.cut_short:
             self.is_partial = self.is_cut = True
@@ -280,7 +275,7 @@ class _Contents:
         if others:
             self.notes.append(f"{topic}: messages of other joints left out: {others}; a topic of their own is better")
         self._names[topic] = names
-        return series._replace(arrival=_arrival(series))
+        return series._replace(arrival=arrival_of(series))
 
     def note_steps(self, line: Timeline, start: int) -> None:
         """Note the steps of the clock."""
@@ -320,8 +315,11 @@ class _Contents:
             except (ValueError, TypeError, ParameterError):
                 raise DataError(f"{topic}: invalid session") from None
         else:
-            node, _, text = message.data.partition(":")
-            self.parameters[node.strip()] = f"{node}:{text}"
+            node = message.data.partition(":")[0].strip()
+            if _has_parameters(message.data, node):
+                self.parameters[node] = message.data
+            else:
+                self._damaged[topic] = self._damaged.get(topic, 0) + 1
 
     def _add_status(self, row: Row, status: Any) -> None:
         level, values = int(status.level), {entry.key: entry.value for entry in status.values}
@@ -343,13 +341,16 @@ class _Contents:
     def recording(self, topic: str, series: JointSeries, seconds: _Seconds) -> Recording | None:
         """Return the arm whose joint states are on `topic`; None if it is unreadable, which is a problem."""
         name, names = arm_of(topic), self._names[topic]
-        arrival, stamp, near = _clocks(series, seconds.line)
-        order = np.argsort(arrival, kind="stable")
-        arrival, stamp, values = arrival[order], stamp[order], series.values[order]
+        arrival, stamp, near = clocks_of(series, seconds.line)
+        values = series.values
+        if np.any(np.diff(arrival) < 0):
+            order = np.argsort(arrival, kind="stable")
+            arrival, stamp, values = arrival[order], stamp[order], values[order]
         kept = self._plausible(name, names, values[:, FIELDS.index("position")])
         if kept is None:
             return None
-        arrival, stamp, values = arrival[kept], stamp[kept], values[kept]
+        if not kept.all():
+            arrival, stamp, values = arrival[kept], stamp[kept], values[kept]
         stamped = near > 0.5 and bool(np.all(np.diff(stamp) >= -CLOCK.back))
         clock = np.maximum.accumulate(stamp) if stamped else arrival
         command, steps = self._commands(topic, names, clock, stamped, seconds.line), self._script(name, seconds)
@@ -386,24 +387,18 @@ class _Contents:
         self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool, line: Timeline
     ) -> np.ndarray:
         """Return the effort (n, joints) that was in force at each time of `clock`, NaN where there was none."""
-        result = np.full((len(clock), len(names)), np.nan, np.float32)
+        unknown = np.full((len(clock), len(names)), np.nan, np.float32)
         commands = self._commands_of(states)
         if not commands.count:
             self.notes.append(f"{commands.topic} was not recorded: the torque error is unknown")
-            return result
+            return unknown
         if not commands.has(names):
             problem = f"joint names differ: {', '.join(commands.names)}; {states} has {', '.join(names)}"
             self.problems.append(f"{commands.topic}: {problem}: the torque error is unknown")
-            return result
+            return unknown
         series, _ = commands.arrays(names)
-        arrival, stamp, _ = _clocks(series._replace(arrival=_arrival(series)), line)
-        sent = stamp if stamped else arrival
-        order = np.argsort(sent, kind="stable")
-        sent, effort = sent[order], series.values[order, 0]
-        last = np.searchsorted(sent, clock, "left") - 1
-        known = (last >= 0) & (clock - sent[last] < PAIRING.command_age)
-        result[known] = effort[last[known]]
-        return result
+        arrival, stamp, _ = clocks_of(series._replace(arrival=arrival_of(series)), line)
+        return efforts_in_force(stamp if stamped else arrival, series.values[:, 0], clock)
 
     def _script(self, arm: str, seconds: _Seconds) -> tuple[ScriptedStep, ...]:
         """Return the script steps of an arm; each ends when the next one begins, at the latest."""
@@ -423,9 +418,9 @@ class _Contents:
         groups = [list(group) for carried, group in groupby(states, lambda state: state[1] in CARRIED) if carried]
         spans = [(group[0][0], group[-1][0]) for group in groups]
         time, last = states[-1]
-        if last in CARRIED and 0.0 < end - time < PAIRING.state_gap:
+        if last in CARRIED and 0.0 < end - time < STATE_GAP:
             spans[-1] = spans[-1][0], end
-        if self.is_cut or end - time < PAIRING.state_gap:  # else the joint states go on: they show the way down
+        if self.is_cut or end - time < STATE_GAP:  # else the joint states go on: they show the way down
             if last in CARRIED:
                 missing = "while the arm is carried: it does not show how the arm was let down"
             else:
@@ -436,20 +431,12 @@ class _Contents:
         return tuple(spans)
 
 
-def _arrival(series: JointSeries) -> np.ndarray:
-    """Return times of arrival in ns, the stamp where that of arrival is unknown."""
-    return without_outliers(np.where(series.arrival > 0, series.arrival, np.maximum(series.stamp, 0)))
-
-
-def _clocks(series: JointSeries, line: Timeline) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times of arrival (n,) and stamps (n,) in ns on the timeline, and the share of stamps that are near.
-
-    A stamp that is far from the recorder's clock is replaced by the time of arrival.
-    """
-    arrival = line.times(series.ordinal, series.arrival)
-    stamp = series.stamp + line.offset[line.part(series.ordinal)]
-    near = np.abs(arrival - stamp) < PAIRING.clock_offset
-    return arrival, np.where(near, stamp, arrival), float(near.mean())
+def _has_parameters(text: str, node: str) -> bool:
+    """Return whether a text is YAML with the parameters of `node`."""
+    try:
+        return {*map(type, yaml.load(text, Loader)[node]["ros__parameters"].keys())} <= {str}
+    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError):
+        return False
 
 
 def _value(value: Any) -> object:

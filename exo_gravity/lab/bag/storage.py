@@ -10,16 +10,17 @@ chunk's content, once decompressed, is such records again. This module extracts 
 chunk that is cut, and create an object for each message, while seven million must be read in seconds.
 """
 
+import mmap
 import re
 import shutil
 import sqlite3
 import struct
+import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from io import BytesIO
 from itertools import islice
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -47,6 +48,7 @@ HEAD = np.dtype(LAYOUT)  # of a message's record; the serialised message follows
 LEAST = HEAD.itemsize - RECORD.size  # bytes of a message's content; fewer are damage
 LARGEST = 256 * 2**20  # bytes of a chunk or message; more is damage
 ROWS = 20_000  # messages in a batch, at most
+KEPT_BATCHES = 16  # of an MCAP file, in memory at once: to release each costs more time
 CACHED_ROWS = 4_000  # of a database, at once: more leave the processor's cache before they are put together
 BLOCK = 2**20  # bytes that are decompressed at once
 REPAIRED = "_repaired"  # with which the names of complete copies end
@@ -177,9 +179,13 @@ class Storage:
         with file.open("rb") as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise DataError(f"{file}: not an MCAP file, or empty")
-            data = mmap(stream.fileno(), 0, access=ACCESS_READ)
+            data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         reading = _McapFile(self, wanted)
-        yield from reading.rows(data, len(MAGIC))
+        for number, rows in enumerate(reading.rows(data, len(MAGIC)), 1):
+            yield rows
+            if number % KEPT_BATCHES == 0 and sys.platform != "win32":
+                with suppress(OSError):  # of a process whose memory is locked
+                    data.madvise(mmap.MADV_DONTNEED)  # else the whole file counts as memory of this process
         if not reading.is_complete:
             where = "without an index" if reading.at == len(data) else "within a record, or is damaged"
             self.cut_short = f"{file.name} ends {where}"
@@ -189,7 +195,7 @@ class Storage:
             try:
                 database, topics = _open_database(file, stack)
             except (sqlite3.Error, OSError) as error:
-                raise DataError(f"{file}: not a rosbag2 database ({error})") from None
+                raise DataError(f"{file}: not a rosbag2 database ({_one_line(error)})") from None
             self.topics.update(topics.values())
             chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
@@ -202,8 +208,8 @@ class Storage:
                         return
                     yield from self._whole(found, chosen)
                     found = []
-            except sqlite3.Error as error:  # the rows before the damage are kept
-                self.cut_short = f"{file.name} {error}"
+            except (sqlite3.Error, UnicodeDecodeError) as error:  # the rows before the damage are kept
+                self.cut_short = f"{file.name} {_one_line(error)}"
             yield from self._whole(found, chosen)
 
     def _whole(self, found: Sequence[tuple[Any, Any, Any]], chosen: Mapping[int, Topic]) -> Iterator[StoredRows]:
@@ -228,7 +234,7 @@ class _McapFile:
         self.chosen: dict[int, Topic] = {}  # the wanted topics by channel
         self.at, self.is_complete = 0, False
 
-    def rows(self, data: bytes | mmap, at: int) -> Iterator[StoredRows]:
+    def rows(self, data: bytes | mmap.mmap, at: int) -> Iterator[StoredRows]:
         """Yield the messages among the records from `at` on, also those in chunks, up to a cut or damage."""
         end, size, unpack, buffer = len(data), RECORD.size, RECORD.unpack_from, np.frombuffer(data, np.uint8)
         found: list[int] = []  # where records of messages begin
@@ -424,11 +430,19 @@ def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int
         database.text_factory = lambda data: data.decode(errors="replace")
         rows = database.execute("SELECT id, name, type FROM topics").fetchall()
         database.execute("SELECT topic_id, timestamp, data FROM messages LIMIT 1").fetchall()
+    except UnicodeDecodeError as error:  # sqlite3 decodes its messages, which name what is damaged
+        database.close()
+        raise sqlite3.DatabaseError(str(error)) from None
     except sqlite3.Error:
         database.close()
         raise
     stack.callback(database.close)
     return database, {key: (str(topic), str(kind)) for key, topic, kind in rows}
+
+
+def _one_line(error: Exception) -> str:
+    """Return the text of an error, which may quote several lines of a damaged file."""
+    return " ".join(str(error).split())
 
 
 def _natural(path: Path) -> list[int | str]:

@@ -14,7 +14,7 @@ from rich.markup import escape as marked
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Bag, Event
-from exo_gravity.lab.report import figures, html, table, wearer_share
+from exo_gravity.lab.report import html, table, wearer_share
 from exo_gravity.lab.report.verdict import EARLY, Conditions, Report
 from exo_gravity.lab.source import STATEMENTS
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
@@ -74,6 +74,8 @@ def write(
 
     Raises DataError if the folder can't be written.
     """
+    from exo_gravity.lab.report import figures  # not for the rows of many recordings: half of a process's start
+
     folder = Path(folder)
     sections: list[str] = []
     try:

@@ -6,7 +6,6 @@ leads to a class like `ak.SimulatedMotor`, whose arguments are a joint's motor, 
 """
 
 from collections.abc import Mapping
-from importlib.metadata import entry_points
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors import ak as ak_family
@@ -27,6 +26,8 @@ def class_of(family: str) -> type[SimulatedMotor]:
     """Return what simulates the motors of a family. Raises ParameterError if nothing does."""
     if family in OURS:
         return OURS[family]
+    from importlib.metadata import entry_points  # slow to import
+
     for entry in entry_points(group=GROUP, name=family):
         found: type[SimulatedMotor] = entry.load()
         return found

@@ -8,6 +8,7 @@ import pytest
 
 from exo_gravity.lab.bag.content import NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.lab.report.trial_report import analyse
 
 from ...support import synthetic_bags as made
 
@@ -75,3 +76,12 @@ def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content,
         NodeStatus("right/can_bridge", 0, "fine", "none", ""),
     ]
     assert found.parameters == {"/right/compensator": snapshot}
+
+
+@pytest.mark.parametrize(
+    "rest", [":\n  ros__parameters: {law: a: b}\n", ":\n  ros__parameters: 1\n", ""], ids=str.split
+)
+def test_damaged_parameters_are_left_out_and_the_recording_is_reported(content, tmp_path, rest):
+    found = read(content, tmp_path, made.text_entry("/recorder/parameters", 1.0, f"/right/compensator{rest}"))
+    assert not found.parameters and analyse(found).arms
+    assert "/recorder/parameters: damaged messages left out: 1" in found.notes

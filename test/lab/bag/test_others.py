@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.clock import timeline, without_outliers
+from exo_gravity.lab.bag.pairing import PAIRING
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.report.trial_report import analyse
 from exo_gravity.lab.trial.recording import in_blocks
@@ -24,7 +26,7 @@ from ...support import synthetic_bags as made
 SECOND = 10**9
 DAY = 86_400 * SECOND
 RATE = 50.0  # Hz
-STATES = "/right/joint_states"
+STATES, COMMANDS = "/right/joint_states", "/right/effort_commands"
 TRIAL = made.trial(made.POSES, hold=6.0, rate=RATE)
 CONTENT = [
     *made.messages(TRIAL),
@@ -61,6 +63,19 @@ def with_clock(shift, at=5.0):
         yield topic, kind, stamp + shift, data
 
 
+def unstamped(data):
+    """A joint state whose publisher does not set the stamp."""
+    message = made.STORE.deserialize_cdr(data, made.JOINT_STATE)
+    message.header.stamp.sec = message.header.stamp.nanosec = 0
+    return bytes(made.STORE.serialize_cdr(message, made.JOINT_STATE))
+
+
+def timed(bag):
+    """The recording of the only arm of a bag, and its times (n,) in ns since 1970."""
+    (recording,) = bag.recordings
+    return recording, bag.start + np.rint(recording.time * 1e9).astype(np.int64)
+
+
 def report_of(path):
     report = analyse(read_bag(path))
     return report, report.bag.recordings[0], report.arms[0][1]
@@ -95,14 +110,61 @@ def test_impossible_times_of_arrival_do_not_move_the_arm(tmp_path, time, share):
     assert arm.time[-1] < TRIAL.time[-1] + 1.0
 
 
-def test_a_file_in_another_order_than_that_of_arrival_is_sorted(tmp_path):
+def shuffled():
+    """The content in eight parts, in an order of their own."""
     parts = np.array_split(np.arange(len(CONTENT)), 8)
-    content = [CONTENT[k] for part in np.random.default_rng(1).permutation(8) for k in parts[part]]
-    by_topic = sorted(CONTENT, key=lambda entry: entry[0])
-    for number, order in enumerate((content, by_topic)):
+    return [CONTENT[k] for part in np.random.default_rng(1).permutation(8) for k in parts[part]]
+
+
+def by_topic(backwards=False):
+    """The content topic by topic: efforts, then joint states, or the other way round."""
+    return sorted(CONTENT, key=lambda entry: entry[0], reverse=backwards)
+
+
+def test_a_file_in_another_order_than_that_of_arrival_is_sorted(tmp_path):
+    for number, order in enumerate((shuffled(), by_topic())):
         report, arm, _ = report_of(bag_in_order(tmp_path / str(number), order))
         made.assert_same(arm, TRIAL)
         assert not report.failures and not [note for note in report.notes if "clock" in note]
+
+
+def late_and_lost():
+    """The content with a third of the commands lost, and with the others up to 0.1 s late."""
+    rng = np.random.default_rng(3)
+    kept = []
+    for topic, kind, stamp, data in CONTENT:
+        late = int(rng.integers(SECOND // 10)) if topic == COMMANDS else 0
+        if topic != COMMANDS or rng.random() > 1 / 3:
+            kept.append((topic, kind, stamp + late, data))
+    return sorted(kept, key=lambda entry: entry[2])
+
+
+ORDERS = {
+    "as recorded": CONTENT,
+    "late and lost": late_and_lost(),
+    "without stamps": [
+        (*rest, unstamped(data)) if rest[1] == made.JOINT_STATE else (*rest, data) for *rest, data in CONTENT
+    ],
+    "shuffled": shuffled(),
+    "efforts first": by_topic(),
+    "joint states first": by_topic(backwards=True),
+}
+CLOCKS = {f"clock set by {shift} s": [*with_clock(shift * SECOND)] for shift in (-5, 3600)}
+
+
+@pytest.mark.parametrize("name", [*ORDERS, *CLOCKS])
+def test_where_one_of_several_samples_is_kept_each_has_the_command_that_was_in_force(tmp_path, monkeypatch, name):
+    monkeypatch.setattr("exo_gravity.lab.bag.storage.ROWS", 50)
+    monkeypatch.setattr("exo_gravity.lab.bag.pairing.PAIRING", replace(PAIRING, pending=100))
+    path = bag_in_order(tmp_path / "bag", {**ORDERS, **CLOCKS}[name])
+    (whole, times), (thinned, kept) = (timed(read_bag(path, every)) for every in (1, 7))
+    same = np.searchsorted(times, kept) if name in ORDERS else np.arange(0, len(times), 7)
+    np.testing.assert_array_equal(thinned.position, whole.position[same])
+    known, expected = np.isfinite(thinned.command), whole.command[same]
+    np.testing.assert_array_equal(thinned.command[known], expected[known])
+    joints = thinned.command.shape[1]  # a step of the clock is only known to a sample that is kept: that one has none
+    assert np.isfinite(expected).sum() - known.sum() == (joints if name in CLOCKS else 0)
+    assert known.mean() > 0.9
 
 
 def test_the_timeline_keeps_the_order_of_the_file_and_the_length_of_each_part():
@@ -116,6 +178,17 @@ def test_the_timeline_keeps_the_order_of_the_file_and_the_length_of_each_part():
 
 
 # Files
+
+
+@pytest.mark.parametrize(
+    ("was", "becomes"), [(b"CREATE TABLE topics", b"CREA\xccE TABLE topics"), (b"data BLOB NOT", b"data BLOB`NOT")]
+)
+def test_a_database_whose_tables_are_damaged_is_refused_in_one_sentence(tmp_path, was, becomes):
+    file = made.write_bag(tmp_path / "bag", CONTENT, StoragePlugin.SQLITE3) / "bag.db3"
+    file.write_bytes(file.read_bytes().replace(was, becomes))
+    with pytest.raises(DataError, match="not a rosbag2 database") as raised:
+        read_bag(file)
+    assert "\n" not in str(raised.value)
 
 
 def test_of_two_files_that_hold_the_same_the_one_that_the_metadata_name_is_read(tmp_path):

@@ -10,6 +10,8 @@ import itertools
 import json
 import re
 import shutil
+import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.pairing import PAIRING
 from exo_gravity.lab.bag.reader import read_bag
 
 from ...support import synthetic_bags as made
@@ -222,3 +225,26 @@ def test_one_of_several_samples_is_kept_of_each_arm_each_with_the_command_that_w
     (whole,), (thinned,) = (read_bag(bag, every).recordings for every in (1, 7))
     for field in ("time", "position", "velocity", "effort", "command"):
         np.testing.assert_array_equal(getattr(thinned, field), getattr(whole, field)[::7])
+
+
+def test_memory_follows_the_samples_that_are_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("exo_gravity.lab.bag.storage.ROWS", 500)
+    monkeypatch.setattr("exo_gravity.lab.bag.pairing.PAIRING", replace(PAIRING, pending=500))
+    bags = []
+    for minutes in (1, 2):
+        exact = made.still(made.POSES[0], 60.0 * minutes, rate=100.0)
+        recording = made.measured(exact, rate=100.0)
+        bags.append(made.write_bag(tmp_path / str(minutes), made.messages(recording)))
+
+    def bytes_a_sample(every):
+        peaks = []
+        for bag in bags:
+            tracemalloc.start()
+            read_bag(bag, every)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            tracemalloc.stop()
+        return (peaks[1] - peaks[0]) / 6000
+
+    read_bag(bags[0])  # what is imported and kept for all recordings
+    assert 100.0 < bytes_a_sample(1) < 400.0  # of the two messages of a sample, which have 470 bytes
+    assert bytes_a_sample(50) < 20.0
