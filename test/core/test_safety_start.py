@@ -272,9 +272,10 @@ class Joint:
             effort = self.check.effort[0]
             self.pushes.append(effort)
             yielding = effort - max(-self._friction, min(self._friction, effort))
-            self._position += (0.2 * yielding + self._hand(self._now)) * PERIOD
+            velocity = 0.2 * yielding + self._hand(self._now)
+            self._position += velocity * PERIOD
             self._now += PERIOD
-            sample = reading(position=self._position, effort=effort, time=self._now)
+            sample = reading(position=self._position, velocity=velocity, effort=effort, time=self._now)
             fault = self.check.step(PERIOD, (sample,) * 4, (0.0,) * 4)
             if fault or self.check.done:
                 return fault
@@ -303,6 +304,13 @@ def test_a_wearer_who_keeps_moving_the_joint_is_asked_to_hold_still_and_then_ref
     fault = joint.run(60.0)
     assert fault is not None and fault.code == "sign_unproven"
     assert "hold still" in fault.reason
+
+
+def test_a_joint_that_a_hand_shakes_is_not_pushed_on_and_on():
+    joint = Joint(hand=lambda now: (0.2 if now % 0.04 < 0.02 else -0.2) if now > 0.3 else 0.0)
+    fault = joint.run(60.0)
+    assert fault is not None and fault.code == "sign_unproven"
+    assert max(map(abs, joint.pushes)) < FRICTION
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
