@@ -64,7 +64,6 @@ class Bound(NamedTuple):
 
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
-REVERSED = Bound(3.2, 0.1)
 
 
 class Kind(NamedTuple):
@@ -162,7 +161,7 @@ KINDS = {
     "bus_silent": Kind("hardware", lasting(0.05, 5.0), REPLIES_LOST),
     "encoder_slip": Kind("hardware", slip),
     "wrong_speed": Kind("hardware", wrong_speed),
-    "torque_reversed": Kind("hardware", on_joint(), REVERSED),
+    "torque_reversed": Kind("hardware", on_joint()),
     "motor_error": Kind("hardware", on_joint(code=(5, 2))),
     "motor_warms": Kind("hardware", on_joint(most=(76.0, 90.0)), CLAMPED),
     "stall": Kind("computer", lasting(0.02, 0.5)),
@@ -244,6 +243,4 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     clamped: whether the compensator or the bridge had to clamp a torque.
     """
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
-    if REVERSED in bounds and all(bound in (REVERSED, Bound()) for bound in bounds):
-        return REVERSED
     return Bound(max(bound.speed for bound in bounds), max(bound.energy for bound in bounds))

@@ -23,7 +23,7 @@ from exo_gravity.core.motors.frames import MotorSpec
 MAX_SPEED = 1.0  # rad/s, of every joint
 MAX_EFFORT_RATE = 50.0  # Nm/s
 HAND_OFF = 0.1  # s after the wearer lets go
-MAX_WORK = 0.3  # J that one motor may put into the arm after a fault
+MAX_ENERGY = 0.3  # J that one motor may give its joint in one stretch
 MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
 COAST = 0.02  # s for which a motor may stop driving within a stretch: a light arm is thrown and caught by turns
@@ -114,10 +114,9 @@ class Response:
     reaction: s until every motor that can be reached is off or applies damping, None if one never does. top_speed:
     rad/s of `fastest` (joint 1..n), and driven: rad/s, both without the wearer's part. largest_step: Nm of a motor's
     torque within 1 ms, apart from damping times speed; switching off counts. excess: Nm by which the worst step exceeds
-    what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. work: J that the busiest motor
-    put into the arm while no hand was on it. power: W, and damping, as in `Driven`. off: s until the last motor was
-    off, None if one is on at the end. re_enabled: whether a motor was switched on after all had been off. gap: s, the
-    longest time without a record.
+    what `MAX_EFFORT_RATE` allows for the frames that the motor received in that time. energy: J in one stretch, power:
+    W, and damping, as in `Driven`. off: s until the last motor was off, None if one is on at the end. re_enabled:
+    whether a motor was switched on after all had been off. gap: s, the longest time without a record.
     """
 
     reaction: float | None = None
@@ -126,7 +125,7 @@ class Response:
     fastest: int = 0
     largest_step: float = 0.0
     excess: float = 0.0
-    work: float = 0.0
+    energy: float = 0.0
     power: float = 0.0
     damping: float = 0.0
     off: float | None = None
@@ -153,7 +152,7 @@ def measure(
     since = records["time"] - fault_time
     after = since >= 0.0
     on = records["on"] & after[:, None]
-    is_free, speed, gained = _gained(records)
+    _, speed, gained = _gained(records)
     for of_joints in (speed, gained):
         of_joints[~after] = 0.0
         of_joints[:, list(unpowered)] = 0.0
@@ -170,7 +169,7 @@ def measure(
         fastest=int(np.argmax(speed.max(axis=0, initial=0.0))) + 1,
         largest_step=float(step.max(initial=0.0)),
         excess=float(excess.max(initial=0.0)),
-        work=float(_work(records, after & is_free).max(initial=0.0)),
+        energy=whole.energy,
         power=whole.power,
         damping=whole.damping,
         off=None if off_at >= len(records) else max(0.0, float(since[off_at])),
@@ -217,9 +216,3 @@ def _steps(records: np.ndarray, period: float, motors: Sequence[MotorSpec]) -> t
     step[switched_off] = np.abs(records["torque"][:-1])[switched_off]
     frames = np.maximum(1, np.diff(records["frames"].astype(int), axis=0))
     return step, step - (MAX_EFFORT_RATE * period * frames + codes)
-
-
-def _work(records: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the work (4,) in J that each motor put into the arm; braking does not offset it."""
-    power = np.maximum(0.0, records["torque"] * records["velocity"])[after]
-    return np.asarray(power.T @ _lasting(records)[after])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from exo_gravity.core.safety.drive import Fault, FaultCode, Send, State
-from exo_gravity.core.safety.gate import SIGN_PUSH, SWITCH_ON, SignCheck
+from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
 from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
@@ -253,10 +253,13 @@ def test_a_motor_that_missed_its_enter_gets_another_one():
     arm.until(State.ACTIVE)
 
 
+FRICTION = 0.3  # Nm
+
+
 class Joint:
     """The first joint alone: it yields at 0.2 rad/s per Nm beyond `friction`, and to a `hand`: rad/s at a time in s."""
 
-    def __init__(self, hand: Callable[[float], float] = lambda now: 0.0, friction: float = 0.3) -> None:
+    def __init__(self, hand: Callable[[float], float] = lambda now: 0.0, friction: float = FRICTION) -> None:
         self.check = SignCheck(("a", "b", "c", "d"), (1.5, 0.0, 0.0, 0.0))
         self.pushes: list[float] = []
         self._hand = hand
@@ -269,9 +272,10 @@ class Joint:
             effort = self.check.effort[0]
             self.pushes.append(effort)
             yielding = effort - max(-self._friction, min(self._friction, effort))
-            self._position += (0.2 * yielding + self._hand(self._now)) * PERIOD
+            velocity = 0.2 * yielding + self._hand(self._now)
+            self._position += velocity * PERIOD
             self._now += PERIOD
-            sample = reading(position=self._position, effort=effort, time=self._now)
+            sample = reading(position=self._position, velocity=velocity, effort=effort, time=self._now)
             fault = self.check.step(PERIOD, (sample,) * 4, (0.0,) * 4)
             if fault or self.check.done:
                 return fault
@@ -282,7 +286,7 @@ def test_a_joint_passes_after_a_push_each_way_and_is_released():
     joint = Joint()
     assert joint.run(20.0) is None
     assert joint.check.done
-    assert max(joint.pushes) > SIGN_PUSH.least and min(joint.pushes) < -SIGN_PUSH.least
+    assert max(joint.pushes) > FRICTION and min(joint.pushes) < -FRICTION
     assert joint.check.effort[0] == 0.0
 
 
@@ -300,6 +304,13 @@ def test_a_wearer_who_keeps_moving_the_joint_is_asked_to_hold_still_and_then_ref
     fault = joint.run(60.0)
     assert fault is not None and fault.code == "sign_unproven"
     assert "hold still" in fault.reason
+
+
+def test_a_joint_that_a_hand_shakes_is_not_pushed_on_and_on():
+    joint = Joint(hand=lambda now: (0.2 if now % 0.04 < 0.02 else -0.2) if now > 0.3 else 0.0)
+    fault = joint.run(60.0)
+    assert fault is not None and fault.code == "sign_unproven"
+    assert max(map(abs, joint.pushes)) < FRICTION
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])

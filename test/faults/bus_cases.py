@@ -150,7 +150,7 @@ V3_BOARDS = (
     FaultCase("V3 boards: foreign 6 Nm to motor 2, 500 a second for 2 s",
         foreign_frames(lambda rig: (V3_MOTOR_2.command_id, V3_MOTOR_2.command(FOREIGN, 0.0)), 500.0, 2.0), V3Rig,
         steps_from=2.1,
-        outcomes=("foreign_command",), work_limit=2.0),
+        outcomes=("foreign_command",), energy_limit=2.0),
     FaultCase("V3 boards: compensator killed", send_signal("compensator", KILL), V3Rig, PROCESS_REACTION),
     FaultCase("V3 boards: can_bridge killed", send_signal("can_bridge", KILL), V3Rig, PROCESS_REACTION),
 )

@@ -144,7 +144,7 @@ MOTORS = (
     FaultCase("foreign SET_ZERO to motor 2, once", foreign_frames(SET_ZERO), unreached=(1,), steps_from=0.05,
         ends_rig=True),
     FaultCase("foreign 6 Nm to motor 2, 500 a second for 2 s", foreign_frames(commanding(FOREIGN), 500.0, 2.0),
-        steps_from=2.1, outcomes=("foreign_command",), work_limit=2.0),  # the foreign torque does work until opposed
+        steps_from=2.1, outcomes=("foreign_command",), energy_limit=2.0),  # the foreign torque does work until opposed
     FaultCase("foreign zero commands to motor 2, 500 a second for 2 s",
         foreign_frames(commanding(0.0), 500.0, 2.0), steps_from=2.1, outcomes=("foreign_command",)),
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.sim.judge import MAX_DAMPING, MAX_SPEED, MAX_WORK
+from exo_gravity.sim.judge import MAX_DAMPING, MAX_ENERGY, MAX_SPEED
 
 from .rig import Rig
 
@@ -35,7 +35,7 @@ class FaultCase:
     unpowered: joints that fall, because a motor has no power, so that nothing can brake them.
     steps_from: s after the fault from which on torque steps count, where the fault itself is a step.
     speed_limit, driven_limit: rad/s of any joint.
-    work_limit: J of any motor.
+    energy_limit: J of any motor in one stretch.
     damping_limit: of any motor's damping by itself, as a multiple of its rated torque.
     check: of the arm's true motion.
     ends_rig: whether the rig is spent although its nodes run on.
@@ -54,7 +54,7 @@ class FaultCase:
     steps_from: float = 0.0
     speed_limit: float = MAX_SPEED
     driven_limit: float = MAX_SPEED
-    work_limit: float = MAX_WORK
+    energy_limit: float = MAX_ENERGY
     damping_limit: float = MAX_DAMPING
     check: Check = lambda records: ""
     ends_rig: bool = False

@@ -88,7 +88,7 @@ def rows(name: str, arm: dict[str, Any], lets_go: bool) -> tuple[FaultCase, ...]
             unpowered=joints, steps_from=0.1, check=stays_off, afterwards=carries_again),
         FaultCase(f"{name}: foreign 6 Nm to a motor, 500 a second for 2 s",
             foreign_frames(commanding(FOREIGN), 500.0, 2.0), rig, steps_from=2.1, outcomes=("foreign_command",),
-            work_limit=2.0),
+            energy_limit=2.0),
         FaultCase(f"{name}: a joint jumps by a motor turn, then clear and enable", JUMP, rig,
             afterwards=refused_on_the_wrong_angle, outcomes=("position_jump", "over_speed")),
         FaultCase(f"{name}: can_bridge killed", send_signal("can_bridge", KILL), rig, PROCESS_REACTION),

@@ -126,7 +126,7 @@ def save(results: Sequence[Result], path: Path) -> None:
 
 def table(results: Sequence[Result]) -> Table:
     """Return the results as a table."""
-    columns = ("reaction_ms", "top_speed_rad_s", "torque_step_nm", "work_j", "power_w", "damping_of_rated", "off_s")
+    columns = ("reaction_ms", "top_speed_rad_s", "torque_step_nm", "energy_j", "power_w", "damping_of_rated", "off_s")
     grid = Table("fault", "result", "after ms", "top rad/s", "step Nm", "J", "W", "damping", "off s", "verdict")
     for result in results:
         figures = [result[column] for column in columns]

@@ -26,7 +26,7 @@ LOG_LINES = 20
 
 FIGURES = (
     *("reaction_ms", "limit_ms", "top_speed_rad_s", "driven_rad_s", "fastest_joint"),
-    *("torque_step_nm", "work_j", "power_w", "damping_of_rated", "off_s"),
+    *("torque_step_nm", "energy_j", "power_w", "damping_of_rated", "off_s"),
 )
 Result = dict[str, Any]  # a row of the table; `unsafe` is empty, or states why the case failed
 
@@ -115,7 +115,7 @@ def _failures(
         "too fast": response.top_speed > case.speed_limit,
         "moved by a motor": not carried and response.driven > case.driven_limit,
         "torque step": response.excess > 0.0,
-        "driven by a motor": not carried and response.work > case.work_limit,
+        "driven by a motor": not carried and response.energy > case.energy_limit,
         "damped too hard": response.damping > case.damping_limit,
         "switched on again": response.re_enabled,
         f"truth stops for {response.gap:.1f} s": response.gap > MAX_GAP,
@@ -145,7 +145,7 @@ def _result(case: FaultCase, outcome: str, response: Response, failures: list[st
         "driven_rad_s": round(response.driven, 2),
         "fastest_joint": response.fastest,
         "torque_step_nm": round(response.largest_step, 3),
-        "work_j": round(response.work, 3),
+        "energy_j": round(response.energy, 3),
         "power_w": round(response.power, 2),
         "damping_of_rated": round(response.damping, 2),
         "off_s": None if carried or response.off is None else round(response.off, 1),

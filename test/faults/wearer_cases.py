@@ -128,7 +128,7 @@ ACTIVE_WEARER = (
     while_wearer("shakes the arm at 2 Hz", SHAKE, 1.0),
     while_wearer("reaches on and on", REACH, 1.0),
     # The thrown arm coasts upwards, and what carries it does the work of its weight on the way: 0.25 to 0.35 J.
-    while_wearer("throws the arm", THROW, 0.2, work_limit=0.5),
+    while_wearer("throws the arm", THROW, 0.2, energy_limit=0.5),
     while_wearer("presses it down from the horizontal", PRESS_DOWN, 0.1, RaisedRig),
 )
 # fmt: on

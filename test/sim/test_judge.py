@@ -34,7 +34,7 @@ def test_an_arm_that_is_let_down_well_is_found_safe(records):
     assert response.top_speed == pytest.approx(0.3)
     assert response.excess == 0.0
     assert response.off == pytest.approx(4.0, abs=0.002)
-    assert response.work < 0.001
+    assert response.energy < 0.001
     assert not response.re_enabled
     assert response.gap < 0.002
 
@@ -99,9 +99,9 @@ def test_a_motor_that_drives_the_arm_does_work_and_one_that_brakes_does_not(reco
     driven = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 2.0)
     records["velocity"][driven, 2] = 0.5
     records["torque"][driven, 2] = 2.0
-    assert measure(records, FAULT, PERIOD).work == pytest.approx(1.0, abs=0.01)
+    assert measure(records, FAULT, PERIOD).energy == pytest.approx(1.0, abs=0.01)
     records["torque"][driven, 2] = -2.0
-    assert measure(records, FAULT, PERIOD).work < 0.001
+    assert measure(records, FAULT, PERIOD).energy < 0.001
 
 
 @pytest.fixture
@@ -132,7 +132,7 @@ def test_speed_that_an_arm_gains_after_the_wearer_let_go_counts_and_is_driven_if
 
 def test_a_motor_does_no_work_on_an_arm_that_the_wearer_lifts(lifted):
     lifted["torque"][:, 3] = np.where(lifted["wearer"][:, 3] > 0.0, 3.0, 0.0)
-    assert measure(lifted, FAULT, PERIOD).work < 0.001
+    assert measure(lifted, FAULT, PERIOD).energy < 0.001
 
 
 def test_a_motor_that_is_on_at_the_end_or_on_again_is_seen(records):

@@ -43,13 +43,19 @@ class SwitchOn:
 class SignPush:
     """The pushes that show which way a motor moves its joint."""
 
-    rise: float = 1.5  #: Nm/s; a joint that breaks loose is not yet damped
+    #: Nm/s. A light joint (0.002 kg m^2) that breaks loose is read to be moving 35 ms later, after three cycles at 100
+    #: Hz and a filter of 5 ms, and gains 0.5 rad/s by then
+    rise: float = 0.5
+    quick: float = 3.0  #: Nm/s, on a joint that is damped already, or where it cannot break loose:
+    held: float = 0.7  #: of the largest push so far, below which friction held the joint
     fall: float = 10.0  #: Nm/s
-    least: float = 0.1  #: Nm; motion under a smaller push is not caused by it
+    slow: float = 0.1  #: rad/s, beyond which the push is taken back; four codes of the velocity
+    soonest: float = 0.07  #: s; a joint that has moved sooner was not moved by the push
     moved: float = 0.015  #: rad; forty codes of the position
     still: float = 0.003  #: rad within which a joint is still
     still_time: float = 0.2  #: s for which it must stay within `still`
     timeout: float = 0.5  #: s at full torque
+    patience: float = 10.0  #: s for which a joint may move to and fro without going anywhere
     rest_timeout: float = 5.0  #: s for the joint to come to rest
     disturbed: int = 5  #: times at most that a joint may move without a push
 
@@ -240,9 +246,10 @@ class SignCheck:
     """Checks that each motor pushes its joint the way that its encoder shows, while the arm hangs.
 
     Joint after joint: wait until it is still, push it gently and slowly until it moves by about a degree, then push it
-    back the other way. A joint that moves backwards has its torque or its encoder reversed: gravity
-    compensation would double its weight. A joint that does not move has no torque, or is held. A joint that moves
-    before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
+    back the other way. Whichever way it moves, the push is taken back while the joint is faster than `SIGN_PUSH.slow`:
+    without damping, friction alone then stops it. A joint that moves backwards has its torque or its encoder reversed:
+    gravity compensation would double its weight. A joint that does not move has no torque, or is held. A joint that
+    moves before it is pushed is being moved by the wearer: the check starts again, a few times. It cannot detect a
     `direction` that reverses torque and encoder alike: such a joint moves as expected.
 
     How soon the joints move shows two with exchanged CAN IDs (joint_order.py); they are pushed again before that is a
@@ -266,6 +273,7 @@ class SignCheck:
         self._names = names
         self._dt = 0.0
         self._position = [math.nan] * len(names)  # rad
+        self._velocity = [math.nan] * len(names)  # rad/s
         self._order = JointOrder(names)
         self._course = self._check_all(torque)
 
@@ -275,7 +283,8 @@ class SignCheck:
         joints: (n,) the newest readings.
         asked: (n,) Nm that the controller asks for in this pose.
         """
-        self._dt, self._position = dt, [joint.position for joint in joints]
+        self._dt = dt
+        self._position, self._velocity = [joint.position for joint in joints], [joint.velocity for joint in joints]
         self._order.note(joints, asked)
         return next(self._course, None)
 
@@ -320,23 +329,28 @@ class SignCheck:
         for sign in (1.0, -1.0):
             yield from self._wait_for_rest(i)
             self._order.begin(i)
-            start, waited = self._position[i], 0.0
+            start, push, at_full, waited = self._position[i], 0.0, 0.0, 0.0
             while not abs(moved := sign * (self._position[i] - start)) >= SIGN_PUSH.moved:
-                push = self.effort[i]
-                if abs(push) >= most and waited > SIGN_PUSH.timeout:
+                if at_full > SIGN_PUSH.timeout:
                     yield self._fault(i, f"{push:.2f} Nm did not move it: let it hang freely")
-                waited += self._dt if abs(push) >= most else 0.0
-                start = self._position[i] if push * sign <= 0.0 else start
-                self._approach(i, sign * most, SIGN_PUSH.rise)
+                if waited > SIGN_PUSH.patience:
+                    return False
+                if abs(self._velocity[i]) > SIGN_PUSH.slow:
+                    self._approach(i, 0.0, SIGN_PUSH.fall)
+                else:
+                    is_held = self.damped[i] or abs(self.effort[i]) < SIGN_PUSH.held * abs(push)
+                    self._approach(i, sign * most, SIGN_PUSH.quick if is_held else SIGN_PUSH.rise)
+                push = max(push, self.effort[i], key=abs)
+                at_full += self._dt if abs(self.effort[i]) >= most else 0.0
+                waited += self._dt
                 yield None
-            push = self.effort[i]
-            if sign * push < SIGN_PUSH.least:
+            if waited < SIGN_PUSH.soonest:
                 return False
             if moved < 0.0:
                 reason = f"{push:.2f} Nm moved it backwards: torque or encoder is reversed"
                 yield self._fault(i, reason, FaultCode.WRONG_SIGN)
             if not self.damped[i]:
-                self._order.end(SIGN_PUSH.still, SIGN_PUSH.moved)
+                self._order.end(SIGN_PUSH.slow)
             self.damped[i] = True
         return True
 

@@ -3,8 +3,8 @@
 
 An exchange takes the encoder along with the motor: each joint still moves as it is pushed, and an arm that hangs asks
 for hardly any torque. What differs is the inertia. Of two joints with parallel axes, the one nearer to the base turns
-all that the other one turns, and the link between them, so under a push that rises at the same rate it is slower.
-Friction only delays when a joint breaks loose: the time counts from then on.
+all that the other one turns, and the link between them, so under a push that rises at the same rate it gains speed
+later. Friction only delays when a joint breaks loose: the time counts from then on, until the push is taken back.
 
 The efforts that the controller asks for while joints are pushed tell which axes are parallel: the outer joint needs the
 same torque whichever of the two is turned. So no parameter describes the arm, and where gravity turns neither joint,
@@ -31,12 +31,14 @@ from exo_gravity.core.safety.drive import Fault, FaultCode
 class JointOrderTuning:
     """When joints are compared, and how often.
 
-    The inner joint took 1.3 to 4.9 times as long as the outer one in 125 right arms, bare or with a wearer of 50 to 110
-    kg, and 0.18 to 0.7 times in 51 exchanged ones.
+    The inner joint took at least 1.77 times as long as the outer one in 60 right arms, bare or with a wearer of 50 to
+    110 kg who relaxes or holds it lightly (1 to 3 Nm/rad), and at most 0.51 times in 60 exchanged ones.
     """
 
     parallel: float = 0.25  #: of the outer joint's stiffness, by which turning the inner one may show another one
-    sooner: float = 0.9  #: of the outer joint's time, from which on the inner joint is the quicker one
+    left: float = 0.0015  #: rad from where it rested: the joint moves; four codes of the position
+    sooner: float = 0.9  #: of the outer joint's time, below which the inner joint is the quicker one
+    clear: float = 0.01  #: s, beyond that: a cycle at 100 Hz; the times of two light joints are not told apart
     least: float = 0.05  #: Nm/rad of gravity's stiffness; a fifth of that of a bare forearm
     rounds: int = 2  #: of pushes: two joints that seem exchanged are pushed again, and the times averaged
 
@@ -59,14 +61,14 @@ class JointOrder:
         self._names = names
         self._joints: Sequence[JointSample] = ()  # the newest readings
         self._pushed: int | None = None
-        self._path: list[tuple[float, float]] = []  # time in s and angle in rad of the joint that is pushed
+        self._path: list[JointSample] = []  # readings of the joint that is pushed
         self._times: list[list[float]] = [[] for _ in names]  # s, of each push
         self._ends: list[list[Extreme]] = [[] for _ in names]  # the two ends of each joint's motion while it was pushed
 
     def begin(self, i: int) -> None:
         """Note that joint `i` is pushed from now on."""
         self._pushed = i
-        self._path = [(self._joints[i].time, self._joints[i].position)]
+        self._path = [self._joints[i]]
 
     def note(self, joints: Sequence[JointSample], asked: Sequence[float]) -> None:
         """Take the newest readings (n,), and what the controller asks for, (n,) Nm."""
@@ -74,16 +76,20 @@ class JointOrder:
         if self._pushed is None:
             return
         sample, ends = joints[self._pushed], self._ends[self._pushed]
-        self._path.append((sample.time, sample.position))
+        self._path.append(sample)
         if not all(map(math.isfinite, asked)):
             return
         here = [*ends, Extreme(sample.position, tuple(joint.position for joint in joints), tuple(asked))]
         ends[:] = min(here), max(here)
 
-    def end(self, still: float, moved: float) -> None:
-        """Note that a push has moved its joint by `moved` rad from rest, and that the joint had left it at `still`."""
-        if self._pushed is not None:
-            self._times[self._pushed].append(_reached(self._path, moved) - _reached(self._path, still))
+    def end(self, slow: float) -> None:
+        """Note that a push has moved its joint, and was taken back once that was faster than `slow` rad/s."""
+        if self._pushed is None:
+            return
+        start = self._path[0].position
+        left = _reached([(sample.time, sample.position - start) for sample in self._path], JOINT_ORDER.left)
+        quick = _reached([(sample.time, sample.velocity) for sample in self._path], slow)
+        self._times[self._pushed].append(max(0.0, quick - left))
 
     @property
     def exchanged(self) -> tuple[int, ...]:
@@ -93,7 +99,8 @@ class JointOrder:
         for inner, outer in combinations(pushed, 2):
             own, shared = stiffness[outer, outer], stiffness[outer, inner]
             are_parallel = own >= JOINT_ORDER.least and abs(shared - own) <= JOINT_ORDER.parallel * own
-            if are_parallel and self._time(inner) < JOINT_ORDER.sooner * self._time(outer):
+            latest = JOINT_ORDER.sooner * self._time(outer) - JOINT_ORDER.clear
+            if are_parallel and self._time(inner) < latest:
                 return inner, outer
         return ()
 
@@ -122,10 +129,9 @@ class JointOrder:
         return np.asarray(np.linalg.lstsq(np.array(turned), np.array(asked), rcond=None)[0].T)
 
 
-def _reached(path: Sequence[tuple[float, float]], way: float) -> float:
-    """Return the time in s at which `path` was `way` rad from its start, between two readings; NaN if it never was."""
-    start = path[0][1]
-    for (earlier, before), (later, after) in pairwise(path):
-        if after - start >= way:
-            return earlier + (later - earlier) * (way - before + start) / (after - before)
-    return math.nan
+def _reached(course: Sequence[tuple[float, float]], level: float) -> float:
+    """Return when `course`, times in s with a value each, first reached `level`; its last time if it never did."""
+    for (earlier, before), (later, after) in pairwise(course):
+        if after >= level:
+            return earlier + (later - earlier) * max(0.0, level - before) / max(after - before, 1e-9)
+    return course[-1][0]

@@ -1,0 +1,98 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""While the signs of the motors are proven, no joint turns fast: the arms of config, by the truth, in virtual time."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import pytest
+
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.controller import DirectController
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.lab.inputs.arms import carried_arm, node_values
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.sim.device import SimulatedDevice
+from exo_gravity.sim.motors import simulated
+from exo_gravity.sim.motors.damiao import DamiaoMotor
+from exo_gravity.sim.params import device_of, simulator_table
+from exo_gravity.sim.virtual_arm import VirtualArm
+
+from .carried_arm import DRIVEN
+
+RATE = 100.0  # Hz, the lowest in use: a light joint gains most speed in a cycle
+LIGHT = 6  # the seven-joint arm's last joint, 0.002 kg m^2
+
+
+class LateMotor(DamiaoMotor):
+    """A motor whose replies show what it read two commands ago."""
+
+    def __init__(self, joint: JointMotor) -> None:
+        super().__init__(joint)
+        self._past: deque[tuple[float, float, float]] = deque(maxlen=3)
+
+    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
+        self._past.append(super()._readings(position, velocity))
+        return self._past[0]
+
+
+class ReversedMotor(DamiaoMotor):
+    """A motor whose torque turns the joint the other way."""
+
+    def advance(self, position: float, velocity: float, dt: float) -> float:
+        """Return the torque on the joint in Nm; see `DamiaoMotor.advance`."""
+        return -super().advance(position, velocity, dt)
+
+    def damps_at_once(self, torque: float) -> bool:
+        """Return False: its damping drives."""
+        return False
+
+
+class ProvenArm(VirtualArm):
+    """The simulated arm of a file in config. fastest: rad/s, the largest true speed of a joint so far.
+
+    kinds: of motors, by joint (0..), in place of the usual ones.
+    """
+
+    def __init__(self, name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
+        nodes = load(packaged_config(f"{name}.yaml"))
+        arm = carried_arm(nodes, "/right")
+        given = device_of(node_values(nodes, "/right/simulator", simulator_table(nodes["/right/simulator"])))
+        motors = [kinds.get(n, simulated)(joint) for n, joint in enumerate(arm.motors)]
+        device = SimulatedDevice(given.arm, motors)
+        settings = replace(arm.settings, use_imu=False)
+        controller = DirectController(Compensator(settings, arm.limits.joint_names), arm.limits)
+        self.fastest = 0.0
+        super().__init__(device, controller, arm.motors, arm.limits, RATE, look=self._look)
+        self.enable()
+        assert self.run_until(lambda: self.safety.state in (State.RAMPING_IN, State.FAULT), 60.0)
+
+    def _look(self) -> None:
+        self.fastest = max(self.fastest, *map(abs, self.device.arm.velocities), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds"),
+    [
+        ("sim", {}),
+        ("elbow", {}),
+        ("three_joints", {}),
+        ("seven_joints", {}),
+        ("seven_joints", dict.fromkeys(range(LIGHT + 1), LateMotor)),
+    ],
+    ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies"],
+)
+def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
+    arm = ProvenArm(name, kinds)
+    assert arm.safety.state is State.RAMPING_IN, arm.safety.fault
+    assert 0.0 < arm.fastest < DRIVEN
+
+
+def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
+    arm = ProvenArm("seven_joints", {LIGHT: ReversedMotor})
+    assert arm.safety.fault and arm.safety.fault.code is FaultCode.WRONG_SIGN
+    arm.run(1.0)
+    assert not arm.device.powered
+    assert arm.fastest < DRIVEN
