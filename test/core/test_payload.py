@@ -146,7 +146,7 @@ def drop(mass: float, pose: tuple[float, ...]) -> tuple[OfflineTrial, Compensato
     script = TrialScript.parse({"name": "drop", "steps": steps})
     compensator = Compensator(settings)
     setup = ArmSetup(
-        "right", device, motors, Limits(JOINTS, max_effort=MOST, sign_check_torque=0.0), settings, 250.0, None
+        "right", device, motors, Limits(JOINTS, max_effort=MOST, sign_check_torque=0.0), settings, 125.0, None
     )
     trial = OfflineTrial(setup, script, 4.0, compensator)
     recording = trial.run()

@@ -24,7 +24,7 @@ from exo_gravity.sim.virtual_arm import VirtualArm
 from exo_gravity.sim.virtual_time import Wire
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
-RATE = 250.0  # Hz
+RATE = 125.0  # Hz
 POSE = [0.0, 0.5, 0.4, 0.6]  # rad
 WORN_MASS, WORN_COG = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause

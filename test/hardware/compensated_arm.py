@@ -26,7 +26,7 @@ from ..support.copies import prepared
 from ..support.simulated_device import joints_of, make_device
 
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
-CYCLE = 0.004  # s
+CYCLE = 0.008  # s
 POSE = (0.0, 0.4, 0.2, 0.5)  # rad, in which the rated torques carry the arm of 75 kg
 MOVE = 2.0  # s in which a hand brings the arm to its pose
 WEARER = Wearer(75.0).on_links(DEFAULT_LINKS.length)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import pytest
@@ -15,10 +16,13 @@ from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 
 from ..support.copies import prepared
+from ..support.thorough import quick
 from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
-FIRMWARE = pytest.mark.parametrize("name", [name for name in FIRMWARES if name != "v3_query"])
+REPLYING = [name for name in FIRMWARES if name != "v3_query"]
+# The farthest from each other: their time-outs, what they remember, and who asks for a reply.
+FIRMWARE = pytest.mark.parametrize("name", quick(("open_drive", "v3_2"), REPLYING))
 
 
 def motor_of(firmware: Firmware, name: str, can_id: int) -> JointMotor:
@@ -86,12 +90,9 @@ WORST = [
     ("vendor", "all motors restart in 80 ms"),
     ("ak", "motor 2 restarts in 30 ms"),
 ]
-OTHERS = [(name, event) for name in FIRMWARES if name != "v3_query" for event in EVENTS if (name, event) not in WORST]
 
 
-@pytest.mark.parametrize(
-    ("name", "event"), [*WORST, *(pytest.param(*other, marks=pytest.mark.thorough) for other in OTHERS)]
-)
+@pytest.mark.parametrize(("name", "event"), quick(WORST, itertools.product(REPLYING, EVENTS)))
 def test_whatever_the_firmware_drops_the_motors_drive_no_joint(name: str, event: str) -> None:
     """A motor that has lost its torque lets its joint fall; what counts is what motors drive, then and afterwards."""
     arm = raised_arm(name)

@@ -25,7 +25,7 @@ from exo_gravity.sim.virtual_arm import VirtualArm
 
 from ..support.simulated_device import SPECS
 
-RATE = 250.0  # Hz
+RATE = 125.0  # Hz
 WEIGHT = Weight(0.6, 0.2)  # on a forearm that the device carries from the beginning
 MOTORS = tuple(JointMotor(spec, can_id) for can_id, spec in enumerate(SPECS, 1))
 LIMITS = Limits(("a", "b", "c", "elbow"))
