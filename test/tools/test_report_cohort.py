@@ -13,7 +13,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
 
 from exo_gravity.lab.bag.writer import repair
 from exo_gravity.lab.parallel import on_cluster
@@ -97,7 +96,10 @@ def test_a_copy_that_was_repaired_is_not_a_second_trial(trials):
     assert cohort.recordings_below(trials) == before and cohort.recordings_below(copy) == [copy]
 
 
+@pytest.mark.thorough
 def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_there_twice(trials, tmp_path):
+    from distributed import Client, LocalCluster  # a second of imports, which no other test needs
+
     bags = []
     for number in range(8):
         recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=math.radians(number) / 60.0)
