@@ -36,7 +36,7 @@ from exo_gravity.sim.motors.damiao import DamiaoMotor
 
 from ..support.copies import prepared
 from ..support.thorough import quick
-from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm, stall
+from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, REAL_RATE, UNKNOWN_LOSS, CarriedArm, stall
 
 NAMES = ("DM-J4340", "DM-J8009", "DM-J4340", "DM-J4310")
 PEAK = (9.0, 18.0, 9.0, 7.0)  # Nm
@@ -58,7 +58,7 @@ def arm_of(names: tuple[str, ...] = NAMES, **options: float) -> CarriedArm:
 @prepared
 def raised_arm() -> CarriedArm:
     """Return an arm that the wearer has raised to `POSE` and left to the motors."""
-    arm = arm_of()
+    arm = arm_of(rate=REAL_RATE)
     arm.carry()
     arm.raise_to(POSE)
     return arm

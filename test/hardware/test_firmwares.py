@@ -17,7 +17,7 @@ from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 
 from ..support.copies import prepared
 from ..support.thorough import quick
-from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, UNKNOWN_LOSS, CarriedArm
+from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, REAL_RATE, UNKNOWN_LOSS, CarriedArm
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
 REPLYING = [name for name in FIRMWARES if name != "v3_query"]
@@ -37,16 +37,16 @@ def motor_of(firmware: Firmware, name: str, can_id: int) -> JointMotor:
 class FirmwareArm(CarriedArm):
     """An arm whose motors have one firmware."""
 
-    def __init__(self, firmware: Firmware, remembered: float = 0.0, bitrate: int = 0) -> None:
+    def __init__(self, firmware: Firmware, **options: float) -> None:
         joints = [motor_of(firmware, name, 1 + i) for i, name in enumerate(USUAL_MOTORS)]
         usual = replace(firmware, status_rate=500.0)  # as docs/wiring.md asks for
-        super().__init__(joints, [SimulatedMotor(joint, usual) for joint in joints], PEAK, remembered, bitrate)
+        super().__init__(joints, [SimulatedMotor(joint, usual) for joint in joints], PEAK, **options)
 
 
 @prepared
 def raised_arm(name: str) -> FirmwareArm:
     """Return an arm that the wearer has raised to `POSE` and left to motors with the firmware of this name."""
-    arm = FirmwareArm(FIRMWARES[name])
+    arm = FirmwareArm(FIRMWARES[name], rate=REAL_RATE)
     arm.carry()
     arm.raise_to(POSE)
     return arm

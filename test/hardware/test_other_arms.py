@@ -25,7 +25,7 @@ from ..support.thorough import quick
 from .carried_arm import DRIVEN, ENERGY, UNKNOWN_LOSS
 
 POSES = {"elbow": [1.0], "seven_joints": [0.4, 0.3, 0.1, 0.6, 0.1, 0.2, -0.1]}  # rad
-RATE = 125.0  # Hz
+RATE = 250.0  # Hz
 
 
 class ShippedArm(VirtualArm):

@@ -15,7 +15,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 
 from .simulated_device import OFF
 
-PERIOD = 0.008  # s
+PERIOD = 0.004  # s
 LIMITS = Limits(
     joint_names=("a", "b", "c", "d"),
     position_min=(-1.6, -0.2, -0.8, -0.2),
