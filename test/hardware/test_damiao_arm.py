@@ -111,7 +111,7 @@ def test_a_torque_that_another_tool_left_in_the_motors_memory_is_not_carried_out
 
 
 EVENTS_HERE = {**EVENTS, "loop stalls for 300 ms": stall(0.3)}
-WORST = ("all motors restart in 80 ms", "motor 2 restarts in 30 ms", "loop stalls for 120 ms", "loop stalls for 300 ms")
+WORST = ("motor 2 restarts in 30 ms", "loop stalls for 300 ms")
 
 
 @pytest.mark.parametrize("event", quick(WORST, EVENTS_HERE))
@@ -181,7 +181,7 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize("command", quick(("EXIT", "a torque, 100 times a second", "another range"), FOREIGN))
+@pytest.mark.parametrize("command", quick(("a torque, 100 times a second", "another range"), FOREIGN))
 def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> None:
     arm = raised_arm()
     FOREIGN[command](arm)
@@ -191,14 +191,14 @@ def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> No
     assert not arm.device.powered
 
 
-@pytest.mark.parametrize(
-    ("register", "value", "sentence"),
-    [
-        (TMAX, 10.0, "its TMAX (register 23) is 10, must be 54, or torque_range 10 in the file"),
-        (TIMEOUT, 0.0, "its TIMEOUT (register 9) is 0, must be 4000"),
-        (CTRL_MODE, 2.0, "its CTRL_MODE (register 10) is 2, must be 1"),
-    ],
-)
+SET_OTHERWISE = [
+    (TMAX, 10.0, "its TMAX (register 23) is 10, must be 54, or torque_range 10 in the file"),
+    (TIMEOUT, 0.0, "its TIMEOUT (register 9) is 0, must be 4000"),
+    (CTRL_MODE, 2.0, "its CTRL_MODE (register 10) is 2, must be 1"),
+]
+
+
+@pytest.mark.parametrize(("register", "value", "sentence"), quick(SET_OTHERWISE[:1], SET_OTHERWISE))
 def test_a_motor_that_is_set_otherwise_than_the_file_says_is_not_switched_on(
     register: int, value: float, sentence: str
 ) -> None:

@@ -17,6 +17,7 @@ from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.virtual_time import TICK
 
+from ..support.thorough import quick
 from .compensated_arm import CYCLE, PEAK, compensated_arm
 
 SAFE_SPEED = 0.65  # rad/s, at which an arm without friction sinks under the damping of the motors
@@ -42,10 +43,11 @@ CHANGES = {
 }
 # Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
 FASTEST = ("gain",)
+QUICK = [("Zero-G to One-G, above the shoulder", True), ("gain", True), ("gain", False)]
 
 
 @pytest.mark.parametrize(
-    ("name", "is_damped"), [*((name, True) for name in CHANGES), *((name, False) for name in FASTEST)]
+    ("name", "is_damped"), quick(QUICK, [*((name, True) for name in CHANGES), *((name, False) for name in FASTEST)])
 )
 def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
     rig, change, hangs = CHANGES[name]

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 from dataclasses import asdict, replace
 from functools import partial
@@ -29,10 +30,10 @@ DAY = 86_400 * 10**9  # ns
 JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
 
 
-@pytest.fixture
-def trials(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     """A folder of three trials of one subject, a day each, one that is no recording, and one that is cut."""
-    folder = tmp_path / "trials"
+    folder, monkeypatch = tmp_path_factory.mktemp("written") / "trials", pytest.MonkeyPatch()
     for number, drift in enumerate(DRIFTS):
         with monkeypatch.context() as day:
             day.setattr(made, "START", made.START + number * DAY)
@@ -47,6 +48,12 @@ def trials(tmp_path, monkeypatch):
     (folder / "damaged").mkdir()
     (folder / "damaged" / "text.mcap").write_text("no recording")
     return folder
+
+
+@pytest.fixture
+def trials(written, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(written, tmp_path / "trials")
 
 
 def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, capsys):
