@@ -54,6 +54,7 @@ def test_an_arm_whose_imu_is_wrong_by_30_degrees_is_not_carried():
     assert "torque_while_hanging" in play(named("IMU"), None).fault
 
 
+@pytest.mark.thorough
 def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_nothing():
     lie = play(named("a wrong speed"), None)
     assert lie.speed < 0.02 and lie.rate < 5.0

@@ -156,6 +156,7 @@ def drop(mass: float, pose: tuple[float, ...]) -> tuple[OfflineTrial, Compensato
     return trial, compensator, rows
 
 
+@pytest.mark.thorough
 def test_a_load_of_2_kg_that_is_dropped_moves_the_arm_little_and_its_torque_goes(monkeypatch):
     trial, compensator, rows = drop(2.0, (0.0, 0.4, 0.2, 0.5))
     assert trial.trouble == "" and compensator.dropped == 2.0

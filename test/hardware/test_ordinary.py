@@ -22,7 +22,7 @@ ROWS = (
 )
 
 
-@pytest.mark.parametrize(("row", "most"), quick(ROWS[::2], ROWS), ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize(("row", "most"), quick(ROWS[:1], ROWS), ids=lambda value: getattr(value, "name", ""))
 def test_ordinary_equipment_carries_an_arm_without_an_alarm(row, most):
     result = row.play(1.0, carried=2.0)
     assert is_quiet(result), result

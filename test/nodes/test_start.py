@@ -22,6 +22,7 @@ OTHER_NODES = ("can_bridge", "simulator", "imu")
 SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 
+@pytest.mark.thorough
 def test_a_bad_parameter_ends_the_launcher_with_one_sentence_and_no_motor_is_enabled(prepare, listen):
     nodes = prepare(can_bridge={"homes": [0.2] * 4})  # test_validation.py has the other refusals
     listener = listen(nodes)

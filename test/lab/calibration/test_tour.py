@@ -131,6 +131,7 @@ def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_me
     assert tour.measured and not tour.done
 
 
+@pytest.mark.thorough
 def test_a_joint_that_slips_between_two_passes_is_named():
     """A slip shows as a torque that differs between two passes of the same angle."""
 
