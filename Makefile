@@ -24,13 +24,13 @@ panel:  # the simulated right arm and the operator's page, until Ctrl-C
 
 # Tests of running nodes need a machine that keeps up with them: they run alone. The other ones share a module's nodes
 # and simulations: each file runs in one process.
-test:  # the tests, 13 minutes on two cores
+test:  # the tests
 	@$(SETUP) @test
 	$(BIN)/python -m pytest --ignore test/bench -n auto --dist loadfile -m "not (real_time or browser or thorough)"
 	$(BIN)/python -m pytest $$(grep -rl mark.real_time --include='test_*.py' test/hardware test/nodes) \
 		-m "real_time and not thorough"
 
-test-all: test  # the same, then the longer ones: studies, browser, 13 poses, video, SROS2
+test-all: test  # the same, then the longer ones: more arms, motors and seeds, studies, browser, video, SROS2
 	.ci/test-long
 
 lint:  # ruff, mypy, ament's flake8 and pep257, shellcheck, and this repository's own rules

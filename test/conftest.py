@@ -34,6 +34,10 @@ def machine() -> None:
     favour(5)  # what a test receives is in time
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--every", type=int, default=1, metavar="N", help="of the selected tests run only every Nth")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Leave out what needs a quiet machine, and the longer tests, unless `-m` selects others."""
     if UNDER_COLCON and not config.option.markexpr:
@@ -52,7 +56,10 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     return True if missing else None
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+@pytest.hookimpl(trylast=True)  # once `-m` and `-k` have selected
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave all but every Nth test out (--every), and give those of running nodes the machine."""
+    items[:] = items[:: config.option.every]
     for item in items:
         if isinstance(item, pytest.Function) and item.get_closest_marker("real_time"):
             item.fixturenames.insert(0, "machine")

@@ -249,6 +249,7 @@ class SimulatedArm:
         own = self.config
         columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
         self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
+        self._has_stribeck, self._has_load_friction = bool(self._stribeck.any()), bool(self._load_share.any())
         self.move_base(self.config.felt("left", TrunkState())[0])
         self.reset(np.zeros(len(self._theta)))
 
@@ -285,10 +286,11 @@ class SimulatedArm:
         self._theta, self._velocity = self.data.qpos[:count], self.data.qvel[:count]
         self._torque = self.data.qfrc_applied
         self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
+        self._applied: list[float] = []  # Nm of the last step, where they alone are in `data`; [] for none
         # Where the motor of each joint stands in `data`: with its link, or at the end.
         self._motors: slice | np.ndarray = slice(count)
-        self._is_elastic = bool(self.config.elastic)
-        if self._is_elastic:
+        self.is_elastic = bool(self.config.elastic)  #: whether motors move apart from their links
+        if self.is_elastic:
             self._motors = np.arange(count)
             self._motors[self.config.elastic] = range(count, self.model.nv)
         self._substeps = round(STEP / self.model.opt.timestep)
@@ -296,26 +298,29 @@ class SimulatedArm:
     @property
     def positions(self) -> list[float]:
         """Joint angles (n,) in rad."""
-        return list(self._theta.tolist())
+        positions: list[float] = self._theta.tolist()
+        return positions
 
     @property
     def velocities(self) -> list[float]:
         """Joint velocities (n,) in rad/s."""
-        return list(self._velocity.tolist())
+        velocities: list[float] = self._velocity.tolist()
+        return velocities
 
     @property
     def motor_positions(self) -> list[float]:
         """Angles of the joints' motors (n,) in rad; those of the links where the joints are rigid."""
-        return list(self.data.qpos[self._motors].tolist()) if self._is_elastic else self.positions
+        return list(self.data.qpos[self._motors].tolist()) if self.is_elastic else self.positions
 
     @property
     def motor_velocities(self) -> list[float]:
         """Velocities of the joints' motors (n,) in rad/s."""
-        return list(self.data.qvel[self._motors].tolist()) if self._is_elastic else self.velocities
+        return list(self.data.qvel[self._motors].tolist()) if self.is_elastic else self.velocities
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""
         mujoco.mj_resetData(self.model, self.data)
+        self._applied = []
         self._theta[:] = floats("theta", theta, len(self._theta), -math.pi, math.pi, "rad")
         self.data.qpos[self._motors] = self._theta
         mujoco.mj_forward(self.model, self.data)
@@ -347,33 +352,53 @@ class SimulatedArm:
         of_motors: (n,) Nm, the part that gears carry; None: all of it.
         damping: (n,) Nm s/rad, of the motors, whose part of `torque` follows the velocity within a step; () for none.
         """
-        force = np.zeros(self.model.nv)
-        self._damping[:] = self._viscous
-        if any(damping):
-            # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
-            self._damping[self._motors] += damping
-            force[self._motors] += self.data.qvel[self._motors] * damping
-        if of_motors is None or not self._is_elastic:
-            force[self._motors] += torque
+        if self.is_elastic:
+            self._load_motors_and_links(torque, of_motors, damping)
         else:
-            force[self._motors] += of_motors
-            force[: len(self._theta)] += np.subtract(torque, of_motors)
-        self._torque[:] = force
+            self._load_joints(torque, damping)
         constant, count = self._coulomb, count * self._substeps
-        if self._load_share.any():
+        if self._has_load_friction:
             constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
             self.model.dof_frictionloss[self._motors] = constant
-        if not (self._turns or self._stribeck.any()):
+        if not (self._turns or self._has_stribeck):
             mujoco.mj_step(self.model, self.data, count)
             return
-        links = slice(len(self._theta))
+        given, links = self._torque.copy(), slice(len(self._theta))
         for _ in range(count):
             fading = np.exp(-np.square(self.data.qvel[self._motors] / self._speed))
             self.model.dof_frictionloss[self._motors] = constant + self._stribeck * fading
             mujoco.mj_step1(self.model, self.data)
             if self._turns:
-                self._torque[links] = force[links] + self.data.qfrc_bias[links] - self._turning_bias()
+                self._torque[links] = given[links] + self.data.qfrc_bias[links] - self._turning_bias()
             mujoco.mj_step2(self.model, self.data)
+
+    def _load_joints(self, torque: Sequence[float], damping: Sequence[float]) -> None:
+        """Set the torques of a step of a rigid arm, as `step` gets them; most steps repeat those of the one before."""
+        if any(damping):
+            # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
+            self._damping[:] = self._viscous + damping
+            moving = zip(torque, self._velocity.tolist(), damping, strict=True)
+            self._torque[:] = [pull + speed * own for pull, speed, own in moving]
+            self._applied = []
+        elif self._applied != (applied := list(torque)):
+            self._damping[:], self._torque[:] = self._viscous, applied
+            self._applied = [] if self._turns else applied  # where the base turns, `step` changes them
+
+    def _load_motors_and_links(
+        self, torque: Sequence[float], of_motors: Sequence[float] | None, damping: Sequence[float]
+    ) -> None:
+        """Set the torques of a step of an arm with elastic joints, as `step` gets them."""
+        force = np.zeros(self.model.nv)
+        self._damping[:] = self._viscous
+        if any(damping):
+            self._damping[self._motors] += damping
+            force[self._motors] += self.data.qvel[self._motors] * damping
+        if of_motors is None:
+            force[self._motors] += torque
+        else:
+            force[self._motors] += of_motors
+            force[: len(self._theta)] += np.subtract(torque, of_motors)
+        self._torque[:] = force
 
     def _turning_bias(self) -> np.ndarray:
         """Return the torque (n,) in Nm of gravity and inertia at constant joint velocities, on a base that turns."""

@@ -108,10 +108,9 @@ class SimulatedDevice:
         if self.truth:
             self.truth.synchronise(self._clock)
         steps = int((self._clock - self.time) / STEP + 1e-6)
-        while steps > 0:
-            count = steps if self.truth is None and self._steady(steps * STEP) else 1
-            self._step(self.arm.positions, self.arm.velocities, count)
-            steps -= count
+        at_once = steps if self.truth is None and steps > 0 and self._steady(steps * STEP) else 1
+        for _ in range(0, steps, at_once):
+            self._step(self.arm.positions, self.arm.velocities, at_once)
 
     def exchange(self, can_id: int, data: bytes) -> Frame | None:
         """Pass the frame `data` with arbitration ID `can_id` to the motors; return (ID, data) of the reply, if any."""
@@ -236,23 +235,27 @@ class SimulatedDevice:
             self.arm.move_base(*self.arm.config.felt(self.side, state))
 
     def _step(self, theta: list[float], velocity: list[float], count: int) -> None:
+        now, arm = self.time, self.arm
         for joint, returns in enumerate(self._power_returns):
-            if self.time >= returns:
+            if now >= returns:
                 self._power_returns[joint] = math.inf
                 self.motors[joint].unplugged = False
-        at = zip(self.motors, self.arm.motor_positions, self.arm.motor_velocities, strict=True)
+        angles, speeds = (arm.motor_positions, arm.motor_velocities) if arm.is_elastic else (theta, velocity)
+        at = zip(self.motors, angles, speeds, strict=True)
         torque = [motor.advance(angle, speed, count * STEP) for motor, angle, speed in at]
-        elapsed = self.time - self._script_start
+        elapsed = now - self._script_start
         given = self.wearer.torque(elapsed, theta, velocity)
         self._follow_trunk(elapsed)
         damping = [motor.damping for motor in self.motors]
         if self.truth:
             on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
-            self.truth.note(self.time, theta, velocity, torque, damping, given, self._frames, step, on)
-        each = zip(damping, self.motors, torque, strict=True)
-        prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
-        self.arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
+            self.truth.note(now, theta, velocity, torque, damping, given, self._frames, step, on)
+        prompt: Sequence[float] = ()
+        if any(damping):
+            each = zip(damping, self.motors, torque, strict=True)
+            prompt = [own if own and motor.damps_at_once(pull) else 0.0 for own, motor, pull in each]
+        arm.step(list(map(operator.add, torque, given)), count, torque, prompt)
         self._steps += count
 
 

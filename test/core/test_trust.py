@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from exo_gravity.core.safety.trust import Readings
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
 from ..support.safety_run import LIMITS, SafetyRun, reading
+from ..support.thorough import quick
 
 SPEC = MOTORS["AK80-9"]
 CODE = 2.0 * SPEC.velocity_range / 4095.0  # rad/s of the velocity on the wire
@@ -97,9 +99,11 @@ def resting(now: float) -> float:
     return 0.3
 
 
-@pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
-@pytest.mark.parametrize("angle", [knocked, reaching, resting])
-@pytest.mark.parametrize("scale", [1.0, 0.9, 50.0 / 45.0])
+SCALES, ANGLES, RATES = (1.0, 0.9, 50.0 / 45.0), (knocked, reaching, resting), (100.0, 250.0, 500.0)
+QUICK = [(0.9, knocked, 100.0), (1.0, reaching, 250.0), (50.0 / 45.0, knocked, 500.0), (1.0, resting, 100.0)]
+
+
+@pytest.mark.parametrize(("scale", "angle", "rate"), quick(QUICK, itertools.product(SCALES, ANGLES, RATES)))
 def test_ordinary_equipment_keeps_trust_while_a_wearer_reaches_and_the_arm_is_knocked(rate, angle, scale):
     motion = Motion(angle, Motor(scale=scale), rate, is_busy=True).run(60.0)
     assert motion.readings.trusted

@@ -89,6 +89,7 @@ def test_a_load_of_1_kg_is_weighed_and_the_arm_stays_calm():
     assert np.abs(speed).max() < 2.0
 
 
+@pytest.mark.thorough
 def test_a_wearer_who_helps_with_one_joint_is_refused():
     push = {"push": [0.0, 0.0, 2.5, 0.0], "over": 60.0}  # half a sine wave: nearly constant while the arm is weighed
     weighing, _, _ = weigh(0.5, {"hold": 0.1}, push)

@@ -24,7 +24,8 @@ from exo_gravity.sim.virtual_arm import VirtualArm
 from exo_gravity.sim.virtual_time import Wire
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
-RATE = 250.0  # Hz
+RATE = 125.0  # Hz
+REAL_RATE = 250.0  # Hz, of config/exo.yaml: how far a joint moves until a loss is seen depends on it
 POSE = [0.0, 0.5, 0.4, 0.6]  # rad
 WORN_MASS, WORN_COG = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause
@@ -42,6 +43,7 @@ class CarriedArm(DirectController, VirtualArm):
     bitrate: bit/s of a wire with arbitration; 0: frames take no time.
     is_fd: whether frames are those of CAN FD.
     stiffness, play: of all joints, Nm/rad and rad; 0: rigid. The compensator knows the stiffness.
+    rate: cycles of the loop per s.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class CarriedArm(DirectController, VirtualArm):
         is_fd: bool = False,
         stiffness: float = 0.0,
         play: float = 0.0,
+        rate: float = RATE,
     ) -> None:
         config = ArmConfig(
             wearer_mass=WORN_MASS,
@@ -77,7 +80,7 @@ class CarriedArm(DirectController, VirtualArm):
         wire = Wire(start=0.0, bitrate=bitrate)
         wire.play(device, tick=None)
         port = CanPort(wire.open(), wire.clock, wire.open, is_fd)
-        VirtualArm.__init__(self, device, self, joints, limits, RATE, wire, [port] * len(joints))
+        VirtualArm.__init__(self, device, self, joints, limits, rate, wire, [port] * len(joints))
         self.truth = device.truth = TruthRecords()
 
     def carry(self) -> None:

@@ -51,6 +51,8 @@ class CompensatedArm(DirectController, VirtualArm):
     """The arm of a 75 kg wearer, carried in `pose`; settings: what differs from exact Zero-G.
 
     imu: of the trunk; None for a trunk that is upright.
+    rate: cycles of the loop per s.
+
     top_speed: rad/s, the largest true speed of a joint since the arm was raised. driven: rad/s, the same of a joint
     along its motor's torque. torques: (n, 4) Nm, what the motors applied since then. is_damped: whether the bridge
     damps while the load changes.
@@ -64,6 +66,7 @@ class CompensatedArm(DirectController, VirtualArm):
         friction: float = 0.1,
         has_wearer: bool = True,
         imu: TrunkSensor | None = None,
+        rate: float = 1.0 / CYCLE,
         **settings: Any,
     ) -> None:
         mass, cog = WEARER
@@ -77,7 +80,7 @@ class CompensatedArm(DirectController, VirtualArm):
         config = ArmConfig(coulomb_friction=(friction,) * JOINT_COUNT, **(worn if has_wearer else {}))
         device = make_device(config=config, formats=formats)
         DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
-        VirtualArm.__init__(self, device, self, joints_of(formats), limits, 1.0 / CYCLE, look=self._look)
+        VirtualArm.__init__(self, device, self, joints_of(formats), limits, rate, look=self._look)
         self.person = Person(pose)
         if imu:
             self.add_imu(imu, self.compensator, 0.01)

@@ -44,7 +44,9 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
     arm.assert_let_down()
 
 
-@pytest.mark.parametrize("error", [ValueError("garbled line"), OSError("no device")])
+@pytest.mark.parametrize(
+    "error", [ValueError("garbled line"), pytest.param(OSError("no device"), marks=pytest.mark.thorough)]
+)
 def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
     arm = raised_arm()
     arm.wire.break_down(error)

@@ -13,6 +13,7 @@ from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 
 from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
+from ..support.thorough import quick
 
 ROWS = (
     (Row("paper", EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"), 0.5),
@@ -21,7 +22,7 @@ ROWS = (
 )
 
 
-@pytest.mark.parametrize(("row", "most"), ROWS, ids=lambda value: getattr(value, "name", ""))
+@pytest.mark.parametrize(("row", "most"), quick(ROWS[:1], ROWS), ids=lambda value: getattr(value, "name", ""))
 def test_ordinary_equipment_carries_an_arm_without_an_alarm(row, most):
     result = row.play(1.0, carried=2.0)
     assert is_quiet(result), result

@@ -13,6 +13,7 @@ from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import Drive, State
 
+from ..support.thorough import quick
 from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig, raised_arm
 
 FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
@@ -39,7 +40,10 @@ def carried_again(arm: CarriedArm) -> None:
     assert arm.rig.motors_on == [True] * 4
 
 
-@pytest.mark.parametrize(("wire_format", "duration", "clears"), [(MIT, 2.0, True), (MIT_V3, 9.0, False)])
+SUPPLY_RETURNS = [(MIT, 2.0, True), (MIT_V3, 9.0, False)]
+
+
+@pytest.mark.parametrize(("wire_format", "duration", "clears"), quick(SUPPLY_RETURNS[:1], SUPPLY_RETURNS))
 def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     wire_format: WireFormat, duration: float, clears: bool
 ) -> None:
@@ -63,8 +67,10 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     carried_again(arm)
 
 
-@FORMATS
-@pytest.mark.parametrize(("first", "others"), [(3.0, 9.0), (7.4, 7.6)])
+RETURNS = [(MIT, 3.0, 9.0), (MIT, 7.4, 7.6), (MIT_V3, 3.0, 9.0), (MIT_V3, 7.4, 7.6)]
+
+
+@pytest.mark.parametrize(("wire_format", "first", "others"), quick([RETURNS[0], RETURNS[3]], RETURNS))
 def test_motors_that_return_one_after_the_other_stay_off(wire_format: WireFormat, first: float, others: float) -> None:
     """The way down is over before the last motor returns: that must not decide what the first one applies."""
     arm = raised_arm(wire_format=wire_format)
@@ -105,8 +111,10 @@ def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the
     assert arm.rig.motors_on == [False] * 4
 
 
-@FORMATS
-@pytest.mark.parametrize("away", [0.5, 6.0, 15.0])
+AWAY = [(wire_format, away) for wire_format in (MIT, MIT_V3) for away in (0.5, 6.0, 15.0)]
+
+
+@pytest.mark.parametrize(("wire_format", "away"), quick([(MIT, 15.0), (MIT_V3, 0.5)], AWAY))
 def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
     wire_format: WireFormat, away: float
 ) -> None:

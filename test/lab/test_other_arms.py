@@ -16,6 +16,7 @@ from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.lab.trial.scripted import read_script
 from exo_gravity.sim.script import TrialScript
 
+from ..support.thorough import quick
 from ..support.urdf_oracle import MujocoArm
 
 POSES = {
@@ -31,7 +32,7 @@ def script_to(pose: list[float]) -> TrialScript:
     return TrialScript.parse({"name": "raise", "steps": [{"move": pose, "over": 3.0}, {"hold": 3.0}]})
 
 
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize("name", quick(["three_joints"], POSES))
 def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
     params, script = packaged_config(f"{name}.yaml"), script_to(POSES[name])
     (trial,) = simulated_trials(params, script)

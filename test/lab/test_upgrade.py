@@ -18,6 +18,7 @@ from exo_gravity.sim.params import SIMULATOR
 from exo_gravity.sim.script import TrialScript
 
 from ..support import DATA
+from ..support.thorough import quick
 
 THEN = DATA / "a47959f4"
 TABLES = {"can_bridge": CAN_BRIDGE, "imu": IMU, "simulator": SIMULATOR}
@@ -41,7 +42,7 @@ def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str
         assert arm.can_bridge["start_pose"] == CONFIRM  # the one thing that is new to them
 
 
-@pytest.mark.parametrize("file", ["sim", "sim_both"])
+@pytest.mark.parametrize("file", quick(["sim"], ["sim", "sim_both"]))
 def test_every_simulated_arm_is_carried_through_a_trial(file: str) -> None:
     for trial in simulated_trials(THEN / f"{file}.yaml", SHORT):
         recording = trial.run()

@@ -107,6 +107,7 @@ def test_a_tilt_is_believed_by_its_stamp_and_gravitys_vector_goes_before_pitch_a
         probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
 
 
+@pytest.mark.thorough
 def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_that_fits(launch, probe, feed):
     nodes = launch(without=OTHER_NODES, compensator=NO_IMU, wearer=True)
     bridge = rclpy.create_node("can_bridge", namespace="/right", context=probe.context)

@@ -189,6 +189,7 @@ def test_efforts_for_an_effort_controller_are_refused(compensator):
         compensator("command_interface:=multi_array")
 
 
+@pytest.mark.thorough
 @pytest.mark.real_time
 def test_both_nodes_run_under_their_own_names_carry_the_arm_and_let_it_down(launch, probe, listen):
     nodes = launch(without=("imu",), timing=CALM, compensator=NO_IMU, one_process=True)

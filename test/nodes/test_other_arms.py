@@ -11,7 +11,7 @@ from exo_gravity.lab.inputs.parameter_file import packaged_config
 
 from ..support.urdf_oracle import MujocoArm
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 
 POSE = [0.5, 0.4, 0.7]  # rad
 

@@ -189,6 +189,7 @@ def test_a_live_line_has_joints_step_and_faults(session):
     assert line["faults"] == ["right/bridge: motor 2 is silent"]
 
 
+@pytest.mark.thorough
 def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, tmp_path):
     small = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))  # noqa: E731
     # A compiled module that is cut would keep every later process of this environment from starting.

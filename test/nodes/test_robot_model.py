@@ -138,6 +138,7 @@ def test_an_arm_that_falls_silent_disappears_and_the_other_stays(nodes, viewer):
     viewer.wait_until(lambda: viewer.problem == "no messages on /left/joint_states")
 
 
+@pytest.mark.thorough
 def test_a_recording_holds_each_joint_state_once_and_the_arms_run_on_if_robot_model_ends(nodes, viewer, folder):
     viewer.wait_until(lambda: len(viewer.states.name) == 8)
     nodes.process("/robot_model").kill()

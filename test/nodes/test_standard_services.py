@@ -25,7 +25,7 @@ from ..support.launched_nodes import CALM
 from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 ARM = ("can_bridge", "compensator", "simulator", "wearer")
 NODES = ("/imu", "/recorder", "/robot_model", "/panel", *(f"/right/{name}" for name in ARM))
 TYPES = (*range(10), 99, 255)  # of parameters; the last two do not exist
@@ -88,11 +88,10 @@ def nodes(prepare, tmp_path):
     print("\n".join(nodes.log))
 
 
-@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 6), marks=pytest.mark.thorough)], ids=str)
-def test_no_request_to_a_standard_service_ends_a_node_or_lets_the_arm_down(nodes, probe: RosProbe, seeds: range):
+def test_no_request_to_a_standard_service_ends_a_node_or_lets_the_arm_down(nodes, probe: RosProbe):
     probe.get_carried()
     probe.states.clear()
-    for seed in seeds:
+    for seed in range(6):
         for node in NODES:
             for kind, name, request in requests(seed):
                 for _ in range(2):

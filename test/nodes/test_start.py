@@ -22,6 +22,7 @@ OTHER_NODES = ("can_bridge", "simulator", "imu")
 SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 
+@pytest.mark.thorough
 def test_a_bad_parameter_ends_the_launcher_with_one_sentence_and_no_motor_is_enabled(prepare, listen):
     nodes = prepare(can_bridge={"homes": [0.2] * 4})  # test_validation.py has the other refusals
     listener = listen(nodes)
@@ -66,6 +67,7 @@ def test_a_parameter_dump_starts_the_same_nodes_without_changes(tmp_path, prepar
     assert second.ended_node is None
 
 
+@pytest.mark.thorough
 def test_real_time_threads_and_locked_memory_are_used_or_the_log_states_that_they_are_not_permitted(launch, probe):
     nodes = launch(without=OTHER_NODES, compensator={**NO_IMU, "thread_priority": 10})
     probe.wait_until(lambda: "waiting for joint_states" in "".join(nodes.log))

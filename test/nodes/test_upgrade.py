@@ -11,7 +11,7 @@ from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM
 
 from ..support import DATA
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
 ARMING = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
 
 

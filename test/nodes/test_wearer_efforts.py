@@ -127,6 +127,7 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_th
     probe.wait_until(lambda: torques() == NONE and len(found[""]) > told)
 
 
+@pytest.mark.thorough
 def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arrives(launch, probe):
     names, pose, given = ["abduction", "flexion", "elbow"], [0.4, 0.5, 0.7], np.array((1.0, -2.0, 0.5))
     text = packaged_config("arms/three_joints.urdf").read_text(encoding="utf-8")
@@ -146,6 +147,7 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arr
     assert probe.diagnostic("wearer", "budget") == "unknown"
 
 
+@pytest.mark.thorough
 def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_parameter(launch, probe, arm):
     launch(without=OTHER_NODES, compensator={**WORN, "support": 0.5})
     probe.wait_until(lambda: probe.effort_commands)
@@ -202,6 +204,7 @@ def support_in_use(probe) -> float:
     return float(probe.diagnostic("compensator", "support in use") or 0.0)
 
 
+@pytest.mark.thorough
 def test_a_wrong_or_second_sender_of_requests_raises_no_support(launch, probe, arm):
     launch(without=OTHER_NODES, compensator=ADAPTIVE)
     arm.effort = CARRIED.tolist()

@@ -18,7 +18,7 @@ from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedM
 
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 LIMITS = Limits(("rotation", "abduction", "flexion", "elbow"))
-RATE = 250.0
+RATE = 125.0
 TOP_SPEED = 1.0  # rad/s
 HORIZONTAL = (0.0, 1.5, 0.0, 0.3)
 POSES = [HORIZONTAL, (0.0, 0.8, 0.6, 0.5), (0.0, 0.6, 0.9, 1.5), (1.5, 1.5, -0.7, 2.5), (0.0, 0.1, 2.3, 0.1)]

@@ -37,7 +37,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT
     device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 250.0, tilt and resting(*tilt))
+    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 125.0, tilt and resting(*tilt))
     return OfflineTrial(arm, script, 8.0)
 
 
@@ -91,7 +91,7 @@ def test_after_a_motor_failure_the_arm_is_let_down_and_the_joint_named():
 def test_a_stop_lets_the_arm_down_and_keeps_the_recording_which_is_the_same_until_then(done):
     trial = make()
     recording = trial.run(lambda now: now >= 10.0)
-    assert np.all(recording.position[: 10 * 250] == done[1].position[: 10 * 250])
+    assert np.all(recording.position[: 10 * 125] == done[1].position[: 10 * 125])
     assert trial.trouble == "right: stopped by the operator"
     ((start, end),) = recording.carried
     assert 2.0 < start < 8.0  # the checks take a second without trouble, then the sign check of four joints

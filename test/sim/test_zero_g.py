@@ -41,7 +41,7 @@ def test_zero_g_holds_the_wearers_arm_for_10_s_within_a_sixth_of_a_degree():
     device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
     device.pitch, device.roll = BENT
     script = TrialScript.parse({"name": "release", "steps": [{"move": HELD, "over": 3.0}, {"hold": 10.0}]})
-    setup = ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, CONTROLLER, 250.0, resting(*BENT))
+    setup = ArmSetup("right", device, MOTORS_OF_ARM, LIMITS, CONTROLLER, 125.0, resting(*BENT))
     trial = OfflineTrial(setup, script, 3.0)
     recording = trial.run()
     hold = recording.steps[-1]

@@ -7,13 +7,13 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
 import pytest
-from distributed import Client, LocalCluster
 
 from exo_gravity.lab.bag.writer import repair
 from exo_gravity.lab.parallel import on_cluster
@@ -30,10 +30,10 @@ DAY = 86_400 * 10**9  # ns
 JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
 
 
-@pytest.fixture
-def trials(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
     """A folder of three trials of one subject, a day each, one that is no recording, and one that is cut."""
-    folder = tmp_path / "trials"
+    folder, monkeypatch = tmp_path_factory.mktemp("written") / "trials", pytest.MonkeyPatch()
     for number, drift in enumerate(DRIFTS):
         with monkeypatch.context() as day:
             day.setattr(made, "START", made.START + number * DAY)
@@ -48,6 +48,12 @@ def trials(tmp_path, monkeypatch):
     (folder / "damaged").mkdir()
     (folder / "damaged" / "text.mcap").write_text("no recording")
     return folder
+
+
+@pytest.fixture
+def trials(written, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(written, tmp_path / "trials")
 
 
 def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, capsys):
@@ -97,7 +103,10 @@ def test_a_copy_that_was_repaired_is_not_a_second_trial(trials):
     assert cohort.recordings_below(trials) == before and cohort.recordings_below(copy) == [copy]
 
 
+@pytest.mark.thorough
 def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_there_twice(trials, tmp_path):
+    from distributed import Client, LocalCluster  # a second of imports, which no other test needs
+
     bags = []
     for number in range(8):
         recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=math.radians(number) / 60.0)

@@ -131,6 +131,7 @@ def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all
 
 
 @pytest.mark.usefixtures("without_pictures")
+@pytest.mark.thorough
 def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_poses_that_give_way(run, capsys):
     masses = [round(1.1 * mass, 4) for mass in (0.585, 0.468, 0.598, 0.203)]
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}

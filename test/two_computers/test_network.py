@@ -12,6 +12,7 @@ import pytest
 from ..support.waiting import PATIENCE, wait_until
 from .network import ADDRESSES, Network, Wire
 
+pytestmark = pytest.mark.thorough
 COUNT = 300
 ECHO = [sys.executable, "-m", "test.two_computers.echo"]
 

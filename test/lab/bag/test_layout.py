@@ -67,7 +67,7 @@ def field(message, path):
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(st.data())
 def test_numbers_and_texts_are_those_that_rosbags_decodes(kind, data):
     written = [MAKERS[kind](data.draw) for _ in range(data.draw(st.integers(1, 4)))]

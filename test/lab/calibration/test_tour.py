@@ -24,11 +24,13 @@ from exo_gravity.lab.calibration.tour import Tour
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from ...support.thorough import quick
 from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device, fixed
 
 LIMITS = Limits(NAMES, sign_check_torque=0.0)
 POSE = Station((0.1, 0.5, 0.6, 0.7))
 TWO = POSE, Station((0.0, 0.3, 0.5, 0.4))
+RATE = 50.0  # Hz
 SCALES = (0.8, 1.2, 0.9, 1.0)
 WEIGHT = (1.0, 0.28)  # kg, m from the elbow
 WEIGHED = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
@@ -49,7 +51,7 @@ def wrong_file():
     links = DEFAULT_LINKS
     truth = ArmModel(links.length, links.cog * 0.9, links.mass * (1.2, 0.8, 1.15, 0.8))
     motors = [replace(motor, torque_scale=scale) for motor, scale in zip(MOTORS_AS_MOUNTED, SCALES, strict=True)]
-    run = TourRun(truth=ArmConfig(truth), motors=motors)
+    run = TourRun(truth=ArmConfig(truth), motors=motors, rate=RATE)
     return run, run.run(Itinerary(LIMITS, 4, 80.0)), truth
 
 
@@ -87,7 +89,7 @@ def test_a_tour_is_slow_and_no_limit_of_the_bridge_acts(wrong_file):
     run, _, _ = wrong_file
     positions = np.array(run.log)[:, 1:5]
     assert run.fastest < 0.9  # for moments, where a light joint leaves its friction
-    assert np.abs(np.diff(positions[::50], axis=0)).max() / 0.5 < 1.3 * MOTION.speed
+    assert np.abs(np.diff(positions[:: round(0.5 * run.rate)], axis=0)).max() / 0.5 < 1.3 * MOTION.speed
     assert not run.safety.acted
 
 
@@ -105,7 +107,7 @@ class Grip:
 
 
 def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
-    run = TourRun(disturb=Grip(18.0))
+    run = TourRun(disturb=Grip(18.0), rate=RATE)
     tour = run.run(fixed(TWO))
     assert tour.trouble.startswith("flexion: ") and "a hand" in tour.trouble and "the limit is" in tour.trouble
     assert run.safety.fault.code is FaultCode.COMMAND_WITHDRAWN and not run.device.powered
@@ -114,7 +116,7 @@ def test_a_hand_that_holds_the_arm_stops_the_tour_and_is_named():
 
 def test_a_saturated_joint_is_named_with_its_limit():
     limits = replace(LIMITS, max_effort=(3.0, 9.0, 1.0, 3.0))
-    tour = TourRun(limits=limits).run(fixed([Station((0.0, 0.3, 1.2, 0.2))]))
+    tour = TourRun(limits=limits, rate=RATE).run(fixed([Station((0.0, 0.3, 1.2, 0.2))]))
     assert tour.trouble.startswith("flexion: saturated") and "max_effort = 1 Nm" in tour.trouble
     assert tour.elapsed < 15.0
 
@@ -123,12 +125,13 @@ def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_me
     def unplug(time, device):
         device.motors[1].unplugged = time > 18.0
 
-    run = TourRun(disturb=unplug)
+    run = TourRun(disturb=unplug, rate=RATE)
     tour = run.run(fixed(TWO))
     assert run.safety.fault.code is FaultCode.MOTOR_SILENT and "abduction" in run.safety.fault.reason
     assert tour.measured and not tour.done
 
 
+@pytest.mark.thorough
 def test_a_joint_that_slips_between_two_passes_is_named():
     """A slip shows as a torque that differs between two passes of the same angle."""
 
@@ -284,12 +287,12 @@ def test_friction_over_speed_is_fitted_with_and_without_stribeck():
         fit_friction(speed[:1], speed[:1], error[:1], speed[:1])
 
 
-@pytest.mark.parametrize("noise", [0.004, 0.008])
+@pytest.mark.parametrize("noise", quick([0.008], [0.004, 0.008]))
 def test_no_stribeck_friction_is_made_of_noise_and_the_errors_cover_the_truth(noise):
     speed = np.array((0.1, 0.02, 0.05, 0.1, 0.18, 0.3, 0.1, 0.1, 0.1, 0.1))
     carried = np.array((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, -3.0, 2.0, 4.0))
     true, fits, rng = 0.2 + 0.05 * speed, [], np.random.default_rng(4)
-    for _ in range(300):
+    for _ in range(200):
         measured = true + rng.normal(0.0, noise, len(speed))
         fits.append(fit_friction(speed, measured, np.full(len(speed), noise), carried))
     assert np.mean([fit.stribeck > 0.0 or fit.load > 0.0 for fit in fits]) < 0.01
