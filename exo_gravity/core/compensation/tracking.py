@@ -7,6 +7,12 @@ that of the way back gravity minus friction.
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
 is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have the same natural
 frequency, however they are coupled.
+
+Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
+which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
+sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
+Stribeck friction best, and lowers them as long as a motor vibrates. Lowered gains pass a low-pass filter, which leaves
+nothing of them at the rotor's frequencies.
 """
 
 import math
@@ -44,6 +50,18 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
+    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated
+    softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
+    least_frequency: float = 2.5  #: rad/s: below, the integral part takes a second for 0.1 Nm of friction
+    #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
+    #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
+    filtered_from: float = 10.0
+    filter_order: int = 3  #: of first-order filters in a row
+    swing: float = 0.1  #: rad/s off a motor's mean speed, on both sides: four steps of its 12 bits
+    mean_speed: float = 0.04  #: s, time constant of that mean
+    slowest_swing: float = 0.04  #: s from one side to the other; the controller's own motion is slower
+    swings: int = 6  #: in a row, which are a vibration: a joint that leaves its friction swings twice
+    calm: float = 0.3  #: s in which a vibration may fade under lower gains
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -158,6 +176,40 @@ def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
     return np.asarray(ways / (2.0 * MOTION.window * station.amplitude))
 
 
+class Vibration:
+    """Sees motors whose speeds swing from side to side faster than any joint is moved. count: of motors.
+
+    speed: (n,) rad/s, their mean.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.speed = np.zeros(count)
+        self._side = np.zeros(count)
+        self._since = np.zeros(count)  # s
+        self._swings = np.zeros(count)
+
+    def step(self, dt: float, velocity: Vector) -> np.ndarray:
+        """Return which motors (n,) vibrate; velocity: (n,) rad/s, `dt` s after the last."""
+        self.speed = self.speed + passed(dt / TRACKER.mean_speed) * (velocity - self.speed)
+        off = velocity - self.speed
+        side = np.where(np.abs(off) > TRACKER.swing, np.sign(off), 0.0)
+        is_turned = side * self._side < 0.0
+        self._side = np.where(side, side, self._side)
+        self._since = np.where(is_turned, 0.0, self._since + dt)
+        goes_on = self._since <= TRACKER.slowest_swing
+        self._swings = np.where(goes_on, self._swings + is_turned, 0.0)
+        return np.asarray(self._swings >= TRACKER.swings)
+
+    def forget(self) -> None:
+        """Count anew."""
+        self._swings = np.zeros_like(self._swings)
+
+
+def passed(time: float) -> float:
+    """Return the share of a change that a low-pass filter passes on within `time`, in its time constants."""
+    return 1.0 - math.exp(-time)
+
+
 class Tracker:
     """Moves all joints along lines, one after the other, and takes the samples of sweeps.
 
@@ -165,6 +217,8 @@ class Tracker:
     before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
     behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    speed: (n,) rad/s of the joints, without vibration. vibrates: (n,) whether a joint's motor vibrates even under the
+    lowest gains.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
@@ -173,7 +227,10 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
-        self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
+        self.vibrates = np.zeros(count, bool)
+        self._vibration, self._calm = Vibration(count), 0.0  # s left
+        self._frequency, self._is_soft = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate), False
+        self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
         self._slide = np.zeros(count)  # Nm that compensate friction
@@ -218,9 +275,32 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
+        self._watch_vibration(dt, velocity)
         self._compensate_friction(dt, coming, speed_error)
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
+
+    @property
+    def speed(self) -> np.ndarray:
+        """The mean speeds (n,) of the joints in rad/s."""
+        return self._vibration.speed
+
+    def _watch_vibration(self, dt: float, velocity: Vector) -> None:
+        """Lower the gains if a motor vibrates, without a step of what they hold."""
+        self._calm = max(0.0, self._calm - dt)
+        vibrates = self._vibration.step(dt, velocity)
+        if self._calm or not vibrates.any():
+            return
+        if self._frequency <= TRACKER.least_frequency:
+            self.vibrates = vibrates
+            return
+        wanted = TRACKER.softer * self._frequency if self._is_soft else TRACKER.soft_frequency
+        before, self._frequency = self._frequency, max(TRACKER.least_frequency, min(wanted, self._frequency))
+        left = (self._frequency / before) ** 2
+        self._integral += (1.0 - left) * self._filter[-1]
+        self._filter *= left
+        self._is_soft, self._calm = True, TRACKER.calm
+        self._vibration.forget()
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -233,7 +313,7 @@ class Tracker:
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
         frequency = self._frequency
         stiff = matrix @ self.error * frequency**2
-        push = stiff + matrix @ speed_error * 2.0 * frequency
+        push = self._filtered(dt, stiff + matrix @ speed_error * 2.0 * frequency)
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
@@ -244,3 +324,11 @@ class Tracker:
         self._integral = np.where(is_saturated & (torque * self.error > 0.0), self._integral, integral)
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
+
+    def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
+        """Return `push` (n,) Nm, without what rotors could vibrate with once one has."""
+        share, value = passed(TRACKER.filtered_from * self._frequency * dt), push
+        for stage in self._filter:
+            stage += share * (value - stage)
+            value = stage
+        return value.copy() if self._is_soft else push
