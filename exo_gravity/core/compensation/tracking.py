@@ -5,14 +5,14 @@ All joints sweep through a pose there and back. At the same angle the torque of 
 that of the way back gravity minus friction.
 
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
-is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have the same natural
-frequency, however they are coupled.
+is an acceleration, which the arm's approximate mass matrix turns into torques: so each joint has the natural frequency
+that it is given, however they are coupled.
 
 Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
 sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
-Stribeck friction best, and lowers them as long as a motor vibrates. Lowered gains pass a low-pass filter, which leaves
-nothing of them at the rotor's frequencies.
+Stribeck friction best, and lowers those of a joint as long as its motor vibrates. Lowered gains pass a low-pass filter,
+which leaves nothing of them at the rotor's frequencies.
 """
 
 import math
@@ -190,7 +190,7 @@ class Vibration:
 
     def step(self, dt: float, velocity: Vector) -> np.ndarray:
         """Return which motors (n,) vibrate; velocity: (n,) rad/s, `dt` s after the last."""
-        self.speed = self.speed + passed(dt / TRACKER.mean_speed) * (velocity - self.speed)
+        self.speed = self.speed + (1.0 - math.exp(-dt / TRACKER.mean_speed)) * (velocity - self.speed)
         off = velocity - self.speed
         side = np.where(np.abs(off) > TRACKER.swing, np.sign(off), 0.0)
         is_turned = side * self._side < 0.0
@@ -200,14 +200,9 @@ class Vibration:
         self._swings = np.where(goes_on, self._swings + is_turned, 0.0)
         return np.asarray(self._swings >= TRACKER.swings)
 
-    def forget(self) -> None:
-        """Count anew."""
-        self._swings = np.zeros_like(self._swings)
-
-
-def passed(time: float) -> float:
-    """Return the share of a change that a low-pass filter passes on within `time`, in its time constants."""
-    return 1.0 - math.exp(-time)
+    def forget(self, which: np.ndarray) -> None:
+        """Count the swings of motors anew; which: (n,) whether it is one of them."""
+        self._swings = np.where(which, 0.0, self._swings)
 
 
 class Tracker:
@@ -228,8 +223,9 @@ class Tracker:
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
         self.vibrates = np.zeros(count, bool)
-        self._vibration, self._calm = Vibration(count), 0.0  # s left
-        self._frequency, self._is_soft = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate), False
+        self._vibration = Vibration(count)
+        self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))
+        self._is_soft, self._calm = np.zeros(count, bool), np.zeros(count)  # whether lowered, and s left to calm down
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
@@ -286,21 +282,21 @@ class Tracker:
         return self._vibration.speed
 
     def _watch_vibration(self, dt: float, velocity: Vector) -> None:
-        """Lower the gains if a motor vibrates, without a step of what they hold."""
-        self._calm = max(0.0, self._calm - dt)
-        vibrates = self._vibration.step(dt, velocity)
-        if self._calm or not vibrates.any():
+        """Lower the gains of joints whose motors vibrate, without a step of what they hold."""
+        self._calm = np.maximum(0.0, self._calm - dt)
+        vibrates = self._vibration.step(dt, velocity) & (self._calm == 0.0)
+        if not vibrates.any():
             return
-        if self._frequency <= TRACKER.least_frequency:
-            self.vibrates = vibrates
-            return
-        wanted = TRACKER.softer * self._frequency if self._is_soft else TRACKER.soft_frequency
-        before, self._frequency = self._frequency, max(TRACKER.least_frequency, min(wanted, self._frequency))
-        left = (self._frequency / before) ** 2
+        self.vibrates = vibrates & (self._frequency <= TRACKER.least_frequency)
+        wanted = np.where(self._is_soft, TRACKER.softer * self._frequency, TRACKER.soft_frequency)
+        lower = np.maximum(TRACKER.least_frequency, np.minimum(wanted, self._frequency))
+        left = np.where(vibrates, (lower / self._frequency) ** 2, 1.0)
+        self._frequency = np.where(vibrates, lower, self._frequency)
         self._integral += (1.0 - left) * self._filter[-1]
         self._filter *= left
-        self._is_soft, self._calm = True, TRACKER.calm
-        self._vibration.forget()
+        self._is_soft |= vibrates
+        self._calm = np.where(vibrates, TRACKER.calm, self._calm)
+        self._vibration.forget(vibrates)
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -311,9 +307,9 @@ class Tracker:
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
-        frequency = self._frequency
-        stiff = matrix @ self.error * frequency**2
-        push = self._filtered(dt, stiff + matrix @ speed_error * 2.0 * frequency)
+        frequency, root = self._frequency, np.sqrt(self._frequency)
+        stiff = frequency * (matrix @ (frequency * self.error))
+        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
@@ -326,9 +322,9 @@ class Tracker:
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
 
     def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
-        """Return `push` (n,) Nm, without what rotors could vibrate with once one has."""
-        share, value = passed(TRACKER.filtered_from * self._frequency * dt), push
+        """Return `push` (n,) Nm, in joints with lowered gains without what the rotor could vibrate with."""
+        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * self._frequency * dt), push
         for stage in self._filter:
-            stage += share * (value - stage)
+            stage += passed * (value - stage)
             value = stage
-        return value.copy() if self._is_soft else push
+        return np.where(self._is_soft, value, push)
