@@ -13,7 +13,7 @@ from bench.wearer.devices import draw
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
 from bench.wearer.report import verdict
 from bench.wearer.strapped_arm import RHYTHM, StrappedArm
-from bench.wearer.straps import table
+from bench.wearer.straps import TIED, table
 from bench.wearer.study import KINDS, Trial
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
@@ -120,7 +120,13 @@ def test_torques_measured_in_poses_know_an_arm_better_than_a_table():
     assert np.all(sprung.left[: ways.NOW] > 2.0 * sprung.left[ways.NOW])  # no other way knows springs
     assert carried.left[ways.NOW] > 0.05  # which no torque shows,
     assert carried.share_covered[1] and np.all(carried.covered[1] > 0.9) and carried.band[1] > 0.2  # but its band says
-    assert ways.tables([[plain, plain, sprung, carried, carried]]).count("\n") == 21
+    assert ways.tables([[plain, plain, sprung, carried, carried, plain]]).count("\n") == 24
+
+
+def test_a_shoulder_that_rises_is_within_the_band_of_a_calibration_that_has_seen_it():
+    seen = ways.seen_of(draw(4, "shoulder"))
+    assert seen.left[ways.NOW] < 0.08 < seen.left[0]
+    assert seen.share_covered[1] and np.all(seen.covered[1] > 0.9)
 
 
 def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rises_with_it():
@@ -145,9 +151,9 @@ def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rise
 
 def test_the_table_of_straps_has_a_row_for_each_tie():
     trial = judge_of_constant(0.5)
-    lines = table([[trial, trial, replace(trial, true_share=0.7)]]).splitlines()
-    assert len(lines) == 5 and "0.50 0.50 0.50 0.50" in lines[2]
-    assert "-20.0" in lines[4] and "+0.0" in lines[2]
+    lines = table([[*[trial] * (len(TIED) - 1), replace(trial, true_share=0.7)]]).splitlines()
+    assert len(lines) == 2 + len(TIED) and "0.50 0.50 0.50 0.50" in lines[2]
+    assert "-20.0" in lines[-1] and "+0.0" in lines[2]
 
 
 def judge_of_constant(error: float) -> Trial:

@@ -73,6 +73,9 @@ class TrackerTuning:
     slow_error: float = 0.04  #: rad behind the reference, from which on it slows down,
     stop_error: float = 0.08  #: and at which it waits
     full_friction_speed: float = 0.03  #: rad/s of the reference, from which on friction is compensated fully
+    standing: float = 0.03  #: rad/s, below which a joint that sticks is pushed off; one step of the velocity's 12 bits
+    push_off_rate: float = 1.5  #: Nm/s: a light joint at 100 Hz is late by 0.01 rad for 0.1 Nm of Stribeck friction
+    most_push_off: float = 0.3  #: Nm
 
 
 MOTION, TRACKER = MotionTuning(), TrackerTuning()
@@ -211,7 +214,8 @@ class Tracker:
     rate: control cycles per s. max_effort: (n,) Nm. lines: to follow, each taken when it begins; the owner sets them
     before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
     saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
-    behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    behind its path. sticks: (n,) whether a joint has not followed a sweep, as far as the owner knows it: it is pushed off
+    wherever it stands, and no longer. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
     speed: (n,) rad/s of the joints, without vibration. vibrates: (n,) whether a joint's motor vibrates even under the
     lowest gains.
     """
@@ -222,6 +226,7 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
+        self.sticks = np.zeros(count, bool)
         self.vibrates = np.zeros(count, bool)
         self._vibration = Vibration(count)
         self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))
@@ -230,6 +235,7 @@ class Tracker:
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
         self._slide = np.zeros(count)  # Nm that compensate friction
+        self._push_off = np.zeros(count)  # Nm beyond that, of joints that stick
         self._effort: Torque = (0.0,) * count
         self.lines: Iterator[Line] = iter(())
         self._line = Line(self.error, self.error)
@@ -273,6 +279,7 @@ class Tracker:
         speed_error = pace * heading - velocity
         self._watch_vibration(dt, velocity)
         self._compensate_friction(dt, coming, speed_error)
+        self._push(dt, np.sign(coming), np.asarray(velocity))
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
 
@@ -306,6 +313,12 @@ class Tracker:
         is_ahead = (self.error * way < -TRACKER.ahead) | (speed_error * way < -TRACKER.faster)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
+    def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray) -> None:
+        """Push joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1; velocity: (n,) rad/s."""
+        stands = self.sticks & (np.abs(velocity) < TRACKER.standing) & (self.error * way > TRACKER.ahead)
+        more = self._push_off + TRACKER.push_off_rate * dt * way
+        self._push_off = np.where(stands, np.clip(more, -TRACKER.most_push_off, TRACKER.most_push_off), 0.0)
+
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
         frequency, root = self._frequency, np.sqrt(self._frequency)
         stiff = frequency * (matrix @ (frequency * self.error))
@@ -313,7 +326,7 @@ class Tracker:
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
-        torque = expected + self._slide + push + integral
+        torque = expected + self._slide + self._push_off + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
         # Without this the integral would wind up.

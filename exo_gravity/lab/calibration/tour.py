@@ -188,6 +188,7 @@ class Tour:
             sweeps += pair
             share, was_known = followed(pair, station), bool(np.any(self._friction))
             sticks = bool(np.min(share) < MOTION.followed)
+            self._tracker.sticks |= share < MOTION.followed
             if station.speed >= STEADY_SPEED:
                 self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
                 self._tracker.friction = self._friction
