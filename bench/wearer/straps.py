@@ -69,7 +69,9 @@ def table(found: Sequence[Sequence[Trial]]) -> str:
 
 def main() -> int:
     """Run the study; print its table, and write it."""
-    options = options_of("bench.wearer.straps", "What straps, a shoulder that moves and elastic joints do.", Path("build/straps"))
+    options = options_of(
+        "bench.wearer.straps", "What straps, a shoulder that moves and elastic joints do.", Path("build/straps")
+    )
     found = part_by_part("straps", trials, options.seeds, lambda device: f"device {device[0].seed}: {troubles(device)}")
     text = table(found)
     print(text)

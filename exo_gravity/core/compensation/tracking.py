@@ -211,13 +211,17 @@ class Vibration:
 class Tracker:
     """Moves all joints along lines, one after the other, and takes the samples of sweeps.
 
-    rate: control cycles per s. max_effort: (n,) Nm. lines: to follow, each taken when it begins; the owner sets them
-    before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
-    saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
-    behind its path. sticks: (n,) whether a joint has not followed a sweep, as far as the owner knows it: it is pushed off
-    wherever it stands, and no longer. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
-    speed: (n,) rad/s of the joints, without vibration. vibrates: (n,) whether a joint's motor vibrates even under the
-    lowest gains.
+    rate: control cycles per s.
+    max_effort: (n,) Nm.
+
+    lines: to follow, each taken when it begins; the owner sets them before the first step.
+    friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
+    sticks: (n,), set by the owner, whether a joint has not followed a sweep: it is then pushed off wherever it stands.
+    saturated: (n,) s for which each joint has wanted more than its `max_effort`.
+    error: (n,) rad by which the arm is behind its path.
+    correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    speed: (n,) rad/s of the joints, without vibration.
+    vibrates: (n,) whether a joint's motor vibrates even under the lowest gains.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
