@@ -39,6 +39,7 @@ REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how u
 # What stops a tour.
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
+MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
 MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
@@ -120,15 +121,15 @@ class Tour:
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         tracker = self._tracker
-        joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrates, strict=True)
-        for name, behind, speed, vibrates in joints:
+        joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
+        for name, behind, speed, vibrations in joints:
             if not abs(behind) <= MAX_ERROR:
                 reason = "a hand is on the arm, or the joint is blocked"
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
-            if vibrates:
-                return f"{name}: its motor vibrates under the lowest gains: is the joint, or what it drives, loose?"
+            if vibrations > MAX_VIBRATIONS:
+                return f"{name}: its motor goes on vibrating under the lowest gains: is something loose?"
         return ""
 
     def _wrong_torque(self, dt: float) -> str:

@@ -10,7 +10,7 @@ springs none, within what relaxed joints have. A spring stays only if the poses 
 covariance is that with all springs, so that it contains the choice.
 
 What neither moments nor springs explain, such as a shoulder that rises with the arm, stays in the remainder and widens
-the error of the torque. Two more moments, which grow with elevation, were tried: ten poses do not tell them from springs.
+the error of the torque. Two more moments, which grow with elevation, were tried: ten poses tell them from no spring.
 
 What varies of the wearer's own activity shows when a pose is visited again. What does not vary is no longer visible: a
 person who carries a constant share of their arm looks like one with a lighter arm.
