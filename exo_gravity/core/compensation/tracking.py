@@ -50,16 +50,18 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
-    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated
+    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated,
+    soft_stiffness: float = 5.0  #: Nm/rad, and the same of inertia times its square: heavy joints oscillate at 10 Hz
     softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
-    least_frequency: float = 5.0  #: rad/s: with 4, a joint of 0.01 kg m^2 hardly follows (measured)
+    least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
+    least_stiffness: float = 1.2  #: Nm/rad: with less, a light joint hardly follows against its friction (measured)
     #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
     #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
     filtered_from: float = 10.0
     filter_order: int = 3  #: of first-order filters in a row
     swing: float = 0.1  #: rad/s off a motor's mean speed, on both sides: four steps of its 12 bits
     mean_speed: float = 0.04  #: s, time constant of that mean
-    slowest_swing: float = 0.04  #: s from one side to the other; the controller's own motion is slower
+    slowest_swing: float = 0.06  #: s from one side to the other; the controller's own motion is slower
     swings: int = 6  #: in a row, which are a vibration: a joint that leaves its friction swings twice
     calm: float = 0.3  #: s in which a vibration may fade under lower gains
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
@@ -281,7 +283,7 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
-        self._watch_vibration(dt, velocity)
+        self._watch_vibration(dt, velocity, np.diag(matrix))
         self._compensate_friction(dt, coming, speed_error)
         self._push(dt, np.sign(coming), np.asarray(velocity))
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
@@ -292,17 +294,22 @@ class Tracker:
         """The mean speeds (n,) of the joints in rad/s."""
         return self._vibration.speed
 
-    def _watch_vibration(self, dt: float, velocity: Vector) -> None:
-        """Lower the gains of joints whose motors vibrate, without a step of what they hold."""
+    def _watch_vibration(self, dt: float, velocity: Vector, inertia: np.ndarray) -> None:
+        """Lower the gains of joints whose motors vibrate, without a step of what they hold.
+
+        velocity: (n,) rad/s. inertia: (n,) kg m^2.
+        """
         self._calm = np.maximum(0.0, self._calm - dt)
         vibrates = self._vibration.step(dt, velocity) & (self._calm == 0.0)
         if not vibrates.any():
             return
         if not self._is_soft.any():
             vibrates |= True  # the others are about to
-        self.vibrations += vibrates & (self._frequency <= TRACKER.least_frequency)
-        wanted = np.where(self._is_soft, TRACKER.softer * self._frequency, TRACKER.soft_frequency)
-        lower = np.maximum(TRACKER.least_frequency, np.minimum(wanted, self._frequency))
+        least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
+        self.vibrations += vibrates & (self._frequency <= least)
+        soft = np.minimum(TRACKER.soft_frequency, np.sqrt(TRACKER.soft_stiffness / inertia))
+        wanted = np.where(self._is_soft, TRACKER.softer * self._frequency, soft)
+        lower = np.minimum(np.maximum(wanted, np.minimum(least, TRACKER.soft_frequency)), self._frequency)
         left = np.where(vibrates, (lower / self._frequency) ** 2, 1.0)
         self._frequency = np.where(vibrates, lower, self._frequency)
         self._integral += (1.0 - left) * self._filter[-1]
