@@ -13,7 +13,6 @@ On elastic joints the poses are those of the motors, behind which the links rest
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from dataclasses import replace
@@ -59,7 +58,6 @@ WEAKER = 0.03  # share of its torque that a warm motor lacks
 CABLES = 0.15  # Nm/rad
 REST = (-0.3, 0.8)  # rad, where a cable is slack
 STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
-PLAY = math.radians(1.0)
 POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
 NEW_POSES = 300
 MEDIAN, LARGE = 0.01, 0.025  # of peak: limits of the median and of the 95th percentile
@@ -73,7 +71,6 @@ class Effect(NamedTuple):
     stiffness: float = 0.0  #: Nm/rad of the cables across each joint
     slope: float = 0.0  #: 1/K of the torque scales
     joints: float = 0.0  #: Nm/rad of each joint; 0: rigid
-    play: float = 0.0  #: rad of each joint
 
 
 EFFECTS = {
@@ -81,8 +78,6 @@ EFFECTS = {
     f"cables {CABLES:g} Nm/rad": Effect(stiffness=CABLES),
     f"motors {WEAKER:.0%} weaker when warm": Effect(slope=-WEAKER / (WARM - COLD)),
     "joints of 1,000 Nm/rad": Effect(joints=1000.0),
-    "joints of 150 Nm/rad": Effect(joints=150.0),
-    "joints of 150 Nm/rad, play of 1 degree": Effect(joints=150.0, play=PLAY),
 }
 
 
@@ -117,7 +112,7 @@ class Device:
             "links": ArmModel(nominal.length, cog, mass), "cog_y": beside[0], "cog_z": beside[1],
             "coulomb_friction": rng.uniform(*COULOMB, count), "viscous_friction": rng.uniform(*VISCOUS, count),
             "spring_rest": rng.uniform(*REST, count), "spring_stiffness": (effect.stiffness,) * count,
-            "joint_stiffness": (effect.joints,) * count, "backlash": (effect.play,) * count,
+            "joint_stiffness": (effect.joints,) * count,
         }  # fmt: skip
         scales = rng.uniform(low, high, count).tolist()
         self.motors = [

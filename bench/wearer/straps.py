@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -39,7 +40,7 @@ def trials(seed: int) -> list[Trial]:
     """Play and judge the trial of a device with each of TIED, on a trunk at rest."""
     worn, seen = draw(seed), draw(seed, "shoulder")
     count = len(worn.motors)
-    joints = {"joint_stiffness": (JOINTS,) * count, "backlash": (PLAY,) * count}
+    joints: dict[str, Any] = {"joint_stiffness": (JOINTS,) * count, "backlash": (PLAY,) * count}
     elastic = replace(worn, config=replace(worn.config, **joints))
     measured = JOINTS * (1.0 + STIFFNESS_ERROR * np.random.default_rng(seed).standard_normal(count))
     known = replace(elastic, settings=replace(worn.settings, joint_stiffness=measured.tolist()))
