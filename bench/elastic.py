@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-import mujoco
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -44,6 +43,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 from .calibration.device import SPREAD
 from .device_study import options_of
 from .parts import play
+from .resting import resting_torque
 
 HOLDS, HELD_OUT, BOWED = 120, 300, 100
 LOW, HIGH = np.array((0.0, 0.0, -0.3, 0.0)), np.array((0.0, 1.6, 1.5, 1.6))  # rad; the ANFIS has no joint 1
@@ -53,8 +53,6 @@ WORN = {"wearer_mass": (0.0, 0.0, 2.0, 1.5), "wearer_cog": (0.0, 0.0, 0.16, 0.18
 BOW = math.radians(15.0)
 FUNCTIONS, RIDGE = 2, 1e-2  # of the ANFIS: 3 functions have 108 consequents, too many for as many holds
 ANGLES = (-math.pi,) * 4, (math.pi,) * 4
-REST_STEPS, RELAXATION, AT_REST = 600, 0.1, 1e-6  # rad: the links find their rest step by step
-LITTLE = 0.02  # Nm, below which a link hangs within its play
 LAWS = ("rigid", "deflection", "ANFIS", "rigid + GP", "deflection + GP")
 
 
@@ -116,22 +114,7 @@ class Device:
     def needed(self, poses: np.ndarray, tilt: Tilt) -> np.ndarray:
         """Return the torque (n, 3) in Nm that joints 2 to 4 carry behind motors at `poses` (n, 4) rad, by MuJoCo."""
         self.arm.move_base(np.multiply(STANDARD_GRAVITY, tilt.direction).tolist())
-        return np.array([self._resting(motors)[1:] for motors in poses])
-
-    def _resting(self, motors: np.ndarray) -> np.ndarray:
-        model, data, config, count = self.arm.model, self.arm.data, self.arm.config, len(motors)
-        data.qpos[count:], data.qvel[:] = motors, 0.0
-        links = motors
-        for _ in range(REST_STEPS):
-            data.qpos[:count] = links
-            mujoco.mj_forward(model, data)
-            torque, before = data.qfrc_bias[:count].copy(), links
-            side = np.clip(torque / LITTLE, -1.0, 1.0)  # of the play
-            rest = motors - torque / config.joint_stiffness - side * np.divide(config.backlash, 2.0)
-            links = before + RELAXATION * (rest - before)
-            if np.abs(rest - before).max() < AT_REST:
-                return torque
-        raise RuntimeError(f"no rest behind motors at {motors.tolist()} rad")
+        return np.array([resting_torque(self.arm, motors)[1:] for motors in poses])
 
 
 def by(settings: Settings) -> Callable[[np.ndarray, Tilt], np.ndarray]:

@@ -1,19 +1,21 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""python -m bench.calibration.effects [--devices 20]: what `calibrate` leaves of cables, and of motors that warm up.
+"""python -m bench.calibration.effects [--devices 20]: what `calibrate` leaves of cables, warm motors, elastic joints.
 
 Random simulated devices in MuJoCo, with tours in virtual time as `calibrate scale` makes them: without and with a
-weight, the stand leant otherwise. Each device is played without any effect, with cables, and with motors that are 3 %
-weaker when warm. There `calibrate gravity` follows on the warm arm, with `--earlier` the cold record.
+weight, the stand leant otherwise. Each device is played without any effect, with cables, with motors that are 3 %
+weaker when warm, and with elastic joints. On warm motors `calibrate gravity` follows, with `--earlier` the cold record.
 
 Judged by the torque that holds MuJoCo's arm in 300 poses that no tour visited: the largest error of any joint, as a
 share of the largest torque, and the share of the poses within the 95 % band that `model_error` gives. `before`
-is the same without springs and slopes in the identification.
+is the same without springs and slopes in the identification, and without `joint_stiffness`, which is known to 10 %.
+On elastic joints the poses are those of the motors, behind which the links rest.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -45,6 +47,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ..device_study import Row, as_markdown, options_of
 from ..parts import play
+from ..resting import resting_torque
 from .device import COULOMB, LARGEST_OFFSET, LEANT, SPREAD, STAND, VISCOUS
 from .tour import Player, let_hang
 
@@ -54,6 +57,7 @@ COLD, WARM = 25.0, 50.0  # degC
 WEAKER = 0.03  # share of its torque that a warm motor lacks
 CABLES = 0.15  # Nm/rad
 REST = (-0.3, 0.8)  # rad, where a cable is slack
+STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
 POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
 NEW_POSES = 300
 MEDIAN, LARGE = 0.01, 0.025  # of peak: limits of the median and of the 95th percentile
@@ -66,12 +70,14 @@ class Effect(NamedTuple):
 
     stiffness: float = 0.0  #: Nm/rad of the cables across each joint
     slope: float = 0.0  #: 1/K of the torque scales
+    joints: float = 0.0  #: Nm/rad of each joint; 0: rigid
 
 
 EFFECTS = {
     "none": Effect(),
     f"cables {CABLES:g} Nm/rad": Effect(stiffness=CABLES),
     f"motors {WEAKER:.0%} weaker when warm": Effect(slope=-WEAKER / (WARM - COLD)),
+    "joints of 1,000 Nm/rad": Effect(joints=1000.0),
 }
 
 
@@ -106,6 +112,7 @@ class Device:
             "links": ArmModel(nominal.length, cog, mass), "cog_y": beside[0], "cog_z": beside[1],
             "coulomb_friction": rng.uniform(*COULOMB, count), "viscous_friction": rng.uniform(*VISCOUS, count),
             "spring_rest": rng.uniform(*REST, count), "spring_stiffness": (effect.stiffness,) * count,
+            "joint_stiffness": (effect.joints,) * count,
         }  # fmt: skip
         scales = rng.uniform(low, high, count).tolist()
         self.motors = [
@@ -115,6 +122,7 @@ class Device:
         pitch = float(rng.uniform(*STAND[0]))
         self.stand = pitch, float(rng.uniform(*STAND[1]))
         self.leant = pitch - float(np.copysign(rng.uniform(*LEANT), pitch)), float(rng.uniform(*STAND[1]))
+        self.measured = effect.joints * (1.0 + STIFFNESS_ERROR * rng.standard_normal(count))  # Nm/rad
 
     def tours(self, poses: int, temperature: float, loaded: bool) -> list[Observation]:
         """Return what a tour shows of the arm with motors at `temperature` degC; loaded: and one with the weight."""
@@ -141,22 +149,31 @@ class Device:
             raise RuntimeError(tour.trouble or (fault.reason if fault else "the tour did not end"))
         return tour.measured
 
-    def judged(self, observations: list[Observation], temperature: float) -> tuple[Judged, tuple[int, int]]:
-        """Return how the file that these give holds the arm with motors at `temperature` degC, and what it has."""
-        result = moments_from(ARM, observations)
+    def judged(
+        self, observations: list[Observation], temperature: float, joints: np.ndarray
+    ) -> tuple[Judged, tuple[int, int]]:
+        """Return how the file that these give holds the arm with motors at `temperature` degC, and what it has.
+
+        joints: (n,) Nm/rad, the file's `joint_stiffness`.
+        """
+        result = moments_from(replace(ARM, compensator={**ARM.compensator, "joint_stiffness": joints}), observations)
         given: dict[str, Any] = {change.name: change.value for change in result.changes}
         none = [0.0] * len(ASSUMED)
         spring = JointSpring(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
         slope = given.get("torque_scale_slope", none)
         robot = ArmModel.from_moments(DEFAULT_LINKS.length, given["robot.first_moment"], given["robot.off_axis"])
-        settings, upright = Settings("right", robot, joint_spring=spring), Tilt.of("right")
+        settings, upright = (
+            Settings("right", robot, joint_spring=spring, joint_stiffness=joints.tolist()),
+            Tilt.of("right"),
+        )
         at = given.get("torque_scale_temperature", [SCALE_TEMPERATURE] * len(ASSUMED))
         assumed = [scale_at(*motor, temperature) for motor in zip(given["torque_scale"], slope, at, strict=True)]
         strength = np.divide([motor.scale_at(temperature) for motor in self.motors], assumed)
         device = SimulatedArm(ArmConfig(**self.mechanics))
         poses = np.random.default_rng(1000).uniform(*POSES, (NEW_POSES, len(ASSUMED)))
         wanted = np.array([settings.torque(theta, upright)[0] for theta in poses.tolist()])
-        true = np.array([_needed(device, theta) for theta in poses])
+        needed = resting_torque if device.config.elastic else _needed
+        true = np.array([needed(device, theta) for theta in poses])
         error = np.abs(wanted * strength - true)
         band = COVER * np.hypot(given["model_error.torque"], wanted * given["model_error.scale"])
         judged = Judged(float(error.max() / np.abs(true).max()), (error <= band).mean(axis=0))
@@ -164,7 +181,7 @@ class Device:
 
 
 def _needed(device: SimulatedArm, theta: np.ndarray) -> np.ndarray:
-    """Return the torque (4,) in Nm that holds MuJoCo's arm on an upright trunk."""
+    """Return the torque (4,) in Nm that holds MuJoCo's rigid arm on an upright trunk."""
     device.reset(theta)
     return np.asarray(device.data.qfrc_bias - device.data.qfrc_passive)
 
@@ -178,8 +195,8 @@ def outcome(part: tuple[int, str]) -> Outcome:
     temperature = WARM if effect.slope else COLD
     warm = device.tours(SCALE_POSES, WARM, loaded=False) if effect.slope else []
     with patch.object(identification, "possible_extras", lambda rows: ()):
-        before, _ = device.judged(cold, temperature)
-    return Outcome(seed, name, before, *device.judged(cold + warm, temperature))
+        before, _ = device.judged(cold, temperature, np.zeros(len(ASSUMED)))
+    return Outcome(seed, name, before, *device.judged(cold + warm, temperature, device.measured))
 
 
 def told(found: Outcome) -> str:
@@ -206,7 +223,7 @@ def rows_of(found: list[Outcome]) -> list[Row]:
 
 def main() -> int:
     """Run the study; return the exit code."""
-    description = "What calibrate leaves of cables, and of motors that warm up."
+    description = "What calibrate leaves of cables, warm motors and elastic joints."
     options = options_of("bench.calibration.effects", description, Path("build/calibration_effects"))
     parts = [(seed, name) for name in EFFECTS for seed in options.seeds]
     rows = rows_of(play("calibration_effects", outcome, parts, told))

@@ -41,12 +41,15 @@ from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from .strapped_arm import StrappedArm
+
 STRIBECK = 0.05  # Nm
 LEANT = Tilt.of("right", -0.15, 0.22).direction  # the stand while the weight hangs
 MOUNTING = math.radians(1.2)  # of the IMU, before the weight of the arm corrects it
 BODY_MASS = (55.0, 90.0)  # kg
 MASS_ERROR, COG_ERROR = 0.15, 0.03  # of the body-mass table: share of a segment's mass; m along the segment
-EFFECTS = ("none", "beside", "springs", "carries", "all")  # of the wearer's arm, which the table does not have:
+# Of the wearer's arm, which the table does not have; `shoulder` is a strapped arm (strapped_arm.py), and not in `all`:
+EFFECTS = ("none", "beside", "springs", "carries", "all", "shoulder")
 BESIDE = 0.04  # m, of both segments' centres of gravity from their links, in any direction
 STIFFNESS, REST, REST_SPREAD = 1.5, (0.1, 0.5, 0.4, 0.8), 0.3  # Nm/rad and rad, of all joints
 CARRIED = 0.2  # share of their arm that they may carry while they mean to relax, the same in all poses
@@ -62,7 +65,8 @@ class Worn:
     """A device with a wearer in it. settings, motors: as calibrated; the rest is the truth.
 
     mounting: (3,) rad, the rotation of gravity that calibration leaves. calibrated: the arm with all but its wearer, as
-    it was when `relaxed` was seen. refusals: of the calibration of the wearer.
+    it was when `relaxed` was seen. refusals: of the calibration of the wearer. is_strapped: whether the wearer's arm
+    moves in its straps, and their shoulder moves.
     """
 
     seed: int
@@ -75,6 +79,7 @@ class Worn:
     calibrated: ConfiguredArm
     relaxed: tuple[Observation, ...]
     refusals: tuple[str, ...]
+    is_strapped: bool
 
     @property
     def wearer(self) -> ArmModel:
@@ -94,12 +99,13 @@ class Worn:
 class WornDevice(Device):
     """A device whose wearer means to relax, and carries the share `carried` of their arm's weight.
 
-    device: the robot. config: of the simulated arm with the wearer in it, whose hands the motors' torques come from.
+    device: the robot. config, is_strapped: of the simulated arm with the wearer in it, which needs the motors' torques.
     """
 
-    def __init__(self, device: Device, config: ArmConfig, carried: float) -> None:
+    def __init__(self, device: Device, config: ArmConfig, carried: float, is_strapped: bool) -> None:
+        self.is_strapped = is_strapped
         self.rng, self.scale, self.friction, self.offset = device.rng, device.scale, device.friction, device.offset
-        self._arm, self._bare, self._passive, self._carried = *simulated(config), carried
+        self._arm, self._bare, self._passive, self._carried = *simulated(config, is_strapped), carried
 
     def effort(self, theta: Vector, direction: Vector, added: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the commands (1, 4) in Nm that hold the arm without friction."""
@@ -108,10 +114,11 @@ class WornDevice(Device):
         return np.asarray(torque / self.scale + self.offset)[None]
 
 
-def simulated(config: ArmConfig) -> tuple[SimulatedArm, SimulatedArm, SimulatedArm]:
+def simulated(config: ArmConfig, is_strapped: bool) -> tuple[SimulatedArm, SimulatedArm, SimulatedArm]:
     """Return the arm of `config`, the same without a wearer, and with a wearer whose joints have no springs."""
     bare = replace(config, wearer_mass=NOTHING, wearer_stiffness=NOTHING)
-    return SimulatedArm(config), SimulatedArm(bare), SimulatedArm(replace(config, wearer_stiffness=NOTHING))
+    worn = StrappedArm(config) if is_strapped else SimulatedArm(config)
+    return worn, SimulatedArm(bare), SimulatedArm(replace(config, wearer_stiffness=NOTHING))
 
 
 def holding(arm: SimulatedArm, theta: Vector, direction: Vector) -> np.ndarray:
@@ -120,6 +127,8 @@ def holding(arm: SimulatedArm, theta: Vector, direction: Vector) -> np.ndarray:
     direction: gravity's unit vector (3,) in the base frame.
     """
     arm.move_base([STANDARD_GRAVITY * component for component in direction])
+    if isinstance(arm, StrappedArm):
+        return arm.held(theta)
     arm.reset(theta)
     return np.asarray(arm.data.qfrc_bias - arm.data.qfrc_passive)
 
@@ -171,7 +180,7 @@ def draw(seed: int, effect: str = "none") -> Worn:
     found = {**nominal.compensator, "side": side, "wearer.body_mass": body_mass, "mode": "zero_g", "support": 1.0}
     found |= {name: value for name, value in values.items() if name != "torque_scale"}
     true.scale = scale / values["torque_scale"]
-    worn = WornDevice(true, config, carried)
+    worn = WornDevice(true, config, carried, effect == "shoulder")
     relaxed = tuple(
         one._replace(effort=one.effort + rng.normal(0.0, BREATHING, 4), direction=turned(one.direction, -left))
         for one in (worn.observe(theta, UPRIGHT) for theta in relaxed_poses())
@@ -187,7 +196,7 @@ def draw(seed: int, effect: str = "none") -> Worn:
         settings_of(found), max_effort=[min(MOST, motor.peak_effort) for motor in motors],
         terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
     )  # fmt: skip
-    return Worn(seed, side, config, scale, settings, motors, left, arm, relaxed, result.refusals)
+    return Worn(seed, side, config, scale, settings, motors, left, arm, relaxed, result.refusals, worn.is_strapped)
 
 
 def _of_effect(seed: int, effect: str) -> tuple[dict[str, np.ndarray], float]:

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import mujoco
 import numpy as np
+from scipy.optimize import root
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
@@ -25,6 +26,7 @@ CUFFS = (0.2, 0.2)  # m along the upper arm and the forearm
 SHOULDER, SHOULDER_DAMPING, GIRDLE = 5000.0, 200.0, 2.0  # N/m, N s/m and kg
 RHYTHM = np.array((-0.02, 0.0, -0.03))  # m in the base's axes at 90 degrees of elevation: to the spine, and up
 LIGHT = 0.001  # kg; links of the wearer's chain in which there is no segment
+REST = 1e-9  # of the search for the place where the wearer's arm rests
 INERTIA = (0.002,) * 4  # kg m^2, of flesh about each of the wearer's joints
 
 
@@ -61,6 +63,26 @@ class StrappedArm(SimulatedArm):
         super().reset(theta)
         self.data.qpos[7:] = theta
         mujoco.mj_forward(self.model, self.data)
+
+    def held(self, theta: Vector) -> np.ndarray:
+        """Return the torque (4,) in Nm that holds the robot at `theta` (4,) rad, while the wearer's arm rests in it.
+
+        Raises RuntimeError if it finds no rest.
+        """
+        model, data = self.model, self.data
+        data.qpos[:4], data.qvel[:] = theta, 0.0
+
+        def unbalanced(worn: np.ndarray) -> np.ndarray:
+            data.qpos[4:] = worn
+            mujoco.mj_forward(model, data)
+            self._tied()  # moves the shoulder's rest
+            mujoco.mj_forward(model, data)
+            return np.asarray(data.qfrc_bias - data.qfrc_passive - self._tied())
+
+        found = root(lambda worn: unbalanced(worn)[4:], np.concatenate((np.zeros(3), theta)), tol=REST)
+        if not found.success:
+            raise RuntimeError(f"the wearer's arm finds no rest behind {list(theta)} rad: {found.message}")
+        return unbalanced(found.x)[:4]
 
     def step(
         self,

@@ -1,12 +1,18 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What straps that give and a shoulder that moves do to the estimate, whose model has neither."""
+"""What straps that give, a shoulder that moves and elastic joints with play do to the estimate.
+
+Its model has none of them but the joints' stiffness, which is known to 10 %, or not at all.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
@@ -16,19 +22,33 @@ from exo_gravity.core.numbers import COVER
 
 from ..device_study import options_of
 from ..parts import play as part_by_part
-from .devices import Worn, draw
+from .devices import draw
 from .report import points
 from .strapped_arm import RHYTHM, StrappedArm
 from .study import Trial, judge, play
 
 STILL = ({"hold": 47.0},)  # of the trunk
-TIED = ("none", "straps that give", "straps, and a shoulder that moves")
+JOINTS, PLAY = 100.0, math.radians(1.0)  # Nm/rad and rad, of elastic joints
+STIFFNESS_ERROR = 0.1  # of what is known of them, as a share
+TIED = (
+    "none", "straps that give", "straps, and a shoulder that moves", "the same, as `calibrate wearer` has seen it",
+    f"joints of {JOINTS:g} Nm/rad with a play of 1 degree, unknown", "the same, `joint_stiffness` known",
+)  # fmt: skip
 
 
-def trials(worn: Worn) -> list[Trial]:
-    """Play and judge the trial of `worn` with each of TIED, on a trunk at rest."""
-    ties = (None, StrappedArm(worn.config, 0.0 * RHYTHM), StrappedArm(worn.config))
-    return [judge(play(worn, tie, STILL)) for tie in ties]
+def trials(seed: int) -> list[Trial]:
+    """Play and judge the trial of a device with each of TIED, on a trunk at rest."""
+    worn, seen = draw(seed), draw(seed, "shoulder")
+    count = len(worn.motors)
+    joints: dict[str, Any] = {"joint_stiffness": (JOINTS,) * count, "backlash": (PLAY,) * count}
+    elastic = replace(worn, config=replace(worn.config, **joints))
+    measured = JOINTS * (1.0 + STIFFNESS_ERROR * np.random.default_rng(seed).standard_normal(count))
+    known = replace(elastic, settings=replace(worn.settings, joint_stiffness=measured.tolist()))
+    cases = (
+        (worn, None), (worn, StrappedArm(worn.config, 0.0 * RHYTHM)), (worn, StrappedArm(worn.config)),
+        (seen, StrappedArm(seen.config)), (elastic, None), (known, None),
+    )  # fmt: skip
+    return [judge(play(case, tie, STILL)) for case, tie in cases]
 
 
 def table(found: Sequence[Sequence[Trial]]) -> str:
@@ -48,15 +68,12 @@ def table(found: Sequence[Sequence[Trial]]) -> str:
     return "\n".join(lines)
 
 
-def tied(seed: int) -> list[Trial]:
-    """Return the `trials` of a device."""
-    return trials(draw(seed))
-
-
 def main() -> int:
     """Run the study; print its table, and write it."""
-    options = options_of("bench.wearer.straps", "What straps and a shoulder that moves do.", Path("build/straps"))
-    found = part_by_part("straps", tied, options.seeds, lambda device: f"device {device[0].seed}: {troubles(device)}")
+    options = options_of(
+        "bench.wearer.straps", "What straps, a shoulder that moves and elastic joints do.", Path("build/straps")
+    )
+    found = part_by_part("straps", trials, options.seeds, lambda device: f"device {device[0].seed}: {troubles(device)}")
     text = table(found)
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)

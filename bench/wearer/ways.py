@@ -138,7 +138,7 @@ def seen_of(worn: Worn) -> Seen:
     """Return what each way leaves of the wearer's arm, and what the bands before and now contain."""
     rng = np.random.default_rng(worn.seed)
     poses = rng.uniform(LOW, HIGH, (POSES, 4))
-    arm, bare, passive = simulated(worn.config)
+    arm, bare, passive = simulated(worn.config, worn.is_strapped)
     hold, own, free = (np.array([holding(one, pose, UPRIGHT) for pose in poses]) for one in (arm, bare, passive))
     weight = free - own
     left = [np.sqrt(np.sum((way(poses) - (hold - own)) ** 2) / np.sum(weight**2)) for way in ways_of(worn)]

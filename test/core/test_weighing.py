@@ -20,6 +20,7 @@ from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.vocabulary import WeighingPhase
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -124,6 +125,8 @@ def test_what_would_hide_the_load_is_refused_before_anything_moves():
     assert "zero_g" in refusal(replace(SETTINGS, mode="one_g"), (), RATE)
     assert refusal(replace(SETTINGS, mode="one_g", wearer_mass=STILL), (), RATE) == ""
     assert "50 Hz, must be 80 or more" in refusal(SETTINGS, (), 50.0)
+    assert Weighing(SETTINGS, JOINTS, 0.0).phase is WeighingPhase.TAKING_OVER  # made before the rate is known,
+    assert "0 Hz" in refusal(SETTINGS, (), 0.0)  # and refused
 
 
 def test_an_arm_that_is_not_carried_or_is_held_has_no_result():

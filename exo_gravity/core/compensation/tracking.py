@@ -5,8 +5,14 @@ All joints sweep through a pose there and back. At the same angle the torque of 
 that of the way back gravity minus friction.
 
 The arm follows a slow reference by expected gravity torque, friction, and a PID controller in joint space. Its output
-is an acceleration, which the arm's approximate mass matrix turns into torques: so all joints have the same natural
-frequency, however they are coupled.
+is an acceleration, which the arm's approximate mass matrix turns into torques: so each joint has the natural frequency
+that it is given, however they are coupled.
+
+Behind an elastic joint the links no longer hold the rotor: above their resonance the controller moves the rotor alone,
+which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
+sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
+Stribeck friction best. When a motor vibrates it lowers those of all joints, and then further those of each whose motor
+still does. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's frequencies.
 """
 
 import math
@@ -44,6 +50,20 @@ class TrackerTuning:
     #: natural frequency in rad/s per control cycle per s; two cycles of delay cost 27 degrees
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
+    soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated,
+    soft_stiffness: float = 5.0  #: Nm/rad, and the same of inertia times its square: heavy joints oscillate at 10 Hz
+    softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
+    least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
+    least_stiffness: float = 1.2  #: Nm/rad: with less, a light joint hardly follows against its friction (measured)
+    #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
+    #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
+    filtered_from: float = 10.0
+    filter_order: int = 3  #: of first-order filters in a row
+    swing: float = 0.1  #: rad/s off a motor's mean speed, on both sides: four steps of its 12 bits
+    mean_speed: float = 0.04  #: s, time constant of that mean
+    slowest_swing: float = 0.06  #: s from one side to the other; the controller's own motion is slower
+    swings: int = 6  #: in a row, which are a vibration: a joint that leaves its friction swings twice
+    calm: float = 0.3  #: s in which a vibration may fade under lower gains
     integral_share: float = 0.4  #: of the frequency, at which the integral part acts; unstable from 2 on
     #: times the smallest inertia in any direction, that the integral part adds in all. Without it, two joints that
     #: stick on opposite sides of their path would cancel each other's integral where the inertia of both is small.
@@ -55,6 +75,9 @@ class TrackerTuning:
     slow_error: float = 0.04  #: rad behind the reference, from which on it slows down,
     stop_error: float = 0.08  #: and at which it waits
     full_friction_speed: float = 0.03  #: rad/s of the reference, from which on friction is compensated fully
+    standing: float = 0.03  #: rad/s, below which a joint that sticks is pushed off; one step of the velocity's 12 bits
+    push_off_rate: float = 1.5  #: Nm/s: a light joint at 100 Hz is late by 0.01 rad for 0.1 Nm of Stribeck friction
+    most_push_off: float = 0.3  #: Nm
 
 
 MOTION, TRACKER = MotionTuning(), TrackerTuning()
@@ -158,13 +181,49 @@ def followed(sweeps: Sequence[Sweep], station: Station) -> np.ndarray:
     return np.asarray(ways / (2.0 * MOTION.window * station.amplitude))
 
 
+class Vibration:
+    """Sees motors whose speeds swing from side to side faster than any joint is moved. count: of motors.
+
+    speed: (n,) rad/s, their mean.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.speed = np.zeros(count)
+        self._side = np.zeros(count)
+        self._since = np.zeros(count)  # s
+        self._swings = np.zeros(count)
+
+    def step(self, dt: float, velocity: Vector) -> np.ndarray:
+        """Return which motors (n,) vibrate; velocity: (n,) rad/s, `dt` s after the last."""
+        self.speed = self.speed + (1.0 - math.exp(-dt / TRACKER.mean_speed)) * (velocity - self.speed)
+        off = velocity - self.speed
+        side = np.where(np.abs(off) > TRACKER.swing, np.sign(off), 0.0)
+        is_turned = side * self._side < 0.0
+        self._side = np.where(side, side, self._side)
+        self._since = np.where(is_turned, 0.0, self._since + dt)
+        goes_on = self._since <= TRACKER.slowest_swing
+        self._swings = np.where(goes_on, self._swings + is_turned, 0.0)
+        return np.asarray(self._swings >= TRACKER.swings)
+
+    def forget(self, which: np.ndarray) -> None:
+        """Count the swings of motors anew; which: (n,) whether it is one of them."""
+        self._swings = np.where(which, 0.0, self._swings)
+
+
 class Tracker:
     """Moves all joints along lines, one after the other, and takes the samples of sweeps.
 
-    rate: control cycles per s. max_effort: (n,) Nm. lines: to follow, each taken when it begins; the owner sets them
-    before the first step. friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
-    saturated: (n,) s for which each joint has wanted more than its `max_effort`. error: (n,) rad by which the arm is
-    behind its path. correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    rate: control cycles per s.
+    max_effort: (n,) Nm.
+
+    lines: to follow, each taken when it begins; the owner sets them before the first step.
+    friction: (n,) Nm, compensated in the direction of motion, as far as the owner knows it.
+    sticks: (n,), set by the owner, whether a joint has not followed a sweep: it is then pushed off wherever it stands.
+    saturated: (n,) s for which each joint has wanted more than its `max_effort`.
+    error: (n,) rad by which the arm is behind its path.
+    correction: (n,) Nm, what the controller added to gravity and friction in the last step.
+    speed: (n,) rad/s of the joints, without vibration.
+    vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
     """
 
     def __init__(self, rate: float, max_effort: Sequence[float]) -> None:
@@ -173,10 +232,16 @@ class Tracker:
         self.saturated = np.zeros(count)
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
-        self._frequency = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)
+        self.sticks = np.zeros(count, bool)
+        self.vibrations = np.zeros(count)
+        self._vibration = Vibration(count)
+        self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))
+        self._is_soft, self._calm = np.zeros(count, bool), np.zeros(count)  # whether lowered, and s left to calm down
+        self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
         self._integral = np.zeros(count)
         self._slide = np.zeros(count)  # Nm that compensate friction
+        self._push_off = np.zeros(count)  # Nm beyond that, of joints that stick
         self._effort: Torque = (0.0,) * count
         self.lines: Iterator[Line] = iter(())
         self._line = Line(self.error, self.error)
@@ -218,9 +283,40 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
+        self._watch_vibration(dt, velocity, np.diag(matrix))
         self._compensate_friction(dt, coming, speed_error)
+        self._push(dt, np.sign(coming), np.asarray(velocity))
         self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
         return self._effort
+
+    @property
+    def speed(self) -> np.ndarray:
+        """The mean speeds (n,) of the joints in rad/s."""
+        return self._vibration.speed
+
+    def _watch_vibration(self, dt: float, velocity: Vector, inertia: np.ndarray) -> None:
+        """Lower the gains of joints whose motors vibrate, without a step of what they hold.
+
+        velocity: (n,) rad/s. inertia: (n,) kg m^2.
+        """
+        self._calm = np.maximum(0.0, self._calm - dt)
+        vibrates = self._vibration.step(dt, velocity) & (self._calm == 0.0)
+        if not vibrates.any():
+            return
+        if not self._is_soft.any():
+            vibrates |= True  # the others are about to
+        least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
+        self.vibrations += vibrates & (self._frequency <= least)
+        soft = np.minimum(TRACKER.soft_frequency, np.sqrt(TRACKER.soft_stiffness / inertia))
+        wanted = np.where(self._is_soft, TRACKER.softer * self._frequency, soft)
+        lower = np.minimum(np.maximum(wanted, np.minimum(least, TRACKER.soft_frequency)), self._frequency)
+        left = np.where(vibrates, (lower / self._frequency) ** 2, 1.0)
+        self._frequency = np.where(vibrates, lower, self._frequency)
+        self._integral += (1.0 - left) * self._filter[-1]
+        self._filter *= left
+        self._is_soft |= vibrates
+        self._calm = np.where(vibrates, TRACKER.calm, self._calm)
+        self._vibration.forget(vibrates)
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -230,17 +326,31 @@ class Tracker:
         is_ahead = (self.error * way < -TRACKER.ahead) | (speed_error * way < -TRACKER.faster)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
+    def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray) -> None:
+        """Push joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1; velocity: (n,) rad/s."""
+        stands = self.sticks & (np.abs(velocity) < TRACKER.standing) & (self.error * way > TRACKER.ahead)
+        more = self._push_off + TRACKER.push_off_rate * dt * way
+        self._push_off = np.where(stands, np.clip(more, -TRACKER.most_push_off, TRACKER.most_push_off), 0.0)
+
     def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
-        frequency = self._frequency
-        stiff = matrix @ self.error * frequency**2
-        push = stiff + matrix @ speed_error * 2.0 * frequency
+        frequency, root = self._frequency, np.sqrt(self._frequency)
+        stiff = frequency * (matrix @ (frequency * self.error))
+        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
-        torque = expected + self._slide + push + integral
+        torque = expected + self._slide + self._push_off + push + integral
         is_saturated = np.abs(torque) > self._max_effort
         self.saturated = np.where(is_saturated, self.saturated + dt, 0.0)
         # Without this the integral would wind up.
         self._integral = np.where(is_saturated & (torque * self.error > 0.0), self._integral, integral)
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
+
+    def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
+        """Return `push` (n,) Nm, in joints with lowered gains without what the rotor could vibrate with."""
+        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * self._frequency * dt), push
+        for stage in self._filter:
+            stage += passed * (value - stage)
+            value = stage
+        return np.where(self._is_soft, value, push)

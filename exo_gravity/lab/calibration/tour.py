@@ -39,6 +39,7 @@ REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how u
 # What stops a tour.
 MAX_ERROR = 0.12  # rad between a joint and the slow reference
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
+MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
 MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
@@ -108,23 +109,27 @@ class Tour:
             self._uncertain = self._guess.torques(np.array([position]))[1][0]
         down = self._guess.model.down(tilt)
         effort = self._tracker.step(dt, position, velocity, expected, down, self._matrix)
-        self.trouble = self.trouble or self._wrong_motion(dt, velocity, tilt) or self._wrong_torque(dt)
+        self.trouble = self.trouble or self._wrong_motion(dt, tilt) or self._wrong_torque(dt)
         return None if self.trouble else effort
 
-    def _wrong_motion(self, dt: float, velocity: Sequence[float], tilt: Tilt) -> str:
-        """Return what is wrong after `dt` s with the motion, or ''; velocity: (n,) rad/s."""
+    def _wrong_motion(self, dt: float, tilt: Tilt) -> str:
+        """Return what is wrong after `dt` s with the motion, or ''."""
         if dt > MAX_GAP:
             return f"no joint states for {dt * 1000:.0f} ms, the limit is {MAX_GAP * 1000:.0f}: is a motor silent?"
         if self._undecided > LONGEST_CHOICE:
             return f"the next pose was not chosen within {LONGEST_CHOICE:g} s: is this computer too busy?"
         if (moved := angle_between(tilt.direction, self._first_tilt.direction)) > MAX_TILT:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
-        for name, behind, speed in zip(self._limits.joint_names, self._tracker.error, velocity, strict=True):
+        tracker = self._tracker
+        joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
+        for name, behind, speed, vibrations in joints:
             if not abs(behind) <= MAX_ERROR:
                 reason = "a hand is on the arm, or the joint is blocked"
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
+            if vibrations > MAX_VIBRATIONS:
+                return f"{name}: its motor goes on vibrating under the lowest gains: is something loose?"
         return ""
 
     def _wrong_torque(self, dt: float) -> str:
@@ -184,6 +189,7 @@ class Tour:
             sweeps += pair
             share, was_known = followed(pair, station), bool(np.any(self._friction))
             sticks = bool(np.min(share) < MOTION.followed)
+            self._tracker.sticks |= share < MOTION.followed
             if station.speed >= STEADY_SPEED:
                 self._friction = np.maximum(average(pair)[0].friction, self._friction if sticks else 0.0)
                 self._tracker.friction = self._friction
