@@ -51,7 +51,7 @@ class TrackerTuning:
     frequency_per_rate: float = 0.12
     max_frequency: float = 20.0  #: rad/s
     soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated,
-    soft_stiffness: float = 5.0  #: Nm/rad, and the same of inertia times its square: heavy joints oscillate at 10 Hz
+    soft_stiffness: float = 5.0  #: Nm/rad, of inertia times its square, the most once it has vibrated again
     softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
     least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
     least_stiffness: float = 1.2  #: Nm/rad: with less, a light joint hardly follows against its friction (measured)
@@ -307,8 +307,8 @@ class Tracker:
             vibrates |= True  # the others are about to
         least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
         self.vibrations += vibrates & (self._frequency <= least)
-        soft = np.minimum(TRACKER.soft_frequency, np.sqrt(TRACKER.soft_stiffness / inertia))
-        wanted = np.where(self._is_soft, TRACKER.softer * self._frequency, soft)
+        softer = np.minimum(TRACKER.softer * self._frequency, np.sqrt(TRACKER.soft_stiffness / inertia))
+        wanted = np.where(self._is_soft, softer, TRACKER.soft_frequency)
         lower = np.minimum(np.maximum(wanted, np.minimum(least, TRACKER.soft_frequency)), self._frequency)
         left = np.where(vibrates, (lower / self._frequency) ** 2, 1.0)
         self._frequency = np.where(vibrates, lower, self._frequency)
