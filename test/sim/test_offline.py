@@ -38,7 +38,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
     arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 125.0, tilt and resting(*tilt))
-    return OfflineTrial(arm, script, 8.0)
+    return OfflineTrial(arm, script, 11.2)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_a_stop_lets_the_arm_down_and_keeps_the_recording_which_is_the_same_unti
     assert np.all(recording.position[: 10 * 125] == done[1].position[: 10 * 125])
     assert trial.trouble == "right: stopped by the operator"
     ((start, end),) = recording.carried
-    assert 2.0 < start < 8.0  # the checks take a second without trouble, then the sign check of four joints
+    assert 2.0 < start < 11.2  # the checks take a second without trouble, then the sign check of four joints
     assert end == pytest.approx(10.0, abs=0.01)
     assert end + 2.0 < recording.time[-1] < 36.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
