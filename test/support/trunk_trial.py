@@ -25,7 +25,7 @@ LENGTH = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LENGTH, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))  # of config/exo.yaml
 TRUE = ArmModel(LENGTH, (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.198))  # of config/sim.yaml
 MOUNTING = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
-RATE = 125.0  # Hz
+RATE = 250.0  # Hz, that of exo.yaml
 JOINTS = ("rotation", "abduction", "flexion", "elbow")
 
 
