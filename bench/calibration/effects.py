@@ -162,10 +162,8 @@ class Device:
         spring = JointSpring(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
         slope = given.get("torque_scale_slope", none)
         robot = ArmModel.from_moments(DEFAULT_LINKS.length, given["robot.first_moment"], given["robot.off_axis"])
-        settings, upright = (
-            Settings("right", robot, joint_spring=spring, joint_stiffness=joints.tolist()),
-            Tilt.of("right"),
-        )
+        settings = Settings("right", robot, joint_spring=spring, joint_stiffness=joints.tolist())
+        upright = Tilt.of("right")
         at = given.get("torque_scale_temperature", [SCALE_TEMPERATURE] * len(ASSUMED))
         assumed = [scale_at(*motor, temperature) for motor in zip(given["torque_scale"], slope, at, strict=True)]
         strength = np.divide([motor.scale_at(temperature) for motor in self.motors], assumed)

@@ -48,7 +48,7 @@ LEANT = Tilt.of("right", -0.15, 0.22).direction  # the stand while the weight ha
 MOUNTING = math.radians(1.2)  # of the IMU, before the weight of the arm corrects it
 BODY_MASS = (55.0, 90.0)  # kg
 MASS_ERROR, COG_ERROR = 0.15, 0.03  # of the body-mass table: share of a segment's mass; m along the segment
-# Of the wearer's arm, which the table does not have; `shoulder` is a strapped arm (strapped_arm.py), and not in `all`:
+# What the body-mass table leaves out of the wearer's arm; `shoulder` is a strapped arm (strapped_arm.py), not in `all`:
 EFFECTS = ("none", "beside", "springs", "carries", "all", "shoulder")
 BESIDE = 0.04  # m, of both segments' centres of gravity from their links, in any direction
 STIFFNESS, REST, REST_SPREAD = 1.5, (0.1, 0.5, 0.4, 0.8), 0.3  # Nm/rad and rad, of all joints

@@ -4,8 +4,9 @@
 The names are imported when they are used: a node or a tool imports only what it needs from the modules below.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from exo_gravity.core.names import imported_when_used
 
 if TYPE_CHECKING:
     from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
@@ -31,13 +32,7 @@ MODULES = {
     "arm.wearer": ("Wearer",),
     "compensation.laws": ("LAWS",),
 }
-
-
-def __getattr__(name: str) -> Any:
-    for module, names in MODULES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__} has no attribute {name}")
+__getattr__ = imported_when_used(__name__, MODULES)
 
 
 def __dir__() -> list[str]:

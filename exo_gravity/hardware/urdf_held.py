@@ -25,7 +25,7 @@ class Bodies(NamedTuple):
     joints: Sequence[int]  #: (n,) numbers of their joints
     names: Sequence[str]  #: (n,) of the joints
     ways: Sequence[np.ndarray]  #: (n,) the way (3,) in m to the next joint or the hand, in the frame of each joint
-    hand: str  #: the link that holds a load, '' if there is none
+    hand: str  #: link that holds the load; '' for none
 
     def shifted(self, model: Any, moments: np.ndarray, what: str) -> Any:
         """Return a copy of `model` whose links have these `moments` (n, 3) kg m more: their centres of gravity move.

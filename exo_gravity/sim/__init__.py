@@ -8,8 +8,9 @@ The names are imported when they are used: `sim.script` is read by trials and re
 without MuJoCo.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from exo_gravity.core.names import imported_when_used
 
 if TYPE_CHECKING:
     from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
@@ -39,10 +40,4 @@ MODULES = {
     "motors.firmware": ("FIRMWARES", "Firmware"),
     "virtual_wearer": ("VirtualWearer",),
 }
-
-
-def __getattr__(name: str) -> Any:
-    for module, names in MODULES.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__} has no attribute {name}")
+__getattr__ = imported_when_used(__name__, MODULES)

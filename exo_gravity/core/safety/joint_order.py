@@ -38,7 +38,7 @@ class JointOrderTuning:
     parallel: float = 0.25  #: of the outer joint's stiffness, by which turning the inner one may show another one
     left: float = 0.0015  #: rad from where it rested: the joint moves; four codes of the position
     sooner: float = 0.9  #: of the outer joint's time, below which the inner joint is the quicker one
-    clear: float = 0.01  #: s, beyond that: a cycle at 100 Hz; the times of two light joints are not told apart
+    clear: float = 0.01  #: s more than that, a cycle at 100 Hz: the times of two light joints differ by less
     least: float = 0.05  #: Nm/rad of gravity's stiffness; a fifth of that of a bare forearm
     rounds: int = 2  #: of pushes: two joints that seem exchanged are pushed again, and the times averaged
 

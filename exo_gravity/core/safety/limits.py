@@ -103,7 +103,7 @@ class Limits:
     )
     driven_speed: float = owned(
         1.5,
-        "a joint that its motor drives is braked from this speed on; from 1 rad/s more, the motor drives it no more",
+        "from this speed on, a joint that its motor drives is braked; 1 rad/s faster, its motor no longer drives it",
         (0.5, 4.0),
         "rad/s",
         expert=True,

@@ -39,7 +39,7 @@ class MomentModel(Protocol):
     moments: np.ndarray  #: (k,) kg m, as far as known
     start: np.ndarray  #: (k,) kg m, from which the fit begins
     gravity: float  #: m/s^2
-    beside: int  #: directions in which a weight may lie beside the last link or links
+    beside: int  #: number of directions in which a weight may hang beside its link
     turns: int  #: of the joints' places that are fitted: 3 n or 0
     compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
     positive: tuple[int, ...]  #: numbers of the moments that are at least 0
@@ -61,7 +61,7 @@ class MomentModel(Protocol):
         ...
 
     def load_beside(self, mass: float, lever: float) -> np.ndarray:
-        """Return the change (k, `beside`) of these moments per rad by which the weight lies beside the link."""
+        """Return how these moments change, (k, `beside`) kg m per rad, with how far the weight hangs off its link."""
         ...
 
     def turned(self, theta: np.ndarray) -> np.ndarray:

@@ -124,7 +124,7 @@ class Rows(NamedTuple):
     warmth: np.ndarray  #: (m, n) K of the motors, beyond the mean of their poses; 0 where it is not known
     direction: np.ndarray  #: (m, 3), gravity's unit vector in the base frame, as measured
     load: np.ndarray  #: (m, k) kg m, moments of the weight
-    beside: np.ndarray  #: (m, k, a) kg m per rad, their change with the angles
+    beside: np.ndarray  #: (m, k, a) kg m per rad, how these moments change with the angles of a weight
     effort: np.ndarray  #: (m, n) Nm
     sigma: np.ndarray  #: (m, n) Nm, standard error of `effort`
     layout: FitLayout

@@ -64,7 +64,9 @@ def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> Cal
 
 def axis_error_of(degrees: float | None) -> float:
     """Return the assumed standard error of an axis in rad, by default the usual one. Raises ParameterError."""
-    return FIT.axis_error if degrees is None else math.radians(one_float("axes", degrees, 0.0, MOST_ASKEW, "degrees"))
+    if degrees is None:
+        return FIT.axis_error
+    return math.radians(one_float("axes", degrees, 0.0, MOST_ASKEW, "degrees"))
 
 
 def tour_observations(

@@ -10,7 +10,8 @@ springs none, within what relaxed joints have. A spring stays only if the poses 
 covariance is that with all springs, so that it contains the choice.
 
 What neither moments nor springs explain, such as a shoulder that rises with the arm, stays in the remainder and widens
-the error of the torque. Two more moments, which grow with elevation, were tried: ten poses tell them from no spring.
+the error of the torque. Two more moments, which grow with elevation, were tried: ten poses do not tell them from
+springs.
 
 What varies of the wearer's own activity shows when a pose is visited again. What does not vary is no longer visible: a
 person who carries a constant share of their arm looks like one with a lighter arm.
@@ -127,7 +128,7 @@ def visits(theta: np.ndarray) -> list[tuple[int, int]]:
 def unrest(pairs: Sequence[tuple[int, int]], remainder: np.ndarray) -> np.ndarray:
     """Return the largest change (n,) in Nm of what held the arm between two visits of a pose.
 
-    remainder: (p, n) Nm, less what a fit predicts: the visits may be some degrees apart.
+    remainder: (p, n) Nm, what a fit leaves of the torque: two visits may be some degrees apart.
     """
     changes = [np.abs(remainder[one] - remainder[other]) for one, other in pairs]
     return np.max([np.zeros(remainder.shape[1]), *changes], axis=0)
