@@ -27,7 +27,6 @@ from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER
-from exo_gravity.lab.calibration.tour import CALIBRATOR
 from exo_gravity.lab.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL
 from exo_gravity.sim.motors.firmware import FIRMWARES, FIRST_SPECIAL, SHUT_OFF_AT, WARM_ABOVE, Firmware
@@ -49,11 +48,10 @@ PARAMETERS = {
     "recorder": RECORDER,
     "robot_model": ROBOT_MODEL,
     "panel": PANEL,
-    "calibrator": CALIBRATOR,
 }
 BASES = ("can_bridge", "compensator")
 # Their tables name the parameters that they share with one of BASES, and leave them out.
-REPEATING = ("compensator", "simulator", "calibrator", "urdf_arm")
+REPEATING = ("compensator", "simulator", "urdf_arm")
 RANGES = ("position_range", "velocity_range", "torque_range")
 MOTOR_HEAD = (
     "`motor`",
