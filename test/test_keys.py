@@ -16,6 +16,7 @@ from exo_gravity.core import vocabulary
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.gate import WAITED_OUT
 from exo_gravity.core.vocabulary import NONE, TEXT, Reason, Word
+from exo_gravity.lab import vocabulary as beside
 
 from .support.keys import documented, row_of
 
@@ -43,12 +44,12 @@ VOCABULARY: dict[tuple[str, str], Iterable[str]] = {
     ("compensator", "weighing"): vocabulary.WeighingPhase,
     ("compensator", "weighing trouble"): vocabulary.WeighingTrouble,
     ("compensator", "weigh refused"): vocabulary.WeighingRefused,
-    ("wearer", "state"): vocabulary.WearerState,
-    ("wearer", "reason"): vocabulary.NoEstimate,
-    ("wearer", "budget"): vocabulary.Budget,
-    ("wearer", "support adapts"): vocabulary.Adapts,
+    ("wearer", "state"): beside.WearerState,
+    ("wearer", "reason"): beside.NoEstimate,
+    ("wearer", "budget"): beside.Budget,
+    ("wearer", "support adapts"): beside.Adapts,
     ("imu", "state"): vocabulary.ImuState,
-    ("simulator", "warnings"): vocabulary.SimulatorWarning,
+    ("simulator", "warnings"): beside.SimulatorWarning,
 }
 PARAMETERS = {"position_min", "position_max", "use_sim_time"}
 BESIDE = ("simulator", "robot_model", "panel", "calibrator")  # nodes whose states are of one enumeration
@@ -75,8 +76,8 @@ def test_the_page_has_each_word_of_the_code_and_no_other(node: str, key: str) ->
 
 def test_every_word_belongs_to_a_key_and_every_state_of_other_nodes_is_documented() -> None:
     used = {type(word) for words in VOCABULARY.values() for word in words}
-    assert {*Word.__subclasses__()} - used == {vocabulary.NodeState}
-    assert {word for node in BESIDE for word in documented_words(node, "state")} == as_words(vocabulary.NodeState)
+    assert {*Word.__subclasses__()} - used == {beside.NodeState}
+    assert {word for node in BESIDE for word in documented_words(node, "state")} == as_words(beside.NodeState)
     assert documented()[""]["interface"].words == {str(vocabulary.INTERFACE)}
 
 

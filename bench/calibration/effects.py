@@ -25,7 +25,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import load_moments, moments_of
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -42,6 +42,7 @@ from exo_gravity.lab.calibration.tour import DURATION, Tour
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -9,11 +9,12 @@ from functools import cache
 import numpy as np
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
 from exo_gravity.lab.calibration.poses import next_pose
+from exo_gravity.lab.moments import load_moments, regressor
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
 PAPERS = PapersMoments(ArmModel.from_moments(LENGTH, (0.0,) * 4))

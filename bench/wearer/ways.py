@@ -27,12 +27,13 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import moments_of, regressor
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Tissue, Wearer
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.numbers import COVER, Vector
 from exo_gravity.lab.calibration.pose_fit import columns
+from exo_gravity.lab.moments import regressor
 from exo_gravity.lab.observer.momentum import MomentumObserver
 from exo_gravity.lab.observer.share import WearerCurve, share_of
 

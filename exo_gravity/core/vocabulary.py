@@ -1,8 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The words that programs read on /diagnostics, beside the sentences for people: docs/keys.md.
 
-Each word stands here once; the states and the fault codes of an arm are in core/safety/drive.py. A `Reason` is a
-sentence together with its word, so that what decides on a torque tells both at once.
+Each word stands once: the states and the fault codes of an arm in core/safety/drive.py, those of nodes beside the path
+in lab/vocabulary.py, all others here. A `Reason` is a sentence together with its word, so that what decides on a torque
+tells both at once.
 """
 
 from enum import Enum
@@ -211,46 +212,7 @@ class WeighingTrouble(Word):
     NO_LOAD = "no_load"
 
 
-# wearer
-
-
-class WearerState(Word):
-    """What the estimate of the wearer's torque does."""
-
-    WAITING = "waiting"
-    STOPPED = "stopped"
-    ESTIMATING = "estimating"
-
-
-class NoEstimate(Word):
-    """Why the wearer's torque is not estimated."""
-
-    NO_COMPENSATOR = "no_compensator"
-    NO_PARAMETERS = "no_parameters"
-    REFUSED_PARAMETERS = "refused_parameters"
-    NO_DESCRIPTION = "no_description"
-    NO_JOINT_STATES = "no_joint_states"
-    INCOMPLETE_JOINT_STATES = "incomplete_joint_states"
-    NO_TILT = "no_tilt"
-
-
-class Budget(Word):
-    """Whether the motors hold an arm in every pose."""
-
-    WITHIN_RATED = "within_rated"
-    ABOVE_RATED = "above_rated"
-    UNKNOWN = "unknown"
-
-
-class Adapts(Word):
-    """Whether the support adapts."""
-
-    OFF = "off"
-    ON = "on"
-    HELD = "held"
-
-
-# imu and the other nodes
+# imu, and every node
 
 
 class ImuState(Word):
@@ -270,24 +232,6 @@ class ClockState(Word):
 
     PUBLISHED = "published"
     MISSING = "missing"
-
-
-class NodeState(Word):
-    """What a node beside the path does."""
-
-    WAITING = "waiting"
-    RUNNING = "running"
-    PUBLISHING = "publishing"
-    MEASURING = "measuring"
-    WITHDRAWN = "withdrawn"
-    DONE = "done"
-
-
-class SimulatorWarning(Word):
-    """What makes a simulated arm differ from a sound real one."""
-
-    STALLED = "stalled"
-    DISCONNECTED = "disconnected"
 
 
 def words(*found: object) -> str:

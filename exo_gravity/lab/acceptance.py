@@ -137,8 +137,8 @@ class Bench:
         return float((self.model.rows(np.array([angles]), down)[0] @ self.moments)[-1])
 
     @property
-    def way(self) -> float:
-        """The direction, 1 or -1, in which the last joint has more room from `home`: there it lifts the weight."""
+    def lift_direction(self) -> float:
+        """1 or -1: the direction in which the last joint has more room from `home`, and so lifts the weight."""
         limits = self.loop.safety.limits
         low, home, high = (column[-1] for column in (limits.position_min, limits.home, limits.position_max))
         return 1.0 if high - home >= home - low else -1.0
@@ -174,11 +174,11 @@ class Bench:
         Returns why it does not come to rest, or ''.
         """
         limits = self.loop.safety.limits
-        lifted = [*limits.home[:-1], limits.home[-1] + self.way * ACCEPTANCE.angle]
+        lifted = [*limits.home[:-1], limits.home[-1] + self.lift_direction * ACCEPTANCE.angle]
         goal, most = share * self.needed(lifted), limits.max_effort[-1]
-        if self.way * goal < ACCEPTANCE.least:
+        if self.lift_direction * goal < ACCEPTANCE.least:
             expected = f"at least {ACCEPTANCE.least:g}: take a heavier one; the last joint must lift it"
-            return f"the weight needs {self.way * goal:.2f} Nm, must be {expected}"
+            return f"the weight needs {self.lift_direction * goal:.2f} Nm, must be {expected}"
         if abs(goal) > most:
             return f"the weight needs {abs(goal):.2f} Nm, max_effort permits {most:g}: take a lighter one"
         self.lift.goal = goal
@@ -296,7 +296,7 @@ def time_out(bench: Bench) -> BenchStep:
     paused = bench.loop.call(lambda: bench.clock.sleep(ACCEPTANCE.pause))
     bench.until(paused.done, 2.0 * ACCEPTANCE.pause)
     bench.advance(0.1)
-    fallen = bench.way * (before - bench.angles[-1])
+    fallen = bench.lift_direction * (before - bench.angles[-1])
     has_let_go = fallen > ACCEPTANCE.dip
     expected = f"it must {'let go' if timeout else 'hold'}: motor_timeout = {timeout:g} s"
     sentence = (

@@ -34,6 +34,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     """Train, save the law and print its errors; return 0."""
+    from exo_gravity.lab.anfis_file import text_of
     from exo_gravity.lab.anfis_training import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)
@@ -45,7 +46,7 @@ def _run(options: argparse.Namespace) -> int:
         samples, ridge = from_gravload(configured), RIDGE
     law, results = train_law(samples, configured.robot, functions, ridge)
     output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(law.dump(), encoding="utf-8")
+    output.write_text(text_of(law), encoding="utf-8")
     print(f"{law.source}; {law.model.rules} rules, {law.model.parameters} parameters per joint")
     print(f"{'joint':<6}{'training RMSE':>16}{'held-out RMSE':>16}{'the paper':>16}{'steps':>8}{'time':>9}")
     for i, (joint, result) in enumerate(zip(JOINTS, results, strict=True)):

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.calibration.tour import Player
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, load_moments, moments_of
+from exo_gravity.core.arm.gravity import NO_TORQUE, moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Station
@@ -21,6 +21,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.lab.calibration.tour import Tour
+from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque, load_moments, regressor
+from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.lab.calibration.identification import fit_friction, identify
 from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders
 from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.moments import load_moments, regressor
 
 DAY = datetime.date(2026, 11, 22)
 DOWN = Tilt.of("right", 0.3, -0.2).direction

@@ -11,7 +11,7 @@ import pinocchio
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.gravity import load_moments, moments_of, regressor
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import settings_of
 from exo_gravity.core.compensation.tracking import Observation
@@ -25,6 +25,7 @@ from exo_gravity.lab.calibration.wearer import wearer_from
 from exo_gravity.lab.calibration.wearer_fit import fit_wearer
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.moments import load_moments, regressor
 from exo_gravity.sim import ArmConfig, SimulatedArm
 
 from ..support.chains import random_chain

@@ -10,6 +10,7 @@ import yaml
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.anfis_file import text_of
 from exo_gravity.lab.anfis_training import RIDGE, Projection, from_bag, from_gravload, train, train_law
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.references import PAPER_ANFIS
@@ -58,7 +59,7 @@ def test_on_the_papers_positions_it_errs_less_than_the_paper_and_holds_the_arm_a
     assert np.all(np.array(law.error["held_out"]) < PAPER_ANFIS)
     theta = np.random.default_rng(2).uniform(configured.low, configured.high, (2000, 4))
     assert law.torques(theta[:, 1:]) == pytest.approx(gravity_torque(configured.robot, theta)[:, 1:], abs=2e-3)
-    again = AnfisLaw.load(law.dump())  # the reported errors are those of the saved law
+    again = AnfisLaw.load(text_of(law))  # the reported errors are those of the saved law
     held_out = np.sqrt(np.mean((again.torques(samples.held_out_angle) - samples.held_out_torque) ** 2, axis=0))
     assert again.error["held_out"] == pytest.approx(held_out)
 

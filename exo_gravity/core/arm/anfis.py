@@ -14,7 +14,6 @@ law instead. An upright trunk needs no torque of joint 1. Gains c_n and gravity 
 
 import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -138,23 +137,6 @@ class AnfisLaw:
             raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
         except (TypeError, ValueError) as error:
             raise DataError(f"ANFIS file: {error}: must be a file from train_anfis") from None
-
-    def dump(self) -> str:
-        """Return the JSON text that `load` reads, one line per rule."""
-        joints = {}
-        for i, joint in enumerate(JOINTS):
-            joints[joint] = {f"{kind}_rmse": float(values[i]) for kind, values in self.error.items()}
-            joints[joint] |= {part: getattr(self.model, part)[i].tolist() for part in PARTS}
-        content = {
-            "format": FORMAT,
-            "about": "Takagi-Sugeno models (Jang 1993) of the holding torque in Nm of joints 2 to 4, trunk upright. "
-            "Inputs: joint angles, scaled to -1..1 over the box (rad). Consequents: p_0..p_3 of each rule.",
-            "source": self.source,
-            "arm": {"first_moment": self.first_moment, "gravity": self.gravity},
-            "box": dict(zip(INPUTS, zip(self.low, self.high, strict=True), strict=True)),
-            "joints": joints,
-        }
-        return re.sub(r"\[[^\[\]]*\]", lambda found: " ".join(found[0].split()), json.dumps(content, indent=1)) + "\n"
 
     def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
         """Return why the law was not trained for this arm, pose or tilt, in a sentence; '' if it was.

@@ -21,17 +21,16 @@ their y. What lies along a joint's own axis (link 1 along y_1) needs no torque.
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmData
+from exo_gravity.core.arm.arm_data import ArmData
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+from exo_gravity.core.numbers import JOINT_COUNT
 
 Torque = tuple[float, ...]  # (n,) Nm in joint order
 NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
@@ -192,41 +191,9 @@ def _scaled(arm: ArmData, tilt: Tilt, tau: Torque) -> Torque:
     return felt * a * tau[0], felt * b * tau[1], felt * c * tau[2], felt * d * tau[3]
 
 
-MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
 MAX_OFFSET = 0.1  # m of a centre of gravity from its link
 
 
 def moments_of(arm: ArmData) -> np.ndarray:
     """Return the eight moments (8,) of `arm` in kg m."""
     return np.array((*arm.first_moment, *arm.off_axis))
-
-
-def load_moments(length: Vector, mass: float, lever: float) -> np.ndarray:
-    """Return what a weight of `mass` kg on link 4, `lever` m from the elbow, adds to the moments: (8,) kg m.
-
-    length: (4,) m. Raises ParameterError.
-    """
-    lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
-    mass = one_float("load_mass", mass, 0.0, MAX_MASS, "kg")
-    lever = one_float("load_lever", lever, 0.0, MAX_LENGTH, "m")
-    return np.array((*(mass * lengths[:3]).tolist(), mass * lever, 0.0, 0.0, 0.0, 0.0))
-
-
-def regressor(
-    theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0), gravity: float = STANDARD_GRAVITY
-) -> np.ndarray:
-    """Return the torque of each joint per unit of each moment: (n, 4, 8) in Nm per kg m.
-
-    theta: (n, 4) rad. direction: (3,) or (n, 3), gravity's unit vector in the base frame. The torque (n, 4) in Nm is
-    `regressor(...) @ moments`. Raises ParameterError as `gravity_torque` does.
-    """
-    poses = np.atleast_2d(np.asarray(theta, dtype=float))
-    return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
-
-
-@lru_cache(4)
-def _unit_arms(gravity: float) -> list[ArmData]:
-    """Return an arm for each moment, which has that moment of 1 kg m and no other."""
-    rows = np.eye(len(MOMENTS))
-    no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
-    return [ArmData.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]

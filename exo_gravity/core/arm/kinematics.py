@@ -115,12 +115,12 @@ class LinkInertia(NamedTuple):
         """Return the torque (4,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (4,) each."""
         links = frames(NO_LENGTH, theta)
         vectors = _vectors(links, self.weights)
-        turning = spin_up = ZERO  # of the link
+        omega = alpha = ZERO  # angular velocity and acceleration of the link
         motions = []
         for (_, axis, _), speed, change in zip(links, velocity, acceleration, strict=True):
-            spin_up = plus(plus(spin_up, axis, change), cross(turning, axis), speed)
-            turning = plus(turning, axis, speed)
-            motions.append((turning, spin_up))
+            alpha = plus(plus(alpha, axis, change), cross(omega, axis), speed)
+            omega = plus(omega, axis, speed)
+            motions.append((omega, alpha))
         second = [acceleration_of(vector, *motions[n % JOINT_COUNT]) for n, vector in enumerate(vectors)]
         rotors = map(operator.mul, self.rotors, acceleration)
         return tuple(map(operator.add, _torque(links, vectors, self.weights, second), rotors))

@@ -79,9 +79,9 @@ def cross(a: Floats3, b: Floats3) -> Floats3:
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-def acceleration_of(place: Floats3, turning: Floats3, spin_up: Floats3) -> Floats3:
-    """Return by how much `place` on a turning body accelerates beyond the body's origin, in m/s^2.
+def acceleration_of(place: Floats3, angular_velocity: Floats3, angular_acceleration: Floats3) -> Floats3:
+    """Return the acceleration of `place` on a rigid body relative to the body's origin, in m/s^2.
 
-    place: m from the origin. turning: rad/s, spin_up: rad/s^2.
+    place: m from the origin. angular_velocity: rad/s. angular_acceleration: rad/s^2.
     """
-    return plus(cross(spin_up, place), cross(turning, cross(turning, place)))
+    return plus(cross(angular_acceleration, place), cross(angular_velocity, cross(angular_velocity, place)))

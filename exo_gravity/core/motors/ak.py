@@ -33,6 +33,7 @@ import math
 import struct
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import partial
 
 from exo_gravity.core.errors import FrameError, ParameterError
 from exo_gravity.core.motors.frames import (
@@ -44,6 +45,7 @@ from exo_gravity.core.motors.frames import (
     MALFORMED,
     OTHER,
     REPLY,
+    RPM,
     SERVO,
     Family,
     Frame,
@@ -89,119 +91,105 @@ SPEED_STEP = 10.0 * 2.0 * math.pi / 60.0  # electrical rad/s
 CURRENT_STEP = 0.01  # A
 _STATUS = struct.Struct(">hhhbB")
 
-_RPM = 2.0 * math.pi / 60.0  # rad/s
-_WIRE = "wire ranges: driver manual V1.0.15, table of MIT mode"
-
-
-def _ak(
-    name: str,
-    *,
-    ranges: tuple[float, float],
-    torques: tuple[float, float],
-    rpm: tuple[float, float],
-    gear_ratio: int,
-    pole_pairs: int,
-    torque_per_ampere: float,
-    rotor_inertia: float,
-    source: str,
-    assumed: tuple[str, ...] = (),
-) -> MotorSpec:
-    """Return an AK motor.
-
-    ranges: on the wire, rad/s and Nm.
-    torques: rated and peak, Nm.
-    rpm: rated and no-load speed of the output.
-    """
-    rated_speed, no_load_speed = (_RPM * speed for speed in rpm)
-    return MotorSpec(
-        name,
-        FAMILY,
-        *ranges,
-        *torques,
-        rated_speed,
-        no_load_speed,
-        gear_ratio,
-        pole_pairs,
-        torque_per_ampere,
-        rotor_inertia,
-        output_encoder=False,
-        can_fd=False,
-        shuts_off_at=120.0,  # of the one firmware that was run (sim/motors/firmware.py)
-        source=f"{_WIRE}; {source}",
-        assumed=frozenset(("shuts_off_at", *assumed)),
-    )
-
+# What the motors have in common.
+_motor = partial(
+    MotorSpec,
+    family=FAMILY,
+    output_encoder=False,
+    can_fd=False,
+    shuts_off_at=120.0,  # of the one firmware that was run (sim/motors/firmware.py)
+    assumed=frozenset(("shuts_off_at",)),
+)
+_SOURCE = "wire ranges: driver manual V1.0.15, table of MIT mode; CubeMars product page, "
 
 # Torque per ampere is rated torque by rated current, unless a firmware was read. An AK10-9 has a second encoder at the
 # output; whether its angle after power-up is that one's is not known, so that it counts as ambiguous.
 _ALL = (
-    _ak(
-        "AK10-9",
-        ranges=(50.0, 65.0),
-        torques=(18.0, 48.0),
-        rpm=(228.0, 320.0),
+    _motor(
+        name="AK10-9",
+        velocity_range=50.0,
+        torque_range=65.0,
+        rated_torque=18.0,
+        peak_torque=48.0,
+        rated_speed=228.0 * RPM,
+        no_load_speed=320.0 * RPM,
         gear_ratio=9,
         pole_pairs=21,
         torque_per_ampere=18.0 / 10.6,
         rotor_inertia=8.12e-3,  # 1002 g cm^2 times the gear ratio squared
-        source="CubeMars product page, AK10-9 V2.0 KV60 at 48 V",
-        assumed=("output_encoder",),
+        source=_SOURCE + "AK10-9 V2.0 KV60 at 48 V",
+        assumed=frozenset(("shuts_off_at", "output_encoder")),
     ),
-    _ak(
-        "AK60-6",
-        ranges=(45.0, 15.0),
-        torques=(3.0, 9.0),
-        rpm=(420.0, 560.0),
+    _motor(
+        name="AK60-6",
+        velocity_range=45.0,
+        torque_range=15.0,
+        rated_torque=3.0,
+        peak_torque=9.0,
+        rated_speed=420.0 * RPM,
+        no_load_speed=560.0 * RPM,
         gear_ratio=6,
         pole_pairs=14,
         torque_per_ampere=0.2997,  # of firmware V3.2; rated torque by rated current would be 0.405
         rotor_inertia=8.8e-4,  # 243.5 g cm^2
-        source="CubeMars product page, AK60-6 V1.1 KV140 at 24 V",
-        assumed=("no_load_speed",),  # Kv times 24 V by the gear ratio
+        source=_SOURCE + "AK60-6 V1.1 KV140 at 24 V",
+        assumed=frozenset(("shuts_off_at", "no_load_speed")),  # Kv times 24 V by the gear ratio
     ),
-    _ak(
-        "AK70-10",
-        ranges=(50.0, 25.0),
-        torques=(8.3, 24.8),
-        rpm=(310.0, 480.0),
+    _motor(
+        name="AK70-10",
+        velocity_range=50.0,
+        torque_range=25.0,
+        rated_torque=8.3,
+        peak_torque=24.8,
+        rated_speed=310.0 * RPM,
+        no_load_speed=480.0 * RPM,
         gear_ratio=10,
         pole_pairs=21,
         torque_per_ampere=8.3 / 7.2,
         rotor_inertia=4.14e-3,  # 414 g cm^2; an older page has 753
-        source="CubeMars product page, AK70-10 KV100 at 48 V",
+        source=_SOURCE + "AK70-10 KV100 at 48 V",
     ),
-    _ak(
-        "AK80-6",
-        ranges=(76.0, 12.0),
-        torques=(6.0, 12.0),
-        rpm=(603.0, 800.0),
+    _motor(
+        name="AK80-6",
+        velocity_range=76.0,
+        torque_range=12.0,
+        rated_torque=6.0,
+        peak_torque=12.0,
+        rated_speed=603.0 * RPM,
+        no_load_speed=800.0 * RPM,
         gear_ratio=6,
         pole_pairs=21,
         torque_per_ampere=6.0 / 9.7,
         rotor_inertia=2.19e-3,  # 607 g cm^2
-        source="CubeMars product page, AK80-6 KV100 at 48 V",
+        source=_SOURCE + "AK80-6 KV100 at 48 V",
     ),
-    _ak(
-        "AK80-9",
-        ranges=(50.0, 18.0),
-        torques=(9.0, 18.0),
-        rpm=(390.0, 570.0),
+    _motor(
+        name="AK80-9",
+        velocity_range=50.0,
+        torque_range=18.0,
+        rated_torque=9.0,
+        peak_torque=18.0,
+        rated_speed=390.0 * RPM,
+        no_load_speed=570.0 * RPM,
         gear_ratio=9,
         pole_pairs=21,
         torque_per_ampere=9.0 / 10.3,
         rotor_inertia=4.9e-3,  # 607 g cm^2
-        source="CubeMars product page, AK80-9 KV100 at 48 V",
+        source=_SOURCE + "AK80-9 KV100 at 48 V",
     ),
-    _ak(
-        "AK80-64",
-        ranges=(8.0, 144.0),
-        torques=(48.0, 120.0),
-        rpm=(48.0, 75.0),
+    _motor(
+        name="AK80-64",
+        velocity_range=8.0,
+        torque_range=144.0,
+        rated_torque=48.0,
+        peak_torque=120.0,
+        rated_speed=48.0 * RPM,
+        no_load_speed=75.0 * RPM,
         gear_ratio=64,
         pole_pairs=21,
         torque_per_ampere=48.0 / 7.0,
         rotor_inertia=0.231,  # 564.5 g cm^2
-        source="CubeMars product page, AK80-64 KV80 at 48 V",
+        source=_SOURCE + "AK80-64 KV80 at 48 V",
     ),
 )
 MOTORS = {spec.name: spec for spec in _ALL}

@@ -19,10 +19,10 @@ A motor obeys every 11-bit ID with its own lowest 8 bits: bits 8 to 10 name a co
 each (read in a disassembled DM-J4310 firmware). So no reply ID may end with another motor's ID.
 """
 
-import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from exo_gravity.core.errors import FrameError, ParameterError
@@ -35,6 +35,7 @@ from exo_gravity.core.motors.frames import (
     MALFORMED,
     OTHER,
     REPLY,
+    RPM,
     SETTING,
     Family,
     Frame,
@@ -70,135 +71,125 @@ MIT_MODE = 1  # of CTRL_MODE
 TICK = 50e-6  # s, one step of TIMEOUT
 SAME = 1e-3  # share by which a register may differ from the file's decimal
 
-_RPM = 2.0 * math.pi / 60.0  # rad/s
-
-
-def _damiao(
-    name: str,
-    *,
-    ranges: tuple[float, float],
-    torques: tuple[float, float],
-    rpm: tuple[float, float],
-    gear_ratio: int,
-    pole_pairs: int,
-    torque_per_ampere: float,
-    rotor: float,
-    position_range: float = 12.5,
-    can_fd: bool = True,
-    assumed: tuple[str, ...] = (),
-) -> MotorSpec:
-    """Return a Damiao motor.
-
-    ranges: on the wire as delivered, rad/s and Nm.
-    torques: rated and peak, Nm.
-    rpm: rated and no-load speed of the output.
-    rotor: its inertia, kg m^2.
-    """
-    rated_speed, no_load_speed = (_RPM * speed for speed in rpm)
-    return MotorSpec(
-        name,
-        FAMILY,
-        *ranges,
-        *torques,
-        rated_speed,
-        no_load_speed,
-        gear_ratio,
-        pole_pairs,
-        torque_per_ampere,
-        rotor_inertia=rotor * gear_ratio**2,
-        output_encoder=True,  # "magnetic, dual"
-        can_fd=can_fd,
-        shuts_off_at=100.0,  # register OT_Value as recommended
-        source="Damiao's table of motors, as Seeed's wiki prints it (Damiao Series, 2025)",
-        assumed=frozenset(("shuts_off_at", *assumed)),
-        position_range=position_range,
-    )
-
+# What the motors have in common. The inertia of a rotor is that at its own shaft, times the gear ratio squared.
+_motor = partial(
+    MotorSpec,
+    family=FAMILY,
+    output_encoder=True,  # "magnetic, dual"
+    can_fd=True,
+    shuts_off_at=100.0,  # register OT_Value as recommended
+    source="Damiao's table of motors, as Seeed's wiki prints it (Damiao Series, 2025)",
+    assumed=frozenset(("shuts_off_at",)),
+)
 
 _ALL = (
-    _damiao(
-        "DM-J3507",
-        ranges=(50.0, 5.0),
-        torques=(0.8, 3.0),
-        rpm=(150.0, 460.0),
+    _motor(
+        name="DM-J3507",
+        velocity_range=50.0,
+        torque_range=5.0,
+        rated_torque=0.8,
+        peak_torque=3.0,
+        rated_speed=150.0 * RPM,
+        no_load_speed=460.0 * RPM,
         gear_ratio=7,
         pole_pairs=14,
         torque_per_ampere=0.5439,
-        rotor=8.7e-6,
+        rotor_inertia=8.7e-6 * 7**2,
         position_range=12.566,
     ),
-    _damiao(
-        "DM-J4310",
-        ranges=(30.0, 10.0),
-        torques=(3.0, 7.0),
-        rpm=(120.0, 200.0),
+    _motor(
+        name="DM-J4310",
+        velocity_range=30.0,
+        torque_range=10.0,
+        rated_torque=3.0,
+        peak_torque=7.0,
+        rated_speed=120.0 * RPM,
+        no_load_speed=200.0 * RPM,
         gear_ratio=10,
         pole_pairs=14,
         torque_per_ampere=0.945,
-        rotor=1.8e-5,
+        rotor_inertia=1.8e-5 * 10**2,
     ),
-    _damiao(
-        "DM-J4340",
-        ranges=(8.0, 28.0),  # other tables have 10 rad/s: the motor's register decides
-        torques=(9.0, 27.0),
-        rpm=(36.0, 52.5),
+    _motor(
+        name="DM-J4340",
+        velocity_range=8.0,  # other tables have 10 rad/s: the motor's register decides
+        torque_range=28.0,
+        rated_torque=9.0,
+        peak_torque=27.0,
+        rated_speed=36.0 * RPM,
+        no_load_speed=52.5 * RPM,
         gear_ratio=40,
         pole_pairs=14,
         torque_per_ampere=4.074,
-        rotor=2.0e-5,
-        assumed=("velocity_range",),
+        rotor_inertia=2.0e-5 * 40**2,
+        assumed=frozenset(("shuts_off_at", "velocity_range")),
     ),
-    _damiao(
-        "DM-J6006",
-        ranges=(45.0, 20.0),
-        torques=(4.0, 11.0),
-        rpm=(150.0, 408.0),
+    _motor(
+        name="DM-J6006",
+        velocity_range=45.0,
+        torque_range=20.0,
+        rated_torque=4.0,
+        peak_torque=11.0,
+        rated_speed=150.0 * RPM,
+        no_load_speed=408.0 * RPM,
         gear_ratio=6,
         pole_pairs=14,
         torque_per_ampere=0.7308,
-        rotor=5.8e-5,
+        rotor_inertia=5.8e-5 * 6**2,
         can_fd=False,
     ),
-    _damiao(
-        "DM-J8006",
-        ranges=(45.0, 40.0),
-        torques=(8.0, 20.0),
-        rpm=(120.0, 392.8),
+    _motor(
+        name="DM-J8006",
+        velocity_range=45.0,
+        torque_range=40.0,
+        rated_torque=8.0,
+        peak_torque=20.0,
+        rated_speed=120.0 * RPM,
+        no_load_speed=392.8 * RPM,
         gear_ratio=6,
         pole_pairs=21,
         torque_per_ampere=1.0206,
-        rotor=1.15e-4,
+        rotor_inertia=1.15e-4 * 6**2,
         can_fd=False,
     ),
-    _damiao(
-        "DM-J8009",
-        ranges=(45.0, 54.0),
-        torques=(20.0, 40.0),
-        rpm=(200.0, 335.0),
+    _motor(
+        name="DM-J8009",
+        velocity_range=45.0,
+        torque_range=54.0,
+        rated_torque=20.0,
+        peak_torque=40.0,
+        rated_speed=200.0 * RPM,
+        no_load_speed=335.0 * RPM,
         gear_ratio=9,
         pole_pairs=21,
         torque_per_ampere=1.261575,
-        rotor=1.95e-4,
+        rotor_inertia=1.95e-4 * 9**2,
     ),
-    _damiao(
-        "DM-J10010",
-        ranges=(20.0, 200.0),
-        torques=(40.0, 150.0),
-        rpm=(100.0, 150.0),
+    _motor(
+        name="DM-J10010",
+        velocity_range=20.0,
+        torque_range=200.0,
+        rated_torque=40.0,
+        peak_torque=150.0,
+        rated_speed=100.0 * RPM,
+        no_load_speed=150.0 * RPM,
         gear_ratio=10,
         pole_pairs=21,
         torque_per_ampere=2.59875,
-        rotor=5.5e-4,
+        rotor_inertia=5.5e-4 * 10**2,
     ),
-    _damiao(
-        "DM-J10010L",
-        ranges=(25.0, 200.0),
-        torques=(40.0, 120.0),
-        rpm=(100.0, 200.0),
+    _motor(
+        name="DM-J10010L",
+        velocity_range=25.0,
+        torque_range=200.0,
+        rated_torque=40.0,
+        peak_torque=120.0,
+        rated_speed=100.0 * RPM,
+        no_load_speed=200.0 * RPM,
         gear_ratio=10,
         pole_pairs=21,
         torque_per_ampere=2.00025,
-        rotor=5.56e-4,
+        rotor_inertia=5.56e-4 * 10**2,
     ),
 )
 MOTORS = {spec.name: spec for spec in _ALL}

@@ -42,6 +42,7 @@ Frame = tuple[int, bytes]  # arbitration ID and data
 REPLY, COMMAND, MALFORMED, SERVO, OTHER = "reply", "command", "malformed reply", "servo mode", "other"
 SETTING, ELSEWHERE, ALIAS = "setting", "reply with another ID", "command with another ID"
 BROADCAST_ID = 0xFF  # stands for all motors of a bus whose boards obey it
+RPM = 2.0 * math.pi / 60.0  # rad/s
 HANGING_TOLERANCE = 0.5  # rad from zero, at most, of an arm that hangs, where its encoders leave no doubt
 
 

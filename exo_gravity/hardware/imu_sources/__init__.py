@@ -6,19 +6,19 @@ from typing import Any
 
 from exo_gravity.hardware.imu_sources.chips import CHIPS, PolledChip
 from exo_gravity.hardware.imu_sources.serial_sensors import Bno085, WitMotion
-from exo_gravity.hardware.imu_sources.source import Clock, ImuSource, Reopening
+from exo_gravity.hardware.imu_sources.source import StampClock, ImuSource, Reopening
 
 __all__ = ["SOURCES", "ImuSource", "Reopening", "open_source"]
 
 #: By the value of the parameter `source`: what opens the IMU, given the parameter values and the clock of the stamps.
-SOURCES: dict[str, Callable[[Mapping[str, Any], Clock], ImuSource]] = {
+SOURCES: dict[str, Callable[[Mapping[str, Any], StampClock], ImuSource]] = {
     **dict.fromkeys(CHIPS, PolledChip),
     "witmotion": WitMotion,
     "bno085": Bno085,
 }
 
 
-def open_source(values: Mapping[str, Any], clock: Clock) -> ImuSource:
+def open_source(values: Mapping[str, Any], clock: StampClock) -> ImuSource:
     """Open the IMU that the values of `imu`'s parameters name by `source`, which must not be 'topic'.
 
     clock: of the stamps. Raises DeviceError, and ParameterError if a value does not suit the device or its library is

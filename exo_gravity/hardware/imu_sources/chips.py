@@ -14,7 +14,7 @@ from typing import Any
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.trunk.imu_checks import ImuSample
-from exo_gravity.hardware.imu_sources.source import Clock, ImuSource
+from exo_gravity.hardware.imu_sources.source import StampClock, ImuSource
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class PolledChip(ImuSource):
 
     silence = "its values do not change: its supply may have broken down"
 
-    def __init__(self, values: Mapping[str, Any], clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], clock: StampClock) -> None:
         """Open the chip that the values of `imu`'s parameters name. Raises DeviceError, ParameterError."""
         kind, number, rate = values["source"], values["i2c.bus"], values["rate"]
         usual_address, connect = CHIPS[kind]

@@ -23,7 +23,7 @@ from exo_gravity.core.arm.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, Clock, ImuSource
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, StampClock, ImuSource
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 UNLOCK = b"\xff\xaa\x69\x88\xb5"
@@ -58,7 +58,7 @@ class SerialSource(ImuSource):
     LENGTH: ClassVar[int]  # bytes of a packet
     SUMMED: ClassVar[int]  # the first byte that counts into the sum in its last one
 
-    def __init__(self, values: Mapping[str, Any], rate: float, clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], rate: float, clock: StampClock) -> None:
         """Open the port of the parameter values for `rate` samples a second. Raises DeviceError, ParameterError."""
         port = values["serial.port"]
         if not port:
@@ -133,7 +133,7 @@ class WitMotion(SerialSource):
 
     DEVICE, HEADER, LENGTH, SUMMED = "WitMotion", b"\x55", 11, 0
 
-    def __init__(self, values: Mapping[str, Any], clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], clock: StampClock) -> None:
         """Open the port and set the sensor's rate. Raises DeviceError, ParameterError."""
         rate, baud = min(RATES, key=lambda candidate: abs(candidate - values["rate"])), values["serial.baud"]
         needed = int(rate * PACKETS_A_SAMPLE * self.LENGTH * BITS_A_BYTE)
@@ -187,7 +187,7 @@ class Bno085(SerialSource):
 
     DEVICE, HEADER, LENGTH, SUMMED = "BNO085", b"\xaa\xaa", 19, 2
 
-    def __init__(self, values: Mapping[str, Any], clock: Clock) -> None:
+    def __init__(self, values: Mapping[str, Any], clock: StampClock) -> None:
         """Open the port. Raises DeviceError, ParameterError."""
         super().__init__(values, RVC_RATE, clock)
         self._counter: int | None = None

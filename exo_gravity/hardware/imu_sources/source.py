@@ -11,7 +11,7 @@ from exo_gravity.core.trunk.imu_checks import ImuSample
 
 RADIANS_PER_DEGREE = math.pi / 180.0
 
-Clock = Callable[[], float]  # s; the clock of the stamps
+StampClock = Callable[[], float]  # s; the clock of the stamps
 Axes = tuple[float, float, float]
 
 

@@ -33,7 +33,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import MOMENTS
 from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
@@ -56,6 +55,7 @@ from exo_gravity.lab.calibration.pose_fit import (
     without_outliers,
 )
 from exo_gravity.lab.calibration.poses import missing_pose, shown_by
+from exo_gravity.lab.moments import MOMENTS
 
 
 @dataclass(frozen=True)

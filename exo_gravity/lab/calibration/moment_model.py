@@ -13,12 +13,13 @@ from typing import Protocol
 import numpy as np
 
 from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import MOMENTS, Torque, exact_torque, load_moments, moments_of, regressor
+from exo_gravity.core.arm.gravity import Torque, exact_torque, moments_of
 from exo_gravity.core.arm.kinematics import NO_LENGTH, LinkInertia, frames
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 
 Holder = Callable[[Sequence[float], Tilt], Torque]
 # kg m, of a robot arm with the motors of this package; only the share of noise and scale in a pose depends on it.
@@ -138,7 +139,7 @@ class PapersMoments:
         return np.array(tilt.direction)
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return `core.arm.gravity.regressor`."""
+        """Return `lab.moments.regressor`."""
         return regressor(theta, direction, self.gravity)
 
     def load(self, mass: float, lever: float) -> np.ndarray:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.arm import ModelError, papers
-from exo_gravity.core.arm.gravity import MOMENTS
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.compensation.laws import URDF_LAW
@@ -34,6 +33,7 @@ from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"

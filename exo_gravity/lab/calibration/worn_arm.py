@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from exo_gravity.core.arm.arm import moments_along, papers
-from exo_gravity.core.arm.gravity import MAX_OFFSET, MOMENTS, moments_of, regressor
+from exo_gravity.core.arm.gravity import MAX_OFFSET, moments_of
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
@@ -21,6 +21,7 @@ from exo_gravity.lab.calibration.result import Change
 from exo_gravity.lab.calibration.tours import row, urdf_model_of
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit
 from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.moments import MOMENTS, regressor
 
 
 @dataclass(frozen=True)

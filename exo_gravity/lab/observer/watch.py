@@ -8,11 +8,12 @@ from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.numbers import COVER
-from exo_gravity.core.vocabulary import NONE, UNKNOWN, Adapts
+from exo_gravity.core.vocabulary import NONE, UNKNOWN
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
 from exo_gravity.lab.observer.contact import ContactWatch
 from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
 from exo_gravity.lab.observer.share import Known, Shares
+from exo_gravity.lab.vocabulary import Adapts
 
 OLD = 1.0  # s after which an estimate is no longer shown
 

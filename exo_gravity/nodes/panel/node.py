@@ -31,9 +31,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.core.vocabulary import NodeState
 from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.lab.packages import missing
+from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run

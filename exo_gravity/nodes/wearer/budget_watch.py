@@ -17,8 +17,9 @@ from exo_gravity.core.arm.wearer import Tissue
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.vocabulary import NONE, UNKNOWN, Budget, Reason
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, Reason
 from exo_gravity.lab.budget import USUAL_TILT, budget_worn, largest_support, motor_torques, overload, workspace
+from exo_gravity.lab.vocabulary import Budget
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
 WITHIN = "within rated torque everywhere"

@@ -31,10 +31,11 @@ from exo_gravity.core.compensation.settings import Settings, settings_of, urdf_s
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, NONE, Adapts, NoEstimate, Reason, WearerState
+from exo_gravity.core.vocabulary import NO_REASON, NONE, Reason
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
+from exo_gravity.lab.vocabulary import Adapts, NoEstimate, WearerState
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run

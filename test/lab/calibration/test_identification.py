@@ -20,13 +20,14 @@ from bench.calibration.random_device import (
 )
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import MOMENTS, load_moments, moments_of, regressor
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import FIT
 from exo_gravity.lab.inputs.references import pinocchio_model
+from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from bench.calibration.random_device import LEANING, PAPERS, Device, best
-from exo_gravity.core.arm.gravity import regressor
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import check_physical, identify
 from exo_gravity.lab.calibration.pose_fit import layout_of
 from exo_gravity.lab.calibration.poses import missing_pose
+from exo_gravity.lab.moments import regressor
 
 SLIPS = {
     "one pose": {2: (0, 0, 0.3, 0)},

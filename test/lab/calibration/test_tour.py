@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.arm.gravity import load_moments, moments_of
+from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, average
@@ -21,6 +21,7 @@ from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, measurable
 from exo_gravity.lab.calibration.tour import Tour
+from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
