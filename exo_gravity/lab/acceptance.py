@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.tilt import SIDES, Tilt
+from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.motors.boards import CHECK
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_of_bus
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
+from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.vocabulary import Source
@@ -83,28 +84,21 @@ class BenchStep:
     measured: dict[str, Any] = field(default_factory=dict)
 
 
-class Lift:
+class Lift(SampleController):
     """A controller that lifts the last link with a torque that rises slowly, and asks nothing of the other joints.
 
-    goal: Nm, of the last joint. asked: Nm, at present. period: s of a cycle. limits: of the arm.
+    goal: Nm, of the last joint. asked: Nm, at present. limits: of the arm. period: s of a cycle.
     """
 
     def __init__(self, limits: Limits, period: float) -> None:
+        super().__init__(limits)
         self.goal = self.asked = 0.0
-        self._limits, self._step = limits, ACCEPTANCE.rise * period
-        self._newest = NO_EFFORTS
+        self._step = ACCEPTANCE.rise * period
 
-    def efforts(self, latest: float) -> Efforts:
-        """Return the newest efforts, without waiting."""
-        return self._newest
-
-    def take(self, now: float, samples: Sequence[JointSample]) -> None:
-        """Answer the newest sample of each joint, unless a motor is silent."""
-        if any(self._limits.is_silent(now, sample) for sample in samples):
-            return
+    def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
         self.asked = limited(self.goal, self.asked, self._step)
         effort = (*(0.0 for _ in samples[:-1]), self.asked)
-        self._newest = Efforts(effort, min(sample.time for sample in samples), damped=True, held=False)
+        return Efforts(effort, min(sample.time for sample in samples), damped=True, held=False)
 
 
 class Bench:

@@ -81,7 +81,7 @@ class ArmModel(ArmData):
 
 
 def papers(arm: Arm) -> ArmModel:
-    """Return `arm`, for what is only known of the paper's. Raises TypeError for another."""
+    """Return `arm` as the paper's arm, for what no other arm has. Raises TypeError if it is another one."""
     if not isinstance(arm, ArmModel):
         raise TypeError(f"this takes the paper's arm, got {type(arm).__name__}")
     return arm

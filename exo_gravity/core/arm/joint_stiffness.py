@@ -3,7 +3,7 @@
 
 A joint of stiffness k [Nm/rad] that carries tau has its link at q = theta - tau(q) / k (M. Spong, J Dyn Sys Meas
 Control 109:310, 1987). The torque changes with the angle by at most about g times the first moments, 15
-Nm/rad on a worn arm: `held` finds it by fixed-point steps, each of which leaves that by k of the error.
+Nm/rad on a worn arm. `held` finds it by fixed-point steps, each of which leaves this slope divided by k of the error.
 """
 
 from __future__ import annotations

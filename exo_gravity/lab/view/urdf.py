@@ -85,8 +85,8 @@ class Described:
         """
         raise NotImplementedError
 
-    def ways(self) -> np.ndarray:
-        """Return the way (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
+    def link_vectors(self) -> np.ndarray:
+        """Return the vector (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
         raise NotImplementedError
 
     def bodies(self) -> list[tuple[float, Point]]:
@@ -124,15 +124,15 @@ class ArmDescription(Described):
         origins = _in_trunk(self, [link.origin for link in links]) + self.base
         return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
 
-    def ways(self) -> np.ndarray:
-        """Return each link's length along it."""
+    def link_vectors(self) -> np.ndarray:
+        """Return each link's vector: its length along its direction."""
         _, _, along = self.pose((0.0,) * JOINT_COUNT)
         return np.asarray(self.robot.length[:, None] * along)
 
     def bodies(self) -> list[tuple[float, Point]]:
         """Return mass and centre of gravity of each link.
 
-        Moments across the links (moments.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
+        Moments across the links (core/arm/gravity.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
         Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity, also beyond
         the links, follow from the moments.
         """
@@ -175,8 +175,8 @@ class UrdfDescription(Described):
         """Return where the arm is at `theta` (n,) rad."""
         return self.robot.pose(theta)
 
-    def ways(self) -> np.ndarray:
-        """Return the ways between the joints, and to the hand."""
+    def link_vectors(self) -> np.ndarray:
+        """Return the vectors between the joints, and from the last one to the hand."""
         return np.diff(self.robot.places(self._zero), axis=0)
 
     def bodies(self) -> list[tuple[float, Point]]:
@@ -239,11 +239,11 @@ def joint_names(arms: Sequence[Described]) -> list[tuple[str, ...]]:
 
 def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]:
     """Yield the joints and links of one arm."""
-    limits, ways = arm.limits, arm.ways()
+    limits, vectors = arm.limits, arm.link_vectors()
     _, axes, _ = arm.pose((0.0,) * len(names))
     parent, origin = ROOT, arm.base
     for n, (mass, centre) in enumerate(arm.bodies()):
-        end, length = tuple(ways[n].tolist()), float(np.linalg.norm(ways[n]))
+        end, length = tuple(vectors[n].tolist()), float(np.linalg.norm(vectors[n]))
         lower, upper = limits.position_min[n], limits.position_max[n]
         largest = {"effort": limits.max_effort[n], "velocity": limits.max_velocity[n]}
         moving = [_element("axis", xyz=axes[n]), _element("limit", lower=lower, upper=upper, **largest)]
@@ -252,12 +252,12 @@ def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]
         yield _joint(names[n], "revolute", parent, arm.links[n], origin, *moving)
         drawn = []
         if length:
-            middle, along = tuple((ways[n] / 2).tolist()), ways[n] / length
+            middle, along = tuple((vectors[n] / 2).tolist()), vectors[n] / length
             drawn.append(_visual("tube", "cylinder", middle, along, radius=DRAWN_RADIUS, length=length))
         if n + 1 < len(names):
             drawn.append(_visual("motor", "cylinder", end, axes[n + 1], **MOTOR))
         drawn.append(_visual("centre_of_gravity", "sphere", centre, radius=COG_RADIUS))
-        is_sideways = abs(ways[n][1]) > abs(ways[n][2])
+        is_sideways = abs(vectors[n][1]) > abs(vectors[n][2])
         yield _link(arm.links[n], meshes, *drawn, inertial=_tube(mass, centre, length, is_sideways))
         parent, origin = arm.links[n], end
     yield _joint(f"{arm.links[-1]}_joint", "fixed", parent, arm.links[-1], origin)
