@@ -29,7 +29,6 @@ from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import SPRING, Friction, clamp
@@ -39,6 +38,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import COVER, for_joints
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.observer.momentum import MomentumObserver

@@ -14,7 +14,6 @@ import matplotlib.pyplot as plt
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction, Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
@@ -22,6 +21,7 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import VirtualArm

@@ -17,7 +17,6 @@ from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
@@ -25,6 +24,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState

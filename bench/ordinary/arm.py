@@ -17,13 +17,13 @@ import numpy as np
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.hardware.control_loop import Controller
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import SimulatedDevice, SimulatedImu, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm

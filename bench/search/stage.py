@@ -13,11 +13,11 @@ import can
 
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import SimulatedDevice, SimulatedMotor, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.truth import TruthRecords

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.tilt import SIDES, Tilt
-from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.motors.boards import CHECK
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, source_of_bus
 from exo_gravity.core.numbers import limited
@@ -37,6 +36,7 @@ from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
+from exo_gravity.lab.controllers import SampleController
 from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice

@@ -9,13 +9,13 @@ from typing import Any
 
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript

@@ -17,7 +17,6 @@ import pytest
 
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT
@@ -30,6 +29,7 @@ from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.motors import simulated

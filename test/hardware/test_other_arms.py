@@ -9,8 +9,8 @@ from collections.abc import Callable
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.safety.drive import State
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim.judge import Driven, driven

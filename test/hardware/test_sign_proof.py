@@ -9,9 +9,9 @@ from dataclasses import replace
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim.device import SimulatedDevice

@@ -17,7 +17,6 @@ import numpy as np
 from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT, ArmModel
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
-from exo_gravity.core.compensation.controller import SampleController
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
@@ -30,6 +29,7 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
+from exo_gravity.lab.controllers import SampleController
 
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick

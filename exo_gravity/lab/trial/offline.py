@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.controller import DirectController
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
@@ -23,6 +22,7 @@ from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.bag.content import BRIDGE, Event, NodeStatus
+from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.sim.device import SimulatedDevice

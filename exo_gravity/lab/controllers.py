@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A compensator in the same process as the loop that calls it: samples in, efforts out, without messages."""
+"""Controllers in the process of the loop that calls them: samples in, efforts out, without messages."""
 
 from collections.abc import Sequence
 
