@@ -11,6 +11,7 @@ import sys
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import (
@@ -176,7 +177,7 @@ def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
 def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
     """Another host does not see the lock: its frames show it."""
     rig = VirtualRig(carried=False, pose=(0.0,) * 4)
-    other = MotorBus(rig.wire.open(), MOTORS_OF_ARM, clock=rig.clock)
+    other = MotorBus([CanPort(rig.wire.open(), rig.clock)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM, clock=rig.clock)
     rig.clock.every(0.02, lambda: other.exchange(OFF, rig.clock.monotonic()))
     owned = OwnedBus(rig.arm, "a test", print, rig.clock)
     with pytest.raises(BusError, match="is in use: another sender commands motor"):

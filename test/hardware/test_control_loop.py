@@ -11,7 +11,9 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop, NoController
 
 from ..support.simulated_device import frame
@@ -188,7 +190,8 @@ def test_a_cycle_that_took_too_long_is_counted_and_not_made_up():
 
 def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     wire = can.Bus(interface="virtual", channel="test_control_loop")
-    loop = ControlLoop(MotorBus(wire, MOTORS_OF_ARM), SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
+    bus = MotorBus([CanPort(wire, COMPUTER_CLOCK)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM)
+    loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
     loop.start()
     assert loop.call(lambda: loop.cycles).result(10.0) >= 0
     assert loop.stop(10.0)

@@ -29,7 +29,7 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.hardware.can.can_port import CanPort, message_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.damiao import DamiaoMotor
@@ -233,7 +233,7 @@ def test_a_motor_with_an_error_is_never_switched_on_again() -> None:
 def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
     arm = arm_of()
     joints = [replace(joint_of(name, 1 + i), master_id=0x20 + i if i == 1 else 0) for i, name in enumerate(NAMES)]
-    bus = MotorBus(arm.wire.open(), joints, clock=arm.clock)
+    bus = MotorBus([CanPort(arm.wire.open(), arm.clock)] * len(joints), joints, clock=arm.clock)
     bus.listen()
     arm.run(0.1)
     assert bus.boards.hindrance(arm.now, 250.0) == ""

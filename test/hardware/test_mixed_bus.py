@@ -17,6 +17,7 @@ from exo_gravity.core.motors.frames import ENTER, EXIT, EXTENDED, ID_BITS, WireF
 from exo_gravity.core.safety.drive import Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
@@ -59,7 +60,7 @@ def start(wire: Wire) -> Callable[..., SimulatedDevice]:
 
 
 def motor_bus(wire: Wire, formats: tuple[WireFormat, ...]) -> MotorBus:
-    return MotorBus(wire.open(), joints_of(formats), clock=wire.clock)
+    return MotorBus([CanPort(wire.open(), wire.clock)] * len(formats), joints_of(formats), clock=wire.clock)
 
 
 def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:

@@ -42,7 +42,7 @@ def wire():
 
 @pytest.fixture
 def bus(wire):
-    return MotorBus(wire.open(), MOTORS_OF_ARM, clock=wire.clock)
+    return MotorBus([CanPort(wire.open(), wire.clock)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM, clock=wire.clock)
 
 
 @pytest.fixture

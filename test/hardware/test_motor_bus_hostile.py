@@ -19,7 +19,7 @@ from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.trust import Readings
-from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.hardware.can.can_port import CanPort, message_of
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import Wire
@@ -102,7 +102,7 @@ def wire() -> Wire:
 
 
 def motor_bus(wire: Wire) -> MotorBus:
-    return MotorBus(wire.open(), JOINTS, clock=wire.clock)
+    return MotorBus([CanPort(wire.open(), wire.clock)] * len(JOINTS), JOINTS, clock=wire.clock)
 
 
 @pytest.mark.parametrize("firmware", [Firmware(False, 8), Firmware(True, 6)], ids=["own-8", "master-6"])

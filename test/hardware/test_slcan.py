@@ -17,8 +17,9 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import ID_BITS, MotorReply
 from exo_gravity.core.safety.drive import Send
-from exo_gravity.hardware.can.can_port import open_bus
+from exo_gravity.hardware.can.can_port import CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.fake_slcan import FakeSlcan
@@ -70,7 +71,7 @@ def motors(adapter: FakeSlcan, tmp_path: Path) -> Iterator[MotorBus]:
     def reopen() -> can.BusABC:
         return open_bus("slcan", str(tmp_path / "ttyACM0"), OPTIONS)
 
-    bus = MotorBus(reopen(), joints_of(MIXED), reopen=reopen)
+    bus = MotorBus([CanPort(reopen(), COMPUTER_CLOCK, reopen)] * len(MIXED), joints_of(MIXED))
     wait_until(lambda: adapter.is_open)  # python-can does not wait for it
     yield bus
     bus.close()

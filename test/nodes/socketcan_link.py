@@ -17,7 +17,7 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
+from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 
@@ -33,9 +33,13 @@ def set_link(state: str, name: str = "vcan0") -> None:
     subprocess.run(["ip", "link", "set", name, state], check=True)
 
 
+def bus_on(bus: can.BusABC) -> MotorBus:
+    return MotorBus([CanPort(bus, COMPUTER_CLOCK)] * len(IDS), [JointMotor(AK60, can_id) for can_id in IDS])
+
+
 def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once_it_is_up():
     ours, other = (open_bus(*VCAN, {}) for _ in range(2))
-    bus = MotorBus(ours, [JointMotor(AK60, can_id) for can_id in IDS])
+    bus = bus_on(ours)
     bus.exchange(drive_of(NO_TORQUE), time.monotonic())
     set_link("down")
     try:
@@ -53,7 +57,7 @@ def test_a_link_that_is_down_is_a_bus_error_and_the_motors_are_switched_off_once
 
 
 def test_stop_raises_nothing_on_a_link_that_is_down():
-    bus = MotorBus(open_bus(*VCAN, {}), [JointMotor(AK60, can_id) for can_id in IDS])
+    bus = bus_on(open_bus(*VCAN, {}))
     set_link("down")
     try:
         bus.stop()

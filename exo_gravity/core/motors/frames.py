@@ -141,7 +141,7 @@ class MotorReply(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """A value on a motor's board without which the parameters of the arm are not true."""
+    """A value on a motor's board that must agree with the parameters of the arm."""
 
     name: str  #: the maker's
     number: int  #: by which the board's answer names it
@@ -149,7 +149,7 @@ class Setting(NamedTuple):
     low: float  #: the least value that is right
     high: float  #: and the largest
     parameter: str  #: of the file that states it, '' for none
-    unit: float  #: of that parameter, that 1 on the board means
+    unit: float  #: by which the board's value is multiplied to give that parameter
 
 
 def is_special(data: bytes | bytearray) -> bool:

@@ -230,7 +230,7 @@ MOTOR_PARAMETERS = (
           "Damiao)", unit="s", fixed=True),
 )
 # fmt: on
-# Of parameters whose bounds begin at 0, which stands for the usual value: those of any other value.
+# The bounds of any value but 0, of the parameters for which 0 stands for the usual one.
 _BOUNDS_BEYOND_0 = {"position_range": POSITION_RANGE_BOUNDS, "torque_per_ampere": TORQUE_PER_AMPERE_BOUNDS}
 _OF_A_MOTOR = tuple(param.name for param in MOTOR_PARAMETERS if isinstance(param.default, list))
 

@@ -66,19 +66,17 @@ AT_REST = JointSample(0.0, 0.0, 0.0, None, None, -math.inf)  # a joint whose bus
 class MotorBus:
     """The motors of one arm, with different IDs. Not thread-safe: one thread owns it.
 
-    bus: of all motors; or the port of each (n,), None if it is not open: such a joint counts as at rest, without
-        torque, and is sent nothing.
+    ports: of the bus of each motor (n,), None if it is not open: such a joint counts as at rest, without torque, and is
+        sent nothing.
     note: called with each drive before its frames are sent.
-    reopen: opens `bus` again after a failure.
     clock: of all times.
     """
 
     def __init__(
         self,
-        bus: can.BusABC | Sequence[CanPort | None],
+        ports: Sequence[CanPort | None],
         motors: Sequence[JointMotor],
         note: Callable[[Drive], None] = lambda drive: None,
-        reopen: Callable[[], can.BusABC] | None = None,
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
         count = len(motors)
@@ -90,8 +88,8 @@ class MotorBus:
         self.boards = Boards(motors)  #: what keeps them from serving this arm
         self.clock = clock
         self._now = clock.monotonic
-        self._ports = [CanPort(bus, clock, reopen)] * count if isinstance(bus, can.BusABC) else list(bus)
-        self._buses = list(dict.fromkeys(port for port in self._ports if port))
+        self._ports = tuple(ports)
+        self._buses = list(dict.fromkeys(port for port in ports if port))
         self._failed: dict[CanPort, BusError] = {}  # in this cycle
         self._motors = tuple(motors)
         self._joints = frozenset(joint for joint, port in enumerate(self._ports) if port)  # on these buses
