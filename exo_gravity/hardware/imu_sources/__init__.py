@@ -6,7 +6,7 @@ from typing import Any
 
 from exo_gravity.hardware.imu_sources.chips import CHIPS, PolledChip
 from exo_gravity.hardware.imu_sources.serial_sensors import Bno085, WitMotion
-from exo_gravity.hardware.imu_sources.source import StampClock, ImuSource, Reopening
+from exo_gravity.hardware.imu_sources.source import ImuSource, Reopening, StampClock
 
 __all__ = ["SOURCES", "ImuSource", "Reopening", "open_source"]
 

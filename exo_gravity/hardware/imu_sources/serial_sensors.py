@@ -23,7 +23,7 @@ from exo_gravity.core.arm.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.hardware.imu_sources.sample_clock import SampleClock
-from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, StampClock, ImuSource
+from exo_gravity.hardware.imu_sources.source import RADIANS_PER_DEGREE, Axes, ImuSource, StampClock
 
 ACCELERATION, ANGULAR_VELOCITY, ANGLES, QUATERNION = 0x51, 0x52, 0x53, 0x59
 UNLOCK = b"\xff\xaa\x69\x88\xb5"

@@ -132,9 +132,9 @@ class ArmDescription(Described):
     def bodies(self) -> list[tuple[float, Point]]:
         """Return mass and centre of gravity of each link.
 
-        Moments across the links (core/arm/gravity.py) become offsets of the centres of gravity: W of link 1, Z of link 2, Y3 and
-        Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity, also beyond
-        the links, follow from the moments.
+        Moments across the links (core/arm/gravity.py) become offsets of the centres of gravity: W of link 1, Z of link
+        2, Y3 and Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity,
+        also beyond the links, follow from the moments.
         """
         robot = self.robot
         mass = [float(m) for m in (self.mass if robot.by_moments else robot.mass)]
