@@ -31,7 +31,7 @@ from exo_gravity.sim.script import TrialScript
 
 STOP_TIMEOUT = 10.0  # s for a recorder to end
 WEARER, REPORT = "wearer.yaml", "report.html"
-FOLDER = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
+FOLDER_NAME = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
 MOST_LISTED = 200  # recordings that the page lists
 
 
@@ -218,7 +218,7 @@ class Recordings:
         found = []
         for path in (*self._output.glob("*_*/"), *self._output.glob("*/*-*-*/*_*/")):
             key = self._key(path)
-            if (match := FOLDER.fullmatch(path.name)) and (key or (path / "bag").is_dir()):
+            if (match := FOLDER_NAME.fullmatch(path.name)) and (key or (path / "bag").is_dir()):
                 name, year, month, day, hour, minute, second, _ = match.groups()
                 *subject, _ = path.relative_to(self._output).parts
                 when = f"{year}-{month}-{day} {hour}:{minute}:{second}"

@@ -67,7 +67,7 @@ class ArmModel(ArmData):
 
     def worn_links(self, mass: Vector, cog: Vector) -> LinkInertia:
         """Return the inertia with the wearer's segments, (4,) kg at (4,) m along their links, as rods of their own."""
-        return self.links.beside(links_of(ArmModel(self.length, cog, mass)))
+        return self.links.joined_with(links_of(ArmModel(self.length, cog, mass)))
 
     @property
     def facts(self) -> Mapping[str, Sequence[float] | None]:

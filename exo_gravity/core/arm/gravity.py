@@ -1,8 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The gravity laws: joint angles -> the torque that each motor must give to hold the arm against gravity.
 
-`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link or beside it,
-and any trunk tilt: docs/mathematics.md derives it. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the
+`exact` is the closed form of Newton-Euler for gravity alone, valid for any centre of gravity, on its link's axis or off
+it, and any trunk tilt: docs/mathematics.md derives it. `paper_static` is EQ2-EQ5 and `paper_mobile` is EQ1m-EQ4m of the
 paper, word for word. They agree with `exact` only if every centre of gravity is at the far end of its link (d_n = l_n)
 and the trunk is upright.
 

@@ -12,8 +12,8 @@ tau_k = sum W_ij (dx_i/dq_k) . x''_j = z_{k-1} . sum over i >= k of x_i x W_ij x
 are thin rods around their centres of gravity, Q_n = m_n (d_n^2 + l_n^2 / 12), or points of mass at REACH where only the
 moments are known.
 
-Where centres of gravity lie beside their links, the vectors z_1, z_2, y_3 and y_4 of the moments W, Z, Y3 and Y4 take
-part as x_5 to x_8; each turns with link 1 to 4. The links that share a moment are taken to be equally far beside.
+Where centres of gravity lie off the axes of their links, the vectors z_1, z_2, y_3 and y_4 of the moments W, Z, Y3 and
+Y4 take part as x_5 to x_8; each turns with link 1 to 4. The links that share a moment are taken to be equally far off.
 """
 
 import itertools
@@ -36,12 +36,12 @@ ROTORS = tuple(MOTORS[name].rotor_inertia for name in USUAL_MOTORS)  # kg m^2, w
 REACH = (0.8, 0.8, 0.8, 0.6)  # of a link's length, at which the mass of an arm given by its moments is assumed
 LEAST_REACH = 0.01  # m
 NO_LENGTH = (0.0,) * JOINT_COUNT  # m: directions do not depend on the lengths
-NOTHING_BESIDE = (0.0,) * JOINT_COUNT  # kg m: W, Z, Y3, Y4
+NO_OFF_AXIS = (0.0,) * JOINT_COUNT  # kg m: W, Z, Y3, Y4
 SHARED = ((0, 1), (1, 2, 3), (2,), (3,))  # links that share W, Z, Y3 and Y4
 GRID = tuple(map(math.radians, (0.0, 30.0, 60.0, 90.0, 120.0, 150.0)))  # of joints 2 to 4, for the least inertia
 
 
-class Frame(NamedTuple):
+class LinkFrame(NamedTuple):
     """Where a link is, in the arm's base frame: its joint, the joint's axis, and the direction along the link."""
 
     origin: Floats3
@@ -49,7 +49,7 @@ class Frame(NamedTuple):
     along: Floats3
 
 
-def frames(length: Sequence[float], theta: Sequence[float]) -> tuple[Frame, Frame, Frame, Frame]:
+def frames(length: Sequence[float], theta: Sequence[float]) -> tuple[LinkFrame, LinkFrame, LinkFrame, LinkFrame]:
     """Return the four links of `length` (4,) m at `theta` (4,) rad."""
     t1, t2, t3, t4 = theta
     l1, l2, l3, _ = length
@@ -64,17 +64,17 @@ def frames(length: Sequence[float], theta: Sequence[float]) -> tuple[Frame, Fram
     flexion = plus(shoulder, second, l2)
     elbow = plus(flexion, third, l3)
     return (
-        Frame(ZERO, (0.0, 0.0, 1.0), first),
-        Frame(shoulder, swing, second),
-        Frame(flexion, bend, third),
-        Frame(elbow, bend, fourth),
+        LinkFrame(ZERO, (0.0, 0.0, 1.0), first),
+        LinkFrame(shoulder, swing, second),
+        LinkFrame(flexion, bend, third),
+        LinkFrame(elbow, bend, fourth),
     )
 
 
 class LinkInertia(NamedTuple):
     """The inertia of an arm's links and rotors: the coefficients W of the kinetic energy."""
 
-    weights: tuple[tuple[float, ...], ...]  #: W, (4, 4) kg m^2; (8, 8) if a centre of gravity lies beside its link
+    weights: tuple[tuple[float, ...], ...]  #: W, (4, 4) kg m^2; (8, 8) if a centre of gravity lies off its link's axis
     rotors: tuple[float, ...] = ROTORS  #: at the joints, (4,) kg m^2
 
     @classmethod
@@ -83,7 +83,7 @@ class LinkInertia(NamedTuple):
         length: Vector,
         moment: Vector,
         load: tuple[float, float] = (0.0, 0.0),
-        off_axis: Vector = NOTHING_BESIDE,
+        off_axis: Vector = NO_OFF_AXIS,
     ) -> "LinkInertia":
         """Return the approximate inertia of an arm that is known by its moments.
 
@@ -103,7 +103,7 @@ class LinkInertia(NamedTuple):
         second[3] += weight * lever**2
         return _links(lengths, mass, whole, first, second, off_axis)
 
-    def beside(self, other: "LinkInertia") -> "LinkInertia":
+    def joined_with(self, other: "LinkInertia") -> "LinkInertia":
         """Return the inertia of these links with those of `other` fixed to them, and the rotors of these."""
         count = max(len(self.weights), len(other.weights))
         whole = np.zeros((count, count))
@@ -207,7 +207,7 @@ def _links(
     return LinkInertia(tuple(map(tuple, weights.tolist())))
 
 
-def _vectors(links: Sequence[Frame], weights: Sequence[Sequence[float]]) -> list[Floats3]:
+def _vectors(links: Sequence[LinkFrame], weights: Sequence[Sequence[float]]) -> list[Floats3]:
     """Return x_1 to x_4, and z_1, z_2, y_3 and y_4 where `weights` has entries for them."""
     along = [link.along for link in links]
     if len(weights) == len(along):
@@ -217,7 +217,7 @@ def _vectors(links: Sequence[Frame], weights: Sequence[Sequence[float]]) -> list
 
 
 def _torque(
-    links: Sequence[Frame],
+    links: Sequence[LinkFrame],
     vectors: Sequence[Floats3],
     weights: Sequence[Sequence[float]],
     second: Sequence[Floats3],

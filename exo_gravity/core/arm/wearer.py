@@ -92,8 +92,8 @@ class Tissue:
 
     def torques(self, theta: np.ndarray) -> np.ndarray:
         """Return the same for poses (m, n) in rad: (m, n) Nm."""
-        way = np.clip(theta - np.array(self.joint_rest), -TISSUE_REACH, TISSUE_REACH)
-        return np.asarray(np.array(self.joint_stiffness) * way)
+        stretch = np.clip(theta - np.array(self.joint_rest), -TISSUE_REACH, TISSUE_REACH)
+        return np.asarray(np.array(self.joint_stiffness) * stretch)
 
 
 @dataclass(frozen=True)
