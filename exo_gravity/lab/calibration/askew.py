@@ -11,8 +11,8 @@ With the Jacobian J of the efforts in a new pose,
 
 Before the tour w is normal, of a known standard error; what the tour's residuals leave of that is the posterior.
 
-J has nothing of what the fit finds and the file does not hold: offsets, and without an IMU the tilt of the stand. A turn
-of the first axis looks like such a tilt, so it leaves all of its torque where no mounting of an IMU takes it over.
+J has nothing of what the fit finds and the file does not hold: offsets, and without an IMU the tilt of the stand. A
+turn of the first axis looks like such a tilt, so it leaves all of its torque where no mounting of an IMU takes it over.
 """
 
 import numpy as np

@@ -49,8 +49,10 @@ MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest tim
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
 HAND = "a hand is on the arm, or the joint is blocked"
-VIBRATED = "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct " \
+VIBRATED = (
+    "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct "
     "its masses and torque_scale, hang no weight, or stiffen the joint"
+)
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
