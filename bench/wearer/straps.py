@@ -1,7 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What straps that give, a shoulder that moves and elastic joints with play do to the estimate.
 
-Its model has none of them but the joints' stiffness, which is known to 10 %, or not at all.
+Its model has none of them but the joints' stiffness, which is known to 10 %, or not at all. Where it is not known, the
+band is also judged as `model_error.deflection` widens it: the angle by which each link sinks with the arm raised.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import COVER
 
 from ..device_study import options_of
@@ -30,9 +32,11 @@ from .study import Trial, judge, play
 STILL = ({"hold": 47.0},)  # of the trunk
 JOINTS, PLAY = 100.0, math.radians(1.0)  # Nm/rad and rad, of elastic joints
 STIFFNESS_ERROR = 0.1  # of what is known of them, as a share
+RAISED = (0.1, 0.75, 0.55, 0.85)  # rad, where it is seen by how much each link sinks
 TIED = (
     "none", "straps that give", "straps, and a shoulder that moves", "the same, as `calibrate wearer` has seen it",
-    f"joints of {JOINTS:g} Nm/rad with a play of 1 degree, unknown", "the same, `joint_stiffness` known",
+    f"joints of {JOINTS:g} Nm/rad with a play of 1 degree, unknown",
+    "the same, `model_error.deflection` given", "the same, `joint_stiffness` known",
 )  # fmt: skip
 
 
@@ -48,7 +52,12 @@ def trials(seed: int) -> list[Trial]:
         (worn, None), (worn, StrappedArm(worn.config, 0.0 * RHYTHM)), (worn, StrappedArm(worn.config)),
         (seen, StrappedArm(seen.config)), (elastic, None), (known, None),
     )  # fmt: skip
-    return [judge(play(case, tie, STILL)) for case, tie in cases]
+    *tied, unknown, last = [play(case, tie, STILL) for case, tie in cases]
+    torque, _ = worn.settings.torque(RAISED, Tilt.of(worn.side))
+    sunk = [max(abs(held) / JOINTS, PLAY / 2.0) for held in torque]
+    error = replace(worn.settings.model_error, deflection=sunk)
+    told = replace(unknown, worn=replace(elastic, settings=replace(worn.settings, model_error=error)))
+    return [judge(played) for played in (*tied, unknown, told, last)]
 
 
 def table(found: Sequence[Sequence[Trial]]) -> str:

@@ -29,7 +29,7 @@ from exo_gravity.lab.observer.share import (
     while_between,
 )
 from exo_gravity.lab.observer.watch import WearerWatch
-from exo_gravity.sim import ArmConfig, SimulatedArm
+from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.urdf import UrdfConfig
@@ -49,6 +49,8 @@ SETTINGS = Settings(
 WHOLE = DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog)
 TILT = Tilt.of("right", 0.1, -0.05)
 POSE = (0.2, 0.8, 0.5, 0.7)
+SOFT = 100.0  # Nm/rad, of elastic joints
+CODE = 0.024  # rad/s of a motor's 12 bits
 
 
 def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_motions():
@@ -185,9 +187,65 @@ def test_each_error_of_the_model_widens_the_band():
     needed = gravity_torque(WHOLE, POSE, TILT.direction).tolist()
     narrow = np.array(still(needed).deviation)
     errors = {"torque": (0.3,) * 4, "scale": (0.1,) * 4, "wearer": 0.1, "tilt": 0.05, "wearer_torque": (0.3,) * 4}
+    errors["deflection"] = (0.03,) * 4
     for name, value in errors.items():
         wider = still(needed, settings=replace(SETTINGS, model_error=replace(EXACT, **{name: value})))
         assert np.all(np.array(wider.deviation) >= narrow) and wider.deviation[1] > 1.05 * narrow[1], name
+
+
+def test_the_band_holds_what_links_that_lie_elsewhere_make_of_gravity():
+    off, rng = 0.05, np.random.default_rng(4)  # rad
+    smooth = TermSettings(friction=Friction(0.0, (1e-6,) * 4))
+    settings = replace(SETTINGS, terms=smooth, model_error=replace(EXACT, deflection=(off,) * 4))
+    poses = rng.uniform((-0.6, 0.1, -0.2, 0.1), (0.8, 1.4, 1.2, 1.5), (200, 4))
+    found = []
+    for pose in poses:
+        links = pose + rng.normal(0.0, off, 4)
+        estimate = still(gravity_torque(WHOLE, links, TILT.direction), settings=settings, pose=pose)
+        found.append((estimate.torque, estimate.deviation))
+    error, deviation = np.moveaxis(np.array(found), 1, 0)
+    assert np.all(np.mean(np.abs(error) < COVER * deviation, axis=0) > 0.9)
+    assert np.all(rms(deviation) < 1.5 * rms(error) + 0.1)
+
+
+def elastic(seconds):
+    """Yield time, joints as motors of 12 bits report them, and the wearer's torque, of a MuJoCo arm with soft joints.
+
+    The motors carry both arms. The wearer moves the links.
+    """
+    joints = {"joint_stiffness": (SOFT,) * 4, "backlash": (math.radians(1.0),) * 4}
+    arm = SimulatedArm(
+        ArmConfig(
+            DEFAULT_LINKS,
+            wearer_mass=LOAD.mass,
+            wearer_cog=LOAD.cog,
+            coulomb_friction=COULOMB,
+            viscous_friction=VISCOUS,
+            **joints,
+        )
+    )
+    arm.move_base(np.multiply(DEFAULT_LINKS.gravity, TILT.direction).tolist())
+    arm.reset(POSE)
+    carries = replace(SETTINGS, mode="zero_g", support=1.0, joint_stiffness=(SOFT,) * 4, max_effort=(18.0,) * 4)
+    for n in range(round(seconds / PERIOD)):
+        now = n * PERIOD
+        theta, velocity = arm.motor_positions, (CODE * np.round(np.divide(arm.motor_velocities, CODE))).tolist()
+        effort = carries.torque(theta, TILT)[0]
+        for part in range(round(PERIOD / STEP)):
+            wanted = POSE + np.array((0.2, 0.3, 0.4, 0.4)) * math.sin(2.5 * (now + part * STEP))
+            given = (20.0, 30.0, 20.0, 8.0) * (wanted - arm.positions) - (1.0, 2.0, 1.0, 0.4) * np.array(arm.velocities)
+            if part == 0:
+                yield now, (theta, velocity, effort), given, TILT, (0.0, 0.0, 0.0)
+            arm.step(effort + given, of_motors=effort)
+
+
+def test_a_motor_that_vibrates_behind_a_soft_joint_is_not_taken_for_the_wearer():
+    samples = list(elastic(5.0))
+    told = replace(SETTINGS, joint_stiffness=(SOFT,) * 4)
+    error, deviation = errors(samples, told)
+    untold, _ = errors(samples)
+    assert np.all(rms(error) < 0.6 * rms(untold))
+    assert np.mean(np.abs(error) < COVER * deviation) > 0.92
 
 
 def curve(share, count=500, deviation=0.1):

@@ -201,6 +201,12 @@ class ModelError:
         (0.0, 5.0),
         "Nm",
     )
+    deflection: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "standard error of each link's angle behind its motor: play, and elasticity beyond `joint_stiffness`",
+        (0.0, 0.2),
+        "rad",
+    )
 
     def __post_init__(self) -> None:
         check_owned(self)

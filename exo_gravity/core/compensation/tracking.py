@@ -12,7 +12,8 @@ Behind an elastic joint the links no longer hold the rotor: above their resonanc
 which has 1 to 20 % of the inertia that the gains are for. An AK60-6 on 1,000 Nm/rad rings at 170 Hz, beyond what 250 Hz
 sample. Nobody knows that before the first tour. So the tracker begins with the gains of a rigid arm, which pass
 Stribeck friction best. When a motor vibrates it lowers those of all joints, and then further those of each whose motor
-still does. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's frequencies.
+still does. Lowered gains pass a low-pass filter, which leaves nothing of them at the rotor's frequencies. A frequency
+that was lowered where a joint carries much inertia is raised where it carries little: there the joint would stick.
 """
 
 import math
@@ -235,7 +236,8 @@ class Tracker:
         self.sticks = np.zeros(count, bool)
         self.vibrations = np.zeros(count)
         self._vibration = Vibration(count)
-        self._frequency = np.full(count, min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate))
+        self._rigid = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s, of a rigid arm
+        self._frequency = np.full(count, self._rigid)
         self._is_soft, self._calm = np.zeros(count, bool), np.zeros(count)  # whether lowered, and s left to calm down
         self._filter = np.zeros((TRACKER.filter_order, count))  # Nm, what each filter passes
         self._max_effort = np.array(max_effort)
@@ -283,11 +285,18 @@ class Tracker:
         # Friction is compensated before the motion begins: a joint that breaks away late would jump.
         coming = self._line.at(self._time + MOTION.lead)[1] if self._time < MOTION.lead else heading
         speed_error = pace * heading - velocity
-        self._watch_vibration(dt, velocity, np.diag(matrix))
+        inertia = np.diag(matrix)
+        self._watch_vibration(dt, velocity, inertia)
         self._compensate_friction(dt, coming, speed_error)
         self._push(dt, np.sign(coming), np.asarray(velocity))
-        self._effort = self._controlled(dt, speed_error, expected, matrix + TRACKER.added * np.eye(len(matrix)))
+        loaded = matrix + TRACKER.added * np.eye(len(matrix))
+        self._effort = self._controlled(dt, speed_error, expected, loaded, self._frequencies(inertia))
         return self._effort
+
+    @property
+    def is_soft(self) -> np.ndarray:
+        """Whether the gains of each joint (n,) were lowered because motors vibrated."""
+        return self._is_soft
 
     @property
     def speed(self) -> np.ndarray:
@@ -305,18 +314,23 @@ class Tracker:
             return
         if not self._is_soft.any():
             vibrates |= True  # the others are about to
-        least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
-        self.vibrations += vibrates & (self._frequency <= least)
-        softer = np.minimum(TRACKER.softer * self._frequency, np.sqrt(TRACKER.soft_stiffness / inertia))
+        least, present = _least_frequencies(inertia), self._frequencies(inertia)
+        self.vibrations += vibrates & (present <= least)
+        softer = np.minimum(TRACKER.softer * present, np.sqrt(TRACKER.soft_stiffness / inertia))
         wanted = np.where(self._is_soft, softer, TRACKER.soft_frequency)
-        lower = np.minimum(np.maximum(wanted, np.minimum(least, TRACKER.soft_frequency)), self._frequency)
-        left = np.where(vibrates, (lower / self._frequency) ** 2, 1.0)
+        lower = np.minimum(np.maximum(wanted, least), present)
+        left = np.where(vibrates, (lower / present) ** 2, 1.0)
         self._frequency = np.where(vibrates, lower, self._frequency)
         self._integral += (1.0 - left) * self._filter[-1]
         self._filter *= left
         self._is_soft |= vibrates
         self._calm = np.where(vibrates, TRACKER.calm, self._calm)
         self._vibration.forget(vibrates)
+
+    def _frequencies(self, inertia: np.ndarray) -> np.ndarray:
+        """Return the natural frequencies (n,) in rad/s of the joints, which carry `inertia` (n,) kg m^2."""
+        least = np.minimum(_least_frequencies(inertia), self._rigid)
+        return np.where(self._is_soft, np.maximum(self._frequency, least), self._frequency)
 
     def _compensate_friction(self, dt: float, heading: np.ndarray, speed_error: np.ndarray) -> None:
         """Compensate friction by and by towards `heading` (n,) rad/s, and no further in a joint that is ahead."""
@@ -332,10 +346,12 @@ class Tracker:
         more = self._push_off + TRACKER.push_off_rate * dt * way
         self._push_off = np.where(stands, np.clip(more, -TRACKER.most_push_off, TRACKER.most_push_off), 0.0)
 
-    def _controlled(self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray) -> Torque:
-        frequency, root = self._frequency, np.sqrt(self._frequency)
+    def _controlled(
+        self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray, frequency: np.ndarray
+    ) -> Torque:
+        root = np.sqrt(frequency)
         stiff = frequency * (matrix @ (frequency * self.error))
-        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)))
+        push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)), frequency)
         weakest = float(np.linalg.eigvalsh(matrix)[0])
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
@@ -347,10 +363,16 @@ class Tracker:
         self.correction = push + self._integral
         return tuple(np.clip(torque, -self._max_effort, self._max_effort).tolist())
 
-    def _filtered(self, dt: float, push: np.ndarray) -> np.ndarray:
+    def _filtered(self, dt: float, push: np.ndarray, frequency: np.ndarray) -> np.ndarray:
         """Return `push` (n,) Nm, in joints with lowered gains without what the rotor could vibrate with."""
-        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * self._frequency * dt), push
+        passed, value = 1.0 - np.exp(-TRACKER.filtered_from * frequency * dt), push
         for stage in self._filter:
             stage += passed * (value - stage)
             value = stage
         return np.where(self._is_soft, value, push)
+
+
+def _least_frequencies(inertia: np.ndarray) -> np.ndarray:
+    """Return the lowest natural frequencies (n,) in rad/s of joints that carry `inertia` (n,) kg m^2."""
+    least = np.maximum(TRACKER.least_frequency, np.sqrt(TRACKER.least_stiffness / inertia))
+    return np.asarray(np.minimum(least, TRACKER.soft_frequency))

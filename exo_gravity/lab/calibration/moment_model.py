@@ -46,6 +46,7 @@ class MomentModel(Protocol):
     positive: tuple[int, ...]  #: numbers of the moments that are at least 0
     optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
     shows_tilt: bool  #: whether gravity's direction is fitted, too
+    keeps_tilt: bool  #: whether the parameter file takes over the direction that is found, as an IMU's mounting
     expects_scales: bool  #: whether a torque scale is expected to be near that of the file
     suggested: np.ndarray  #: (m, n) rad, from which a missing pose is taken
 
@@ -119,7 +120,11 @@ def turned_by(
 
 
 class PapersMoments:
-    """The paper's arm. arm: of which the moments are known, and the lengths."""
+    """The paper's arm.
+
+    arm: of which the moments are known, and the lengths.
+    keeps_tilt: whether an IMU measures gravity's direction, whose mounting is corrected by what a fit finds.
+    """
 
     count = JOINT_COUNT
     names: tuple[str, ...] = MOMENTS
@@ -131,8 +136,9 @@ class PapersMoments:
     shows_tilt, expects_scales = True, False
     suggested = np.radians(list(itertools.product(*GRID)))
 
-    def __init__(self, arm: ArmModel) -> None:
+    def __init__(self, arm: ArmModel, keeps_tilt: bool = True) -> None:
         self.length, self.gravity, self.moments = arm.length, arm.gravity, moments_of(arm)
+        self.keeps_tilt = keeps_tilt
 
     def down(self, tilt: Tilt) -> np.ndarray:
         """Return gravity's unit vector (3,) in the arm's base frame."""
@@ -205,7 +211,7 @@ class UrdfMoments:
             listed = list(arm.names)
             raise ParameterError("joint_names", listed, "all joints that move the arm's links, for a calibration")
         self.arm, self.gravity, self.moments = arm, arm.gravity, arm.moments
-        self._rotors, self.shows_tilt = np.diag(rotors), shows_tilt
+        self._rotors, self.shows_tilt, self.keeps_tilt = np.diag(rotors), shows_tilt, shows_tilt
         self.count, self.start = len(arm.names), self.moments
         self.turns = TURNS * self.count
         numbers = [n for n, _ in arm.base]

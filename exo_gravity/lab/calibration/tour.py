@@ -48,6 +48,11 @@ SATURATION = 0.1  # s for which a joint may want more than its max_effort
 MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest time-out
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
+HAND = "a hand is on the arm, or the joint is blocked"
+VIBRATED = (
+    "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct "
+    "its masses and torque_scale, hang no weight, or stiffen the joint"
+)
 MAX_UNREST = (0.12, 0.25, 0.05)  # Nm, share of friction, share of the torque: between two passes of the same pose
 
 
@@ -122,9 +127,9 @@ class Tour:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         tracker = self._tracker
         joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
+        reason = VIBRATED if tracker.is_soft.any() else HAND
         for name, behind, speed, vibrations in joints:
             if not abs(behind) <= MAX_ERROR:
-                reason = "a hand is on the arm, or the joint is blocked"
                 return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
@@ -201,9 +206,9 @@ class Tour:
                 self._skipped += 1
                 if self._skipped > MAX_SKIPPED:
                     name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
-                    self.trouble = (
-                        f"{name}: it sticks: it follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
-                    )
+                    why = f": {VIBRATED}" if self._tracker.is_soft.any() else ""
+                    what = f"it follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
+                    self.trouble = f"{name}: it sticks: {what}{why}"
                 return
         self._keep(station, sweeps)
 

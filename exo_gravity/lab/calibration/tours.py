@@ -116,7 +116,7 @@ def _request(arm: AnyArm, mass: float, lever: float) -> str:
 
 def model_of(arm: AnyArm) -> MomentModel:
     """Return the moments of an arm as configured. Raises ParameterError."""
-    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(papers(arm.robot))
+    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(papers(arm.robot), arm.compensator["use_imu"])
 
 
 def urdf_model_of(arm: AnyArm) -> UrdfMoments:
