@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import can
 import pytest
 
@@ -11,8 +13,9 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware import control_loop
 from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop, NoController
+from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, LOWERING, ControlLoop, NoController
 
 from ..support.simulated_device import frame
 from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig, raised_arm
@@ -143,7 +146,8 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
-def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down():
+def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(monkeypatch):
+    monkeypatch.setattr(control_loop, "LOWERING", replace(LOWERING, fade=4.0, rest=4.0))  # the whole: test_supply
     arm = raised_arm()
     arm.safety.step = fail
     while arm.loop.cycle():

@@ -58,7 +58,7 @@ def arm_of(names: tuple[str, ...] = NAMES, **options: float) -> CarriedArm:
 @prepared
 def raised_arm() -> CarriedArm:
     """Return an arm that the wearer has raised to `POSE` and left to the motors."""
-    arm = arm_of(rate=REAL_RATE)
+    arm = arm_of(rate=REAL_RATE, proves_signs=False)
     arm.carry()
     arm.raise_to(POSE)
     return arm
