@@ -55,6 +55,7 @@ def test_moments_of_random_devices_are_right_to_2_percent_or_their_errors_which_
     assert 0.90 <= share_covered(devices) <= 0.99
 
 
+@pytest.mark.thorough
 def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
     found = []
     for device in map(Device, range(200, 210)):
