@@ -70,7 +70,10 @@ def damiao_of(arm: CarriedArm, joint: int) -> DamiaoMotor:
     return motor
 
 
-@pytest.mark.parametrize("names", [NAMES, ("AK80-9", "DM-J8009", "DM-J4340", "AK60-6")], ids=["damiao", "mixed"])
+MIXED = ("AK80-9", "DM-J8009", "DM-J4340", "AK60-6")
+
+
+@pytest.mark.parametrize("names", [pytest.param(NAMES, marks=pytest.mark.thorough), MIXED], ids=["damiao", "mixed"])
 def test_an_arm_is_switched_on_and_off_without_a_collision(names: tuple[str, ...]) -> None:
     arm = arm_of(names, bitrate=1_000_000)
     arm.enable()
@@ -210,6 +213,7 @@ def test_a_motor_that_is_set_otherwise_than_the_file_says_is_not_switched_on(
     assert not arm.device.powered and not arm.caused.energy
 
 
+@pytest.mark.thorough
 def test_a_motor_that_is_set_otherwise_after_it_was_asked_is_found_out_before_the_start() -> None:
     arm = arm_of()
     arm.run(1.0)

@@ -155,6 +155,7 @@ def askew_torque(turn, theta, direction):
     return np.array([pin.computeGeneralizedGravity(model, data, np.array(pose)) for pose in theta])
 
 
+@pytest.mark.thorough
 def test_the_band_contains_what_axes_leave_that_are_askew():
     leans = LEANING, Tilt.of("right", -0.1, 0.25).direction
     new = np.random.default_rng(9).uniform((-0.8, 0.3, -0.2, 0.2), (0.8, 1.3, 1.2, 1.4), (200, 4))
