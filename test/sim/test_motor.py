@@ -97,14 +97,6 @@ def test_set_zero_makes_the_present_angle_zero():
     assert reply_to(motor, command(), position=0.5, now=2.0).position == pytest.approx(-0.2, abs=2e-4)
 
 
-def test_a_motor_does_not_reply_to_set_zero_nor_for_a_while_after_it():
-    motor = entered(Firmware(zero_silence=0.8))
-    assert motor.receive(SET_ZERO, 0.0, 0.0, 10.0) is None
-    assert motor.receive(command(torque=2.0), 0.0, 0.0, 10.79) is None
-    assert abs(motor.torque(0.0, 0.0)) < TORQUE_CODE
-    assert motor.receive(command(torque=2.0), 0.0, 0.0, 10.81) is not None
-
-
 @pytest.mark.parametrize("data", [b"", b"\x05", ENTER[:7], ENTER + b"\x00", b"\xff" * 64])
 def test_frames_of_a_wrong_length_are_ignored(data):
     motor = entered()
