@@ -80,6 +80,7 @@ def test_without_torque_the_same_simulated_arm_falls(capsys, monkeypatch):
     assert moved(output) > 20.0
 
 
+@pytest.mark.thorough
 def test_the_simulated_arm_repeats_the_path_that_a_hand_taught_it(capsys):
     variables, output = run("teach_and_repeat.py", capsys)
     match = re.fullmatch(r"The arm repeats the path within ([0-9.]+) degrees, on average ([0-9.]+)\.\n", output)

@@ -287,6 +287,7 @@ class SimulatedArm:
         self._torque = self.data.qfrc_applied
         self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
         self._applied: list[float] = []  # Nm of the last step, where they alone are in `data`; [] for none
+        self._damped: list[float] = []  # Nm s/rad of the motors, which `model` has; [] for none
         # Where the motor of each joint stands in `data`: with its link, or at the end.
         self._motors: slice | np.ndarray = slice(count)
         self.is_elastic = bool(self.config.elastic)  #: whether motors move apart from their links
@@ -376,12 +377,14 @@ class SimulatedArm:
         """Set the torques of a step of a rigid arm, as `step` gets them; most steps repeat those of the one before."""
         if any(damping):
             # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
-            self._damping[:] = self._viscous + damping
+            if list(damping) != self._damped:
+                self._damped = list(damping)
+                self._damping[:] = self._viscous + damping
             moving = zip(torque, self._velocity.tolist(), damping, strict=True)
             self._torque[:] = [pull + speed * own for pull, speed, own in moving]
             self._applied = []
         elif self._applied != (applied := list(torque)):
-            self._damping[:], self._torque[:] = self._viscous, applied
+            self._damping[:], self._torque[:], self._damped = self._viscous, applied, []
             self._applied = [] if self._turns else applied  # where the base turns, `step` changes them
 
     def _load_motors_and_links(

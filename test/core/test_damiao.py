@@ -7,7 +7,6 @@ Bytes are worked out by hand from the documents that core/motors/damiao.py names
 from __future__ import annotations
 
 import json
-import math
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -233,9 +232,3 @@ def test_can_fd_is_refused_for_motors_that_do_not_speak_it():
             traffic_of(values, fd)
     with pytest.raises(ParameterError, match="data_bitrate = 9000000"):
         traffic_of(parameters(), fd | {"data_bitrate": 9_000_000})
-
-
-def test_a_number_that_is_none_makes_no_command():
-    for effort in (math.nan, math.inf):
-        with pytest.raises(ParameterError):
-            motor(DM8009).command(effort, 1.0)

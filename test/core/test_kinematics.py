@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -108,13 +107,6 @@ def test_the_least_inertia_is_below_that_of_any_pose():
     poses = rng.uniform((-1.6, 0.0, 0.0, 0.0), (1.6, 2.6, 2.5, 2.6), (300, 4))
     felt = np.array([1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses])
     assert np.all(felt > 0.97 * np.array(least_inertia(links)))
-
-
-def test_a_hanging_pendulum_has_the_inertia_of_a_rod():
-    arm = ArmModel((0.0, 0.0, 0.0, 0.3), (0.0, 0.0, 0.0, 0.15), (0.1, 0.1, 0.1, 0.6))
-    torque = links_of(arm)._replace(rotors=NO_ROTORS).torque(NO_ROTORS, NO_ROTORS, (0.0, 0.0, 0.0, 2.0))
-    assert torque[3] == pytest.approx(2.0 * 0.6 * 0.3**2 / 3.0)
-    assert math.isclose(torque[2], torque[3])
 
 
 FREE = {name: (0.0,) * 4 for name in ("coulomb_friction", "viscous_friction", "rotor_inertia")}

@@ -35,28 +35,6 @@ def rotation(axis, angle):
     return np.array({"z": ((c, -s, 0), (s, c, 0), (0, 0, 1)), "x": ((1, 0, 0), (0, c, -s), (0, s, c))}[axis])
 
 
-def by_vectors(moments, theta, direction):
-    """Torque (4,) per g by the vectors of the module's docstring; the columns of a frame are x_n, y_n, z_n."""
-    M1, M2, M3, M4, W, Z, Y3, Y4 = moments
-    frames = [np.eye(3)]
-    for angle, offset, alpha in zip(theta, OFFSET, ALPHA, strict=True):
-        frames.append(frames[-1] @ rotation("z", angle + offset) @ rotation("x", alpha))
-    (_, x1, x2, x3, x4), (_, _, _, y3, y4), z = ([frame[:, k] for frame in frames] for k in range(3))
-    S4 = M4 * x4 + Y4 * y4
-    S3 = S4 + M3 * x3 + Y3 * y3
-    S2 = S3 + M2 * x2 + Z * z[2]
-    S1 = S2 + M1 * x1 + W * z[1]
-    return [axis @ np.cross(direction, S) for axis, S in zip(z, (S1, S2, S3, S4), strict=False)]
-
-
-def test_each_moment_alone_gives_the_torque_of_the_vectors():
-    theta, direction = random_poses(np.random.default_rng(1), 20)
-    rows = regressor(theta, direction, gravity=9.8)
-    for index in range(len(MOMENTS)):
-        expected = [9.8 * np.array(by_vectors(np.eye(8)[index], *pose)) for pose in zip(theta, direction, strict=True)]
-        np.testing.assert_allclose(rows[:, :, index], expected, atol=ROUNDING)
-
-
 def test_the_regressor_times_the_moments_is_the_exact_law():
     rng = np.random.default_rng(2)
     arm, _ = random_arm(rng)

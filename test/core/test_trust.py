@@ -105,7 +105,7 @@ QUICK = [(0.9, knocked, 100.0), (1.0, reaching, 250.0), (50.0 / 45.0, knocked, 5
 
 @pytest.mark.parametrize(("scale", "angle", "rate"), quick(QUICK, itertools.product(SCALES, ANGLES, RATES)))
 def test_ordinary_equipment_keeps_trust_while_a_wearer_reaches_and_the_arm_is_knocked(rate, angle, scale):
-    motion = Motion(angle, Motor(scale=scale), rate, is_busy=True).run(60.0)
+    motion = Motion(angle, Motor(scale=scale), rate, is_busy=True).run(20.0)
     assert motion.readings.trusted
     assert not motion.faults
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
@@ -44,6 +45,7 @@ class CarriedArm(DirectController, VirtualArm):
     is_fd: whether frames are those of CAN FD.
     stiffness, play: of all joints, Nm/rad and rad; 0: rigid. The compensator knows the stiffness.
     rate: cycles of the loop per s.
+    proves_signs: whether the start pushes each joint.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class CarriedArm(DirectController, VirtualArm):
         stiffness: float = 0.0,
         play: float = 0.0,
         rate: float = RATE,
+        proves_signs: bool = True,
     ) -> None:
         config = ArmConfig(
             wearer_mass=WORN_MASS,
@@ -76,6 +79,8 @@ class CarriedArm(DirectController, VirtualArm):
                             joint_stiffness=(stiffness,) * len(joints))  # fmt: skip
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         limits = Limits(JOINTS, max_effort=peak, home_tolerance=tolerance)
+        if not proves_signs:
+            limits = replace(limits, sign_check_torque=0.0)
         DirectController.__init__(self, Compensator(settings, JOINTS), limits)
         wire = Wire(start=0.0, bitrate=bitrate)
         wire.play(device, tick=None)

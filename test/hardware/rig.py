@@ -105,7 +105,7 @@ class VirtualRig(Rig):
 
     def connect(self) -> None:
         """Connect the device to its wire."""
-        self.wire.play(self.device, self.note_speed)
+        self.wire.play(self.device, self.note_speed, CYCLE)
         name = f"of process {os.getpid()}"
         self.arm: ArmOnBus = ArmOnWires(("wire", name, {}), self.motors, LIMITS, CYCLE, {name: self.wire})
 

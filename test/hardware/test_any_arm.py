@@ -7,6 +7,7 @@ MuJoCo's and Pinocchio's models of the same URDF say what gravity needs, and the
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 from collections.abc import Sequence
 
@@ -62,6 +63,7 @@ def settings_of(text: str, names: Sequence[str], **given: object) -> Settings:
     return urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
 
 
+@functools.cache
 def hanging_chain(count: int, trunk: TrunkState) -> tuple[UrdfConfig, list[float]]:
     """Return an arm at random with `count` joints that hangs off its stops on `trunk`, and its angles there."""
     home = np.random.default_rng(count).uniform(-FREE, FREE, count)
@@ -183,7 +185,7 @@ def test_the_efforts_are_gravitys_torque_and_their_frames_within_half_a_code(cou
 PLAYED = [(count, UPRIGHT) for count in COUNTS] + [(3, TILTED)]
 
 
-@pytest.mark.parametrize(("count", "trunk"), quick([(1, UPRIGHT), (7, UPRIGHT), (3, TILTED)], PLAYED))
+@pytest.mark.parametrize(("count", "trunk"), quick([(1, UPRIGHT), (3, TILTED)], PLAYED))
 def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int, trunk: TrunkState) -> None:
     arm = CarriedChain(count, trunk=trunk)
     arm.carry()

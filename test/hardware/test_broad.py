@@ -9,11 +9,15 @@ import pytest
 from bench.imu_report import report
 from bench.imu_trials import Trial, by_estimator, by_vqf, lost_samples, read_trials, score
 
+from ..support.thorough import quick
+
 TRIALS = list(read_trials())
+EACH = pytest.mark.parametrize("number", quick((0, 1), range(len(TRIALS))), ids=[trial.name for trial in TRIALS])
 
 
-@pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
-def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(trial):
+@EACH
+def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(number):
+    trial = TRIALS[number]
     here = score(trial.without(lost_samples(len(trial.times), 0.03)), "here")
     vqf = score(trial, "VQF, its defaults")
     assert here.rms <= max(1.1 * vqf.rms, vqf.rms + 0.1)
@@ -38,8 +42,9 @@ def test_jitter_of_the_stamps_costs_little():
     assert score(jittered, "here").published >= 0.99
 
 
-@pytest.mark.parametrize("trial", TRIALS, ids=[trial.name for trial in TRIALS])
-def test_a_start_amid_strong_motion_gives_a_tilt_within_12_seconds(trial):
+@EACH
+def test_a_start_amid_strong_motion_gives_a_tilt_within_12_seconds(number):
+    trial = TRIALS[number]
     # Motion that is played forward and then backward has no jump: rates change their sign, forces do not.
     rates, forces = (
         np.concatenate((values, sign * values[::-1]))

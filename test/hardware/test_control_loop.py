@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import can
 import pytest
 
@@ -11,10 +13,11 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.hardware import control_loop
 from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, ControlLoop, NoController
+from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, LOWERING, ControlLoop, NoController
 
 from ..support.simulated_device import frame
 from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig, raised_arm
@@ -97,16 +100,16 @@ def test_failing_efforts_let_the_arm_down():
     assert arm.loop.failure is None
 
 
-def test_an_arm_whose_owner_stands_still_is_let_down():
+def test_an_arm_whose_owner_stands_still_is_let_down(monkeypatch):
     """Services, the lease and the look at the watchdog are the owner's: without it no one could let the arm down."""
+    monkeypatch.setattr(control_loop, "LONGEST_ABSENCE", 1.0)
     arm = raised_arm()
-    arm.loop.attended = arm.clock.monotonic()
-    arm.run(0.9 * LONGEST_ABSENCE)
-    arm.loop.attended = arm.clock.monotonic()
-    arm.run(0.9 * LONGEST_ABSENCE)
-    assert arm.safety.state is State.ACTIVE
-    arm.run(0.2 * LONGEST_ABSENCE)
-    assert arm.safety.fault == ("internal_error", "no service and no timer of the node has run for 5 s")
+    for _ in range(2):
+        arm.loop.attended = arm.clock.monotonic()
+        arm.run(0.9)
+        assert arm.safety.state is State.ACTIVE
+    arm.run(0.2)
+    assert arm.safety.fault == ("internal_error", "no service and no timer of the node has run for 1 s")
     arm.assert_let_down()
 
 
@@ -145,7 +148,8 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
-def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down():
+def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(monkeypatch):
+    monkeypatch.setattr(control_loop, "LOWERING", replace(LOWERING, fade=4.0, rest=4.0))  # the whole: test_supply
     arm = raised_arm()
     arm.safety.step = fail
     while arm.loop.cycle():

@@ -47,7 +47,7 @@ def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_l
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     left, truth = np.array(arm.device.arm.positions), TruthRecords()
     arm.device.truth = truth
-    arm.run(4.0)
+    arm.run(2.0)
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     caused = driven(truth.records)
     assert caused.speed < DRIVEN

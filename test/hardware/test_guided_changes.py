@@ -43,7 +43,7 @@ CHANGES = {
 }
 # Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
 FASTEST = ("gain",)
-QUICK = [("Zero-G to One-G, above the shoulder", True), ("gain", True), ("gain", False)]
+QUICK = [("gain", True), ("gain", False)]
 
 
 @pytest.mark.parametrize(

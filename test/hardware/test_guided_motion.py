@@ -140,6 +140,7 @@ def test_one_wrong_velocity_takes_no_load_from_the_hand():
     assert arm.top_speed < 0.1
 
 
+@pytest.mark.thorough
 def test_a_cup_that_is_flicked_away_during_a_change_leaves_the_change_as_slow_as_it_was():
     arm = loaded(0.2, RAISED)
     arm.change(**ONE_G)

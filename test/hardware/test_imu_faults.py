@@ -7,6 +7,7 @@ motion; every published tilt is judged by the true one.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from dataclasses import replace
@@ -33,6 +34,7 @@ from ..support.imu_faults import (
     stuck,
     values,
 )  # fmt: skip
+from ..support.thorough import quick
 
 MOTION = bowing_and_walking()
 WRONG = 5.0  # degrees
@@ -83,8 +85,10 @@ def test_without_a_fault_every_tilt_is_published_and_right():
     assert np.isfinite(outcome.errors[after]).all() and np.nanmax(outcome.errors) < 1.0
 
 
-@pytest.mark.parametrize("start", [0.0, 6.0], ids=["from the start", "amid the motion"])
-@pytest.mark.parametrize("fault", FAULTS)
+CASES = list(itertools.product(FAULTS, (0.0, 6.0)))  # s: from the start, or amid the motion
+
+
+@pytest.mark.parametrize(("fault", "start"), quick(CASES[::3], CASES))
 def test_a_fault_is_named_and_no_wrong_tilt_is_published(fault, start):
     apply, name = FAULTS[fault]
     motion = apply(MOTION, round(start * MOTION.rate))
@@ -121,8 +125,10 @@ def bowing_slowly(times):
     return np.outer(s**3 * (10.0 - 15.0 * s + 6.0 * s * s), (0.0, 0.6, 0.0))
 
 
-@pytest.mark.parametrize("trunk", [standing, bowing_slowly])
-@pytest.mark.parametrize("start", [260, 310, 430, 560, 690])
+SLOW = list(itertools.product((standing, bowing_slowly), (260, 310, 430, 560, 690)))
+
+
+@pytest.mark.parametrize(("trunk", "start"), quick(SLOW[::4], SLOW))
 def test_a_gyroscope_that_turns_to_degrees_in_slow_motion_is_withheld_before_the_tilt_is_wrong_and_named(trunk, start):
     motion = values(np.degrees)(sampled(trunk, np.arange(800) / 100.0, 0.01, 100.0), start)
     outcome = follow(motion)

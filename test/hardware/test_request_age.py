@@ -123,6 +123,7 @@ def test_an_arm_behind_a_queue_that_grows_is_let_down_gently_before_the_queue_ma
     assert arm.top_speed < SPEED
 
 
+@pytest.mark.thorough
 def test_an_arm_whose_frames_are_lost_now_and_then_is_carried_on():
     arm = compensated_arm()
     arm.wire.loss, arm.wire.batch = 0.03, 0.001

@@ -20,6 +20,7 @@ from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
+from ..support.thorough import quick
 from .carried_arm import DRIVEN
 
 RATE = 100.0  # Hz, the lowest in use: a light joint gains most speed in a cycle
@@ -73,15 +74,18 @@ class ProvenArm(VirtualArm):
         self.fastest = max(self.fastest, *map(abs, self.device.arm.velocities), 0.0)
 
 
+PROVEN: list[tuple[str, dict[int, type[DamiaoMotor]]]] = [
+    ("sim", {}),
+    ("elbow", {}),
+    ("three_joints", {}),
+    ("seven_joints", {}),
+    ("seven_joints", dict.fromkeys(range(LIGHT + 1), LateMotor)),
+]
+
+
 @pytest.mark.parametrize(
     ("name", "kinds"),
-    [
-        ("sim", {}),
-        ("elbow", {}),
-        ("three_joints", {}),
-        ("seven_joints", {}),
-        ("seven_joints", dict.fromkeys(range(LIGHT + 1), LateMotor)),
-    ],
+    quick([PROVEN[0], PROVEN[-1]], PROVEN),
     ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies"],
 )
 def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:

@@ -222,7 +222,7 @@ def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
     assert rig.motors_on == [False] * 4 and rig.top_speed < SAFE_SPEED
 
 
-@BOTH_FORMATS
+@FORMATS
 def test_a_bus_that_cannot_be_opened_does_not_keep_the_other_waiting(
     wire_format: WireFormat, capsys: pytest.CaptureFixture[str]
 ) -> None:

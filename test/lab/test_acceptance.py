@@ -24,7 +24,6 @@ from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
 from ..support.simulated_device import SPECS
-from ..support.thorough import quick
 
 RATE = 125.0  # Hz
 WEIGHT = Weight(0.6, 0.2)  # on a forearm that the device carries from the beginning
@@ -150,6 +149,7 @@ def test_a_supply_that_was_not_switched_proves_no_zero():
     assert failed(acceptance(forgets_the_supply=True)) == "zero"
 
 
+@pytest.mark.thorough
 def test_a_torque_range_that_is_not_the_firmwares_fails_at_the_known_weight():
     wrong = (*MOTORS[:3], replace(MOTORS[3], spec=replace(MOTORS[3].spec, torque_range=9.0)))
     results = acceptance(true=wrong)
@@ -160,10 +160,8 @@ def test_a_torque_range_that_is_not_the_firmwares_fails_at_the_known_weight():
 WRONG_TIMES = [(0.0, 0.2, "the motor held; it must let go"), (0.2, 0.0, "the motor let go; it must hold")]
 
 
-@pytest.mark.parametrize(
-    ("true", "assumed", "sentence"),
-    quick([WRONG_TIMES[0]], WRONG_TIMES),
-)
+@pytest.mark.parametrize(("true", "assumed", "sentence"), WRONG_TIMES)
+@pytest.mark.thorough
 def test_a_time_out_that_is_not_that_of_the_file_fails(true, assumed, sentence):
     results = acceptance(assumed=(*MOTORS[:3], replace(MOTORS[3], timeout=assumed)), timeout=true)
     assert failed(results) == "time_out" and sentence in results[-1].sentence

@@ -34,8 +34,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.urdf import UrdfConfig
 
-from ..core.test_gravity_oracles import random_arm
-from ..core.test_kinematics import NO_ROTORS, ROUNDING, with_rods
+from ..core.test_kinematics import NO_ROTORS
 from ..support.chains import random_chain
 
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
@@ -51,21 +50,6 @@ TILT = Tilt.of("right", 0.1, -0.05)
 POSE = (0.2, 0.8, 0.5, 0.7)
 SOFT = 100.0  # Nm/rad, of elastic joints
 CODE = 0.024  # rad/s of a motor's 12 bits
-
-
-def test_momentum_and_coriolis_torque_agree_with_pinocchio_for_random_arms_and_motions():
-    rng = np.random.default_rng(1)
-    for _ in range(5):
-        arm = random_arm(rng)
-        pin, model, data = with_rods(arm)
-        links = links_of(arm)._replace(rotors=NO_ROTORS)
-        for theta, velocity in rng.uniform(-3.0, 3.0, (20, 2, 4)):
-            momentum, coriolis = links.momentum(theta, velocity)
-            mass = pin.crba(model, data, theta)
-            mass = np.triu(mass) + np.triu(mass, 1).T
-            assert momentum == pytest.approx(mass @ velocity, abs=ROUNDING)
-            matrix = pin.computeCoriolisMatrix(model, data, theta, velocity)
-            assert coriolis == pytest.approx(matrix.T @ velocity, abs=ROUNDING)
 
 
 def test_a_base_that_turns_adds_the_momentum_of_an_arm_that_turns_with_it():

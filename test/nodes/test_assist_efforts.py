@@ -92,6 +92,7 @@ def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_t
     rig.wait_until(lambda: rig.message == "compensating" and rig.values["warnings"] == "none")
 
 
+@pytest.mark.thorough
 def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(rig):
     rig.assisted = True
     rig.set(assist__max_effort=[1.0] * 4)
@@ -121,6 +122,7 @@ def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
     rig.wait_until(lambda: rig.adds(ASSIST))
 
 
+@pytest.mark.thorough
 def test_terms_are_set_live_and_need_velocities(rig):
     rig.velocity = (0.15, -0.15, 0.0, 0.0)  # a change of load waits for slow joints
     rig.wait_until(lambda: rig.adds(STILL))

@@ -217,6 +217,7 @@ def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):
     imu.publisher, imu.sent = first, imu.received
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("node", [MOUNTING.as_quat()], indirect=True, ids=["turned"])
 def test_a_turned_imu_gives_tilt_rate_and_acceleration_in_the_trunks_axes(imu):
     messages = []

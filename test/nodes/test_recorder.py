@@ -32,6 +32,7 @@ from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
+from ..support.thorough import quick
 from ..support.waiting import PATIENCE, wait_until
 
 PROGRAM = "from exo_gravity.nodes.recorder import node; node.SILENCE = 3.0; node.main()"  # s: a busy machine sends late
@@ -173,9 +174,10 @@ def test_parameters_their_changes_session_and_markers_are_recorded(session):
     assert 0.0 < bag.markers[0].time <= bag.recordings[0].time[-1] + 1.0
 
 
-@pytest.mark.parametrize(
-    ("parameters", "named"), [(("output:=bag", "subject:='Anna Meier'"), "must be a code"), ((), "output")]
-)
+WRONG = [(("output:=bag", "subject:='Anna Meier'"), "must be a code"), ((), "output")]
+
+
+@pytest.mark.parametrize(("parameters", "named"), quick(WRONG[:1], WRONG))
 def test_a_wrong_parameter_ends_the_recorder_with_2_and_is_named(tmp_path, parameters, named):
     process = start(None, *(word for parameter in parameters for word in ("-p", parameter)), cwd=tmp_path)
     _, errors = process.communicate(timeout=PATIENCE)

@@ -171,6 +171,7 @@ def test_a_load_is_weighed_on_request_and_one_that_is_dropped_is_no_longer_a_par
     assert values["ros__parameters"]["payload"]["mass"] == 0.0
 
 
+@pytest.mark.thorough
 def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_is_killed_while_the_arm_is_carried_on(
     launch, probe, arm
 ):

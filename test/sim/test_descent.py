@@ -16,6 +16,8 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 
+from ..support.thorough import quick
+
 MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
 LIMITS = Limits(("rotation", "abduction", "flexion", "elbow"))
 RATE = 125.0
@@ -87,7 +89,10 @@ class Lowered:
         return fastest
 
 
-@pytest.mark.parametrize(("friction", "body_mass"), [(0.01, 0.0), (0.5, 0.0), (0.05, 75.0)])
+WORN = [(0.01, 0.0), (0.5, 0.0), (0.05, 75.0)]
+
+
+@pytest.mark.parametrize(("friction", "body_mass"), quick([WORN[0], WORN[2]], WORN))
 def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_motors_are_switched_off(
     friction, body_mass
 ):
@@ -98,10 +103,10 @@ def test_a_horizontal_arm_comes_down_slowly_in_15_s_and_does_not_drop_when_its_m
     assert lowered.machine.state is State.DISABLED
 
 
-@pytest.mark.parametrize(
-    ("theta", "pitch", "roll", "friction"),
-    [(POSES[3], 0.4, -0.3, 0.01), (POSES[4], 0.0, 0.0, 0.2)],
-)
+OTHERS = [(POSES[3], 0.4, -0.3, 0.01), (POSES[4], 0.0, 0.0, 0.2)]
+
+
+@pytest.mark.parametrize(("theta", "pitch", "roll", "friction"), quick(OTHERS[:1], OTHERS))
 def test_from_other_poses_and_on_a_tilted_trunk_it_comes_down_as_slowly(theta, pitch, roll, friction):
     lowered = Lowered(theta, friction, pitch=pitch, roll=roll)
     assert lowered.top_speed < TOP_SPEED

@@ -22,12 +22,6 @@ EXACT = {**QUIET, "gyroscope_bias": 0.0, "accelerometer_bias": 0.0, "delay": 0.0
 MOUNTED = (0.5, 0.5, 0.5, 0.5)
 
 
-def test_at_rest_the_accelerometer_measures_g_upward():
-    gyroscope, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(TrunkState(0.0, 0.0))
-    np.testing.assert_allclose(accelerometer, (0, 0, G))
-    np.testing.assert_allclose(gyroscope, 0)
-
-
 def test_a_bow_acts_on_the_x_axis_and_a_lean_to_the_right_on_the_y_axis():
     imu = SimulatedImu(ImuConfig(**EXACT))
     np.testing.assert_allclose(imu.sample(TrunkState(0.3, 0.0))[1], (-G * math.sin(0.3), 0, G * math.cos(0.3)))

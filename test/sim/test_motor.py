@@ -11,7 +11,7 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import unpack_reply
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, pack_command
+from exo_gravity.core.motors.frames import ENTER, SET_ZERO, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.sim import Firmware, SimulatedMotor
 
@@ -34,46 +34,11 @@ def reply_to(motor, data, position=0.0, velocity=0.0, now=0.0):
     return unpack_reply(motor.joint.spec, motor.receive(data, position, velocity, now))
 
 
-def test_no_torque_before_enter():
-    motor = SimulatedMotor(JointMotor(SPEC, 5))
-    assert reply_to(motor, command(torque=2.0)).torque == pytest.approx(0.0, abs=TORQUE_CODE)
-    assert motor.torque(0.0, 0.0) == 0.0
-
-
 def test_current_noise_spoils_the_replied_torque_and_not_the_torque():
     motor = entered(Firmware(current_noise=0.02))
     replied = [reply_to(motor, command(torque=5.0)).torque for _ in range(500)]
     assert np.std(replied) == pytest.approx(0.1, rel=0.2) and np.mean(replied) == pytest.approx(5.0, abs=0.02)
     assert motor.torque(0.0, 0.0) == pytest.approx(5.0, abs=TORQUE_CODE / 2)
-
-
-def test_enter_executes_the_last_command_again():
-    motor = entered()
-    motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
-    motor.receive(EXIT, 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == 0.0
-    motor.receive(ENTER, 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
-
-
-def test_a_command_before_enter_is_executed_by_it():
-    motor = SimulatedMotor(JointMotor(SPEC, 5))
-    motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
-    motor.receive(ENTER, 0.0, 0.0, 0.0)
-    assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
-
-
-def test_after_a_zero_command_and_exit_enter_gives_no_torque():
-    motor = entered()
-    for data in (command(torque=2.0), command(), EXIT, ENTER):
-        motor.receive(data, 0.0, 0.0, 0.0)
-    assert abs(motor.torque(0.0, 0.0)) <= TORQUE_CODE / 2
-
-
-def test_the_last_command_stays_in_force():
-    motor = entered()
-    motor.receive(command(torque=2.0), 0.0, 0.0, now=0.0)
-    assert reply_to(motor, ENTER, now=3600.0).torque == pytest.approx(2.0, abs=TORQUE_CODE)
 
 
 def test_no_12_bit_code_is_exactly_zero_torque():
@@ -132,31 +97,12 @@ def test_set_zero_makes_the_present_angle_zero():
     assert reply_to(motor, command(), position=0.5, now=2.0).position == pytest.approx(-0.2, abs=2e-4)
 
 
-def test_a_motor_does_not_reply_to_set_zero_nor_for_a_while_after_it():
-    motor = entered(Firmware(zero_silence=0.8))
-    assert motor.receive(SET_ZERO, 0.0, 0.0, 10.0) is None
-    assert motor.receive(command(torque=2.0), 0.0, 0.0, 10.79) is None
-    assert abs(motor.torque(0.0, 0.0)) < TORQUE_CODE
-    assert motor.receive(command(torque=2.0), 0.0, 0.0, 10.81) is not None
-
-
-@pytest.mark.parametrize("data", [ENTER, EXIT, command()])
-def test_enter_exit_and_commands_are_answered(data):
-    assert reply_to(SimulatedMotor(JointMotor(SPEC, 5)), data).motor_id == 5
-
-
 @pytest.mark.parametrize("data", [b"", b"\x05", ENTER[:7], ENTER + b"\x00", b"\xff" * 64])
 def test_frames_of_a_wrong_length_are_ignored(data):
     motor = entered()
     motor.receive(command(torque=2.0), 0.0, 0.0, 0.0)
     assert motor.receive(data, 0.0, 0.0, 0.0) is None
     assert motor.torque(0.0, 0.0) == pytest.approx(2.0, abs=TORQUE_CODE / 2)
-
-
-def test_any_8_bytes_below_the_special_frames_are_a_command():
-    motor = entered()
-    assert motor.receive(b"\xff" * 7 + b"\xed", 0.0, 0.0, 0.0) is not None  # above it they are special
-    assert motor.torque(0.0, 0.0) == SPEC.peak_torque
 
 
 @pytest.mark.parametrize(("length", "temperature", "error"), [(8, 47, 6), (6, None, None)])
@@ -172,13 +118,6 @@ def test_a_temperature_beyond_the_range_of_its_byte_is_clamped():
     motor = entered()
     motor.temperature = 300.0
     assert reply_to(motor, command()).temperature == 215
-
-
-@pytest.mark.parametrize(("to_master", "reply_id"), [(False, 5), (True, 0)])
-def test_replies_carry_the_motors_id_or_the_masters(to_master, reply_id):
-    motor = entered(Firmware(reply_to_master=to_master))
-    assert motor.reply_id == reply_id
-    assert reply_to(motor, command()).motor_id == 5
 
 
 @pytest.mark.parametrize("sign", [1, -1])

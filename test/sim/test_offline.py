@@ -29,7 +29,15 @@ MOTORS_AS_MOUNTED = (
     JointMotor(MOTORS["AK60-6"], 3, 1, -0.2),
     JointMotor(MOTORS["AK60-6"], 4, -1),
 )
-LIMITS = Limits(NAMES, (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14), (5.0,) * 4, (3.0, 9.0, 3.0, 3.0))
+LIMITS = Limits(
+    NAMES,
+    (-1.65, -0.17, -0.78, -0.17),
+    (1.65, 3.14, 2.53, 3.14),
+    (5.0,) * 4,
+    (3.0, 9.0, 3.0, 3.0),
+    sign_check_torque=0.0,
+)
+DELAY = 2.5  # s after the motors are switched on, in which they ramp in
 
 
 def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT):
@@ -38,7 +46,7 @@ def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT
     device.pitch, device.roll = 0.1, -0.06
     assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
     arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 125.0, tilt and resting(*tilt))
-    return OfflineTrial(arm, script, 11.2)
+    return OfflineTrial(arm, script, DELAY)
 
 
 @pytest.fixture(scope="module")
@@ -90,20 +98,20 @@ def test_after_a_motor_failure_the_arm_is_let_down_and_the_joint_named():
 
 def test_a_stop_lets_the_arm_down_and_keeps_the_recording_which_is_the_same_until_then(done):
     trial = make()
-    recording = trial.run(lambda now: now >= 10.0)
-    assert np.all(recording.position[: 10 * 125] == done[1].position[: 10 * 125])
+    recording = trial.run(lambda now: now >= 6.0)
+    assert np.all(recording.position[: 6 * 125] == done[1].position[: 6 * 125])
     assert trial.trouble == "right: stopped by the operator"
     ((start, end),) = recording.carried
-    assert 2.0 < start < 11.2  # the checks take a second without trouble, then the sign check of four joints
-    assert end == pytest.approx(10.0, abs=0.01)
+    assert 1.0 < start < 2.0  # the checks take a second without trouble
+    assert end == pytest.approx(6.0, abs=0.01)
     assert end + 2.0 < recording.time[-1] < 36.0  # of letting down
     assert not any(motor.entered for motor in trial.arm.device.motors)
 
 
 def test_the_virtual_wearer_ends_with_a_trial_that_is_stopped():
-    steps = [{"move": [0.0, 0.5, 0.6, 0.5], "over": 2.0}, {"move": [0.0, 1.2, 1.2, 1.2], "over": 40.0}]
+    steps = [{"move": [0.0, 0.5, 0.6, 0.5], "over": 2.0}, {"move": [0.0, 1.2, 1.2, 1.2], "over": 20.0}]
     trial = make(script=TrialScript.parse({"name": "lifting", "steps": steps}))
-    recording = trial.run(lambda now: now >= 20.0)
+    recording = trial.run(lambda now: now >= 9.0)
     stopped = recording.position[np.searchsorted(recording.time, recording.carried[0][1])]
     assert np.all(stopped[1:] > 0.5) and np.all(recording.position[-1, 1:3] < 0.3)  # no hand holds it up
 

@@ -31,7 +31,8 @@ def test_the_written_file_carries_the_arm_on_the_simulated_device(tmp_path, caps
     content = yaml.safe_load(output.read_text())
     shipped = yaml.safe_load(packaged_config("three_joints.yaml").read_text())["/right/simulator"]["ros__parameters"]
     bus = content["/right/can_bridge"]["ros__parameters"]["can"]
-    simulator = {**shipped, "can": {**bus}, "direction": [1, 1, 1], "zero": [0.0, 0.0, 0.0]}
+    simulator = {**shipped, "can": {**bus}, "direction": [1, 1, 1], "zero": [0.0, 0.0, 0.0], "trial_delay": 3.0}
+    content["/right/can_bridge"]["ros__parameters"]["sign_check_torque"] = 0.0
     output.write_text(dumped({**content, "/right/simulator": {"ros__parameters": simulator}}))
     script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.6, 0.5, 0.8], "over": 3.0}, {"hold": 3.0}]})
     (trial,) = simulated_trials(output, script)

@@ -14,6 +14,7 @@ from exo_gravity.lab.processes import node_modules
 
 from ..support import CONFIG
 from ..support.selection import UNDER_COLCON
+from ..support.thorough import quick
 
 EXO = str(CONFIG / "exo.yaml")
 NO_FILE = ["--params", "nowhere.yaml"]
@@ -93,7 +94,7 @@ def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, m
     assert f"{tool}: " in said.splitlines()[-1]
 
 
-@pytest.mark.parametrize("tool", WITHOUT)
+@pytest.mark.parametrize("tool", quick(["launcher"], WITHOUT))
 def test_a_missing_package_is_named_with_what_installs_it_and_help_still_works(tool, tmp_path):
     module, words, installs = WITHOUT[tool]
     program = MAIN.format(module=module, tool=tool, words=words)
@@ -103,7 +104,7 @@ def test_a_missing_package_is_named_with_what_installs_it_and_help_still_works(t
     assert ended.stderr.count("\n") == 1 and "usage: " in ended.stdout
 
 
-@pytest.mark.parametrize("node", NODES_WITHOUT)
+@pytest.mark.parametrize("node", quick(["recorder"], NODES_WITHOUT))
 def test_a_node_whose_package_is_missing_ends_with_one_sentence_in_place_of_a_traceback(node, tmp_path):
     module, extra = NODES_WITHOUT[node]
     program = NODE.format(module=module, node=node, where=node_modules()[node])

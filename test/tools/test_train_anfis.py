@@ -52,6 +52,7 @@ def recorded(tmp_path):
     return configured_arm(params_file(tmp_path))
 
 
+@pytest.mark.thorough
 def test_on_the_papers_positions_it_errs_less_than_the_paper_and_holds_the_arm_as_the_exact_law_anywhere(learned):
     configured, samples, law = learned
     assert (len(samples.angle), len(samples.held_out_angle)) == (1053, 12 * 8 * 8)

@@ -183,16 +183,16 @@ def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
 
 
 BOW = {"bow": math.radians(30.0), "over": 3.0}
-THOROUGH = pytest.mark.thorough
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("steps", "inertial", "least", "most"),
     [
         ((BOW, {"hold": 1.0}), True, 0.0, 2.0),
-        pytest.param(({"walk": 6.0}, {"hold": 1.0}), True, 0.0, 3.0, marks=THOROUGH),
-        pytest.param((BOW, {"hold": 1.0}), False, 0.0, 2.0, marks=THOROUGH),
-        pytest.param(({"walk": 4.0},), False, 5.0, math.inf, marks=THOROUGH),
+        (({"walk": 6.0}, {"hold": 1.0}), True, 0.0, 3.0),
+        ((BOW, {"hold": 1.0}), False, 0.0, 2.0),
+        (({"walk": 4.0},), False, 5.0, math.inf),
     ],
     ids=["bow", "walk", "bow, tilt alone", "walk, tilt alone"],
 )

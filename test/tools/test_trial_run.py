@@ -190,15 +190,6 @@ ENDS = {
 }
 
 
-@pytest.mark.parametrize(("bridge", "silence", "exit_code", "why"), ENDS.values(), ids=ENDS)
-def test_why_a_trial_ends_early(bridge, silence, exit_code, why):
-    screen = Screen()
-    screen.at(0.0)
-    screen.at(1.0, bridge=bridge)
-    screen.now += silence
-    assert why in screen.end_of_trial(exit_code)
-
-
 NO_SENTENCE = "zqx vw: kfj, 17"  # in the place of each: what a program decides does not depend on it
 
 

@@ -44,6 +44,8 @@ NOISE = 0.004  # Nm, standard deviation of a pose's effort: half a code of an AK
 ZERO = 1.5  # deg, the largest error of an encoder's zero
 ASKEW = 1.5  # deg, by which each axis lies otherwise than in the file's URDF
 OFF = 0.2  # share by which each mass of the file's URDF is wrong
+NO_WEIGHT = (0.0, 0.0)  # kg and m
+BEST: dict[tuple[str, tuple[float, float]], list[np.ndarray]] = {}  # poses of a tour, by the file's name and the weight
 
 
 def with_wrong_masses(text: str, seed: int) -> str:
@@ -64,7 +66,7 @@ def turned(text: str, joint: str, turn: np.ndarray) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def true_arm(text: str, names: Sequence[str], weight: tuple[float, float] = (0.0, 0.0)) -> WornMujocoArm:
+def true_arm(text: str, names: Sequence[str], weight: tuple[float, float] = NO_WEIGHT) -> WornMujocoArm:
     """The arm of a URDF with a weight of some kg at some m from its last joint."""
     none = (0.0,) * (len(names) - 1)
     return WornMujocoArm(text, names, (*none, weight[0]), (*none, weight[1]))
@@ -74,6 +76,7 @@ def true_arm(text: str, names: Sequence[str], weight: tuple[float, float] = (0.0
 class Bench:
     """An arm of config whose file has a wrong URDF. params: that file; text: the true URDF."""
 
+    name: str
     params: Path
     arm: AnyArm
     text: str
@@ -88,17 +91,23 @@ class Bench:
         nodes["/right/compensator"]["urdf.file"] = str(wrong)
         params.write_text(text_of(nodes))
         arm = any_arm(params, "right")
-        return cls(params, arm, text, np.zeros(len(arm.joint_names)))
+        return cls(name, params, arm, text, np.zeros(len(arm.joint_names)))
 
-    def observed(self, scales: np.ndarray, weight: tuple[float, float] = (0.0, 0.0)) -> list[Observation]:
+    def poses(self, weight: tuple[float, float] = NO_WEIGHT) -> Sequence[np.ndarray]:
+        """The best poses, which follow from the file alone."""
+        if (self.name, weight) not in BEST:
+            model = model_of(self.arm)
+            poses, taken = candidates(self.arm.limits, model), [np.array(self.arm.limits.home)]
+            while len(taken) < POSES:
+                taken.append(poses[next_pose(taken, poses, DOWN, model.moments + model.load(*weight), model)])
+            BEST[self.name, weight] = taken
+        return BEST[self.name, weight]
+
+    def observed(self, scales: np.ndarray, weight: tuple[float, float] = NO_WEIGHT) -> list[Observation]:
         """What a tour through the best poses would show of motors with these true torque scales (n,)."""
-        model, random = model_of(self.arm), np.random.default_rng(4)
-        poses, taken = candidates(self.arm.limits, model), [np.array(self.arm.limits.home)]
-        truth = true_arm(self.text, self.arm.joint_names, weight)
-        while len(taken) < POSES:
-            taken.append(poses[next_pose(taken, poses, DOWN, model.moments + model.load(*weight), model)])
+        truth, random = true_arm(self.text, self.arm.joint_names, weight), np.random.default_rng(4)
         seen = []
-        for theta in taken:
+        for theta in self.poses(weight):
             effort = truth.torque(theta + self.off) / scales + random.normal(0.0, NOISE, len(theta))
             spread = np.full(len(theta), NOISE)
             seen.append(Observation(theta, DOWN, effort, spread, spread, *weight, temperature=(30.0,) * len(theta)))
@@ -221,12 +230,9 @@ def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> No
     arm = replace(bench.arm, compensator={**bench.arm.compensator, "use_imu": True})
     model, truth, seen = model_of(arm), MujocoArm(bench.text, arm.joint_names), []
     random = np.random.default_rng(4)
-    poses, taken = candidates(arm.limits, model), [np.array(arm.limits.home)]
-    while len(taken) < POSES:
-        taken.append(poses[next_pose(taken, poses, DOWN, model.moments, model)])
     leans = [gravity_in_trunk(pitch, 0.1) for pitch in (0.12, -0.12)]
     for down in leans:
-        for theta in taken:
+        for theta in bench.poses():
             effort = truth.torque(theta, 9.80665 * down) + random.normal(0.0, NOISE, len(theta))
             spread = np.full(len(theta), NOISE)
             seen.append(Observation(theta, down - np.cross(turn, down), effort, spread, spread))

@@ -56,6 +56,7 @@ def test_moments_of_random_devices_are_right_to_2_percent_or_their_errors_which_
     assert 0.90 <= share_covered(devices) <= 0.99
 
 
+@pytest.mark.thorough
 def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
     found = []
     for device in map(Device, range(200, 210)):
@@ -155,6 +156,7 @@ def askew_torque(turn, theta, direction):
     return np.array([pin.computeGeneralizedGravity(model, data, np.array(pose)) for pose in theta])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("with_imu", "askew"), [(True, 1.5), (False, 1.0)])  # degrees; 1 is assumed
 def test_the_band_contains_what_axes_leave_that_are_askew(with_imu, askew):
     leans = (LEANING, Tilt.of("right", -0.1, 0.25).direction) if with_imu else (UPRIGHT,)

@@ -122,6 +122,7 @@ def test_a_saturated_joint_is_named_with_its_limit():
     assert tour.elapsed < 15.0
 
 
+@pytest.mark.thorough
 def test_a_silent_motor_ends_the_tour_by_the_bridges_fault_and_keeps_what_was_measured():
     def unplug(time, device):
         device.motors[1].unplugged = time > 18.0
