@@ -11,7 +11,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.inputs.references import ALPHA, OFFSET
-from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
+from exo_gravity.lab.moments import load_moments, regressor
 
 ROUNDING = 1e-12  # Nm
 LENGTH = (0.05, 0.13, 0.30, 0.30)
