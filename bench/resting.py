@@ -23,7 +23,8 @@ def resting_torque(arm: SimulatedArm, motors: np.ndarray) -> np.ndarray:
     for _ in range(STEPS):
         data.qpos[:count] = links
         mujoco.mj_forward(model, data)
-        torque, before = data.qfrc_bias[:count].copy(), links
+        springs = model.jnt_stiffness[:count] * (links - model.qpos_spring[:count])  # cables and tissue, at the links
+        torque, before = data.qfrc_bias[:count] + springs, links
         side = np.clip(torque / LITTLE, -1.0, 1.0)  # of the play
         rest = motors - torque / config.joint_stiffness - side * np.divide(config.backlash, 2.0)
         links = before + RELAXATION * (rest - before)

@@ -78,7 +78,7 @@ class TrackerTuning:
     full_friction_speed: float = 0.03  #: rad/s of the reference, from which on friction is compensated fully
     standing: float = 0.03  #: rad/s, below which a joint that sticks is pushed off; one step of the velocity's 12 bits
     push_off_rate: float = 1.5  #: Nm/s: a light joint at 100 Hz is late by 0.01 rad for 0.1 Nm of Stribeck friction
-    most_push_off: float = 0.3  #: Nm
+    most_push_off: float = 0.3  #: Nm, less what the controller gives at `slow_error`: more would throw a heavy joint
 
 
 MOTION, TRACKER = MotionTuning(), TrackerTuning()
@@ -288,9 +288,10 @@ class Tracker:
         inertia = np.diag(matrix)
         self._watch_vibration(dt, velocity, inertia)
         self._compensate_friction(dt, coming, speed_error)
-        self._push(dt, np.sign(coming), np.asarray(velocity))
+        frequency = self._frequencies(inertia)
+        self._push(dt, np.sign(coming), np.asarray(velocity), inertia * frequency**2)
         loaded = matrix + TRACKER.added * np.eye(len(matrix))
-        self._effort = self._controlled(dt, speed_error, expected, loaded, self._frequencies(inertia))
+        self._effort = self._controlled(dt, speed_error, expected, loaded, frequency)
         return self._effort
 
     @property
@@ -340,11 +341,15 @@ class Tracker:
         is_ahead = (self.error * way < -TRACKER.ahead) | (speed_error * way < -TRACKER.faster)
         self._slide += np.where(is_ahead & (change * way > 0.0), 0.0, change)
 
-    def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray) -> None:
-        """Push joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1; velocity: (n,) rad/s."""
+    def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray, stiffness: np.ndarray) -> None:
+        """Push light joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1.
+
+        velocity: (n,) rad/s. stiffness: (n,) Nm/rad of the controller, which pushes a heavy joint hard enough by itself.
+        """
+        most = np.maximum(0.0, TRACKER.most_push_off - stiffness * TRACKER.slow_error)
         stands = self.sticks & (np.abs(velocity) < TRACKER.standing) & (self.error * way > TRACKER.ahead)
         more = self._push_off + TRACKER.push_off_rate * dt * way
-        self._push_off = np.where(stands, np.clip(more, -TRACKER.most_push_off, TRACKER.most_push_off), 0.0)
+        self._push_off = np.where(stands, np.clip(more, -most, most), 0.0)
 
     def _controlled(
         self, dt: float, speed_error: np.ndarray, expected: Torque, matrix: np.ndarray, frequency: np.ndarray

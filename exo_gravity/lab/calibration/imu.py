@@ -31,6 +31,7 @@ from exo_gravity.core.numbers import Vector
 from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.lab.calibration.identification import Identified
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -324,12 +325,10 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     rotation = load(params).get(NODE, {}).get(ROTATION)
     if found is None or arm is None or not rotation or not arm.compensator["use_imu"]:
         return result
-    square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
-    error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
+    error, heading_error, turn = mounting_turn(found)
     if not 0.0 < error < LARGEST_ERROR:
         return result
     is_whole = heading_error < LARGEST_HEADING_ERROR
-    turn = found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
     in_trunk = turn if arm.by_urdf else turn_in_trunk(arm.side, turn)  # a URDF's root link has the trunk's axes
     angle, quaternion = math.degrees(float(np.linalg.norm(turn))), turned(rotation, in_trunk)
     heading = f"heading ±{math.degrees(heading_error):.2f}" if is_whole else "heading unchanged"
@@ -338,6 +337,18 @@ def with_mounting(result: CalibrationResult, params: Path) -> CalibrationResult:
     change = Change(NODE, ROTATION, quaternion.round(6).tolist(), note)
     lines = result.lines if is_whole else (*result.lines, NO_HEADING)
     return replace(result, changes=(*result.changes, change), lines=lines)
+
+
+def mounting_turn(found: Identified) -> tuple[float, float, np.ndarray]:
+    """Return what the arm's weight says of the IMU's mounting.
+
+    The standard errors in rad of the inclination and of the heading, and the turn (3,) in rad in the base frame, which
+    leaves the heading as it is where it is not known well.
+    """
+    square, axes = np.linalg.eigh(found.tilt_covariance)  # the last is nearly gravity's own axis
+    error, heading_error = math.sqrt(max(0.0, square[0] + square[1])), math.sqrt(max(0.0, square[2]))
+    is_whole = heading_error < LARGEST_HEADING_ERROR
+    return error, heading_error, found.tilt if is_whole else axes[:, :2] @ axes[:, :2].T @ found.tilt
 
 
 def turned(rotation: Vector, turn: np.ndarray) -> np.ndarray:
