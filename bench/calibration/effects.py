@@ -1,9 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""python -m bench.calibration.effects [--devices 20]: what `calibrate` leaves of cables, warm motors, elastic joints.
+"""python -m bench.calibration.effects [--devices 20]: what `calibrate` leaves of what the moments do not explain.
 
 Random simulated devices in MuJoCo, with tours in virtual time as `calibrate scale` makes them: without and with a
-weight, the stand leant otherwise. Each device is played without any effect, with cables, with motors that are 3 %
-weaker when warm, and with elastic joints. On warm motors `calibrate gravity` follows, with `--earlier` the cold record.
+weight, the stand leant otherwise. Half of the devices, at random, have cables across their joints; half have motors
+that are weaker when warm; half have elastic joints, encoders whose zeros are off, axes askew. On warm motors
+`calibrate gravity` follows, with `--earlier` the cold record.
 
 Judged by the torque that holds MuJoCo's arm in 300 poses that no tour visited: the largest error of any joint, as a
 share of the largest torque, and the share of the poses within the 95 % band that `model_error` gives. `before`
@@ -22,7 +23,9 @@ from unittest.mock import patch
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
+import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import moments_of
@@ -30,12 +33,15 @@ from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import SCALE_TEMPERATURE, JointMotor, scale_at
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration import identification
+from exo_gravity.lab.calibration.identification import Identified
+from exo_gravity.lab.calibration.imu import mounting_turn
 from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
 from exo_gravity.lab.calibration.tour import DURATION, Tour
@@ -52,11 +58,14 @@ from ..resting import resting_torque
 from .device import COULOMB, LARGEST_OFFSET, LEANT, SPREAD, STAND, VISCOUS
 from .tour import Player, let_hang
 
-RATE = 250.0  # Hz
+RATE = 100.0  # Hz
 WEIGHT = (1.0, 0.28)  # kg, m from the elbow
+MAX_EFFORT = (4.5, 13.5, 4.5, 4.5)  # Nm, half as much again as rated: motors may be 30 % weaker, links 30 % heavier
 COLD, WARM = 25.0, 50.0  # degC
-WEAKER = 0.03  # share of its torque that a warm motor lacks
-CABLES = 0.15  # Nm/rad
+WEAKER = 0.03  # share of its torque that a warm motor lacks at most
+CABLES = 0.15  # Nm/rad at most
+JOINTS = (600.0, 3000.0)  # Nm/rad
+OFF = ASKEW = np.radians(1.5)  # rad, the largest error of a zero, and of the direction of an axis
 REST = (-0.3, 0.8)  # rad, where a cable is slack
 STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
 POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
@@ -66,20 +75,9 @@ ARM = configured_arm(packaged_config("sim.yaml"))
 ASSUMED = tuple(JointMotor(MOTORS[kind], n) for n, kind in enumerate(USUAL_MOTORS, 1))
 
 
-class Effect(NamedTuple):
-    """What the moments do not explain."""
-
-    stiffness: float = 0.0  #: Nm/rad of the cables across each joint
-    slope: float = 0.0  #: 1/K of the torque scales
-    joints: float = 0.0  #: Nm/rad of each joint; 0: rigid
-
-
-EFFECTS = {
-    "none": Effect(),
-    f"cables {CABLES:g} Nm/rad": Effect(stiffness=CABLES),
-    f"motors {WEAKER:.0%} weaker when warm": Effect(slope=-WEAKER / (WARM - COLD)),
-    "joints of 1,000 Nm/rad": Effect(joints=1000.0),
-}
+EFFECTS = ("cables", "warm motors", "elastic joints", "zeros off", "axes askew")
+OF_GEOMETRY = EFFECTS[3:]
+Z_99 = 2.58  # standard errors on either side of a 99 % interval
 
 
 class Judged(NamedTuple):
@@ -90,40 +88,61 @@ class Judged(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """One device with one effect."""
+    """One device. trouble: why its tours gave nothing, or ''; then there is no `before` and `after`."""
 
     seed: int
-    effect: str
-    before: Judged
-    after: Judged
-    chosen: tuple[int, int]  #: joints with springs, and with slopes, in the new file
+    effects: tuple[str, ...]
+    trouble: str
+    before: Judged | None = None
+    after: Judged | None = None
+    chosen: tuple[int, int] = (0, 0)  #: joints with springs, and with slopes, in the new file
 
 
 class Device:
-    """A device drawn at random, with an effect."""
+    """A device drawn at random. effects: those of EFFECTS that it has."""
 
-    def __init__(self, seed: int, effect: Effect) -> None:
+    def __init__(self, seed: int) -> None:
         self.rng = rng = np.random.default_rng(seed)
         low, high, count = 1.0 - SPREAD, 1.0 + SPREAD, len(ASSUMED)
+        self.effects = tuple(name for name in EFFECTS if rng.random() < 0.5)
+        size = {name: float(name in self.effects) for name in EFFECTS}
         nominal = DEFAULT_LINKS
         mass = nominal.mass * rng.uniform(low, high, count)
         cog = np.minimum(nominal.cog * rng.uniform(low, high, count), nominal.length)
         beside = rng.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (2, count))
+        stiffness = size["elastic joints"] * np.exp(rng.uniform(*np.log(JOINTS), count))
         self.mechanics = {
             "links": ArmModel(nominal.length, cog, mass), "cog_y": beside[0], "cog_z": beside[1],
             "coulomb_friction": rng.uniform(*COULOMB, count), "viscous_friction": rng.uniform(*VISCOUS, count),
-            "spring_rest": rng.uniform(*REST, count), "spring_stiffness": (effect.stiffness,) * count,
-            "joint_stiffness": (effect.joints,) * count,
+            "spring_rest": rng.uniform(*REST, count),
+            "spring_stiffness": size["cables"] * rng.uniform(0.0, CABLES, count),
+            "joint_stiffness": stiffness,
         }  # fmt: skip
+        weaker = size["warm motors"] * rng.uniform(0.0, WEAKER, count)
+        self.zero = size["zeros off"] * rng.uniform(-OFF, OFF, count)  # rad
         scales = rng.uniform(low, high, count).tolist()
+        slope, zero = (-weaker / (WARM - COLD)).tolist(), self.zero.tolist()
         self.motors = [
-            JointMotor(motor.spec, motor.can_id, torque_scale=scale, scale_slope=effect.slope)
-            for motor, scale in zip(ASSUMED, scales, strict=True)
+            replace(motor, zero=zero[n], torque_scale=scales[n], scale_slope=slope[n])
+            for n, motor in enumerate(ASSUMED)
         ]
+        way, far = rng.uniform(0.0, 2.0 * np.pi, count), size["axes askew"] * rng.uniform(0.0, ASKEW, count)
+        self.turn = np.column_stack((far * np.cos(way), far * np.sin(way)))  # rad, about x and y of each joint
         pitch = float(rng.uniform(*STAND[0]))
         self.stand = pitch, float(rng.uniform(*STAND[1]))
         self.leant = pitch - float(np.copysign(rng.uniform(*LEANT), pitch)), float(rng.uniform(*STAND[1]))
-        self.measured = effect.joints * (1.0 + STIFFNESS_ERROR * rng.standard_normal(count))  # Nm/rad
+        self.measured = stiffness * (1.0 + STIFFNESS_ERROR * rng.standard_normal(count))  # Nm/rad
+
+    def arm(self, **worn: Any) -> SimulatedArm:
+        """Return the arm, with its axes askew."""
+        arm = SimulatedArm(ArmConfig(**self.mechanics, **worn))
+        for joint, turn in enumerate(self.turn):
+            body = arm.model.body_quat[arm.model.jnt_bodyid[joint]]
+            askew = Rotation.from_rotvec((*turn, 0.0)).as_quat(scalar_first=True)
+            mujoco.mju_mulQuat(body, body.copy(), askew)
+        mujoco.mj_setConst(arm.model, arm.data)
+        arm.reset(np.zeros(len(self.turn)))
+        return arm
 
     def tours(self, poses: int, temperature: float, loaded: bool) -> list[Observation]:
         """Return what a tour shows of the arm with motors at `temperature` degC; loaded: and one with the weight."""
@@ -135,13 +154,13 @@ class Device:
     ) -> list[Observation]:
         mass, lever = load
         worn: dict[str, Any] = {"wearer_mass": (0.0, 0.0, 0.0, mass), "wearer_cog": (0.0, 0.0, 0.0, lever)}
-        arm = SimulatedArm(ArmConfig(**self.mechanics, **worn))
-        device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in self.motors])
+        device = SimulatedDevice(self.arm(**worn), [SimulatedMotor(motor) for motor in self.motors])
         for motor in device.motors:
             motor.temperature = motor.ambient = temperature
         device.pitch, device.roll = stand
         let_hang(device)
-        limits, tilt = Limits(ARM.joint_names, sign_check_torque=0.0), Tilt.of(device.side, *stand)
+        limits = Limits(ARM.joint_names, max_effort=MAX_EFFORT, sign_check_torque=0.0)
+        tilt = Tilt.of(device.side, *stand)
         expected = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
         guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), expected, tilt)
         tour = Tour(limits, guess, Itinerary(limits, poses, DURATION), RATE, load)
@@ -158,19 +177,20 @@ class Device:
         joints: (n,) Nm/rad, the file's `joint_stiffness`.
         """
         result = moments_from(replace(ARM, compensator={**ARM.compensator, "joint_stiffness": joints}), observations)
+        assert result.identified is not None
+        seen = _as_calibrated(result.identified)
         given: dict[str, Any] = {change.name: change.value for change in result.changes}
         none = [0.0] * len(ASSUMED)
         spring = JointSpring(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
         slope = given.get("torque_scale_slope", none)
         robot = ArmModel.from_moments(DEFAULT_LINKS.length, given["robot.first_moment"], given["robot.off_axis"])
         settings = Settings("right", robot, joint_spring=spring, joint_stiffness=joints.tolist())
-        upright = Tilt.of("right")
         at = given.get("torque_scale_temperature", [SCALE_TEMPERATURE] * len(ASSUMED))
         assumed = [scale_at(*motor, temperature) for motor in zip(given["torque_scale"], slope, at, strict=True)]
         strength = np.divide([motor.scale_at(temperature) for motor in self.motors], assumed)
-        device = SimulatedArm(ArmConfig(**self.mechanics))
+        device = self.arm()
         poses = np.random.default_rng(1000).uniform(*POSES, (NEW_POSES, len(ASSUMED)))
-        wanted = np.array([settings.torque(theta, upright)[0] for theta in poses.tolist()])
+        wanted = np.array([settings.torque(theta, seen)[0] for theta in (poses + self.zero).tolist()])
         needed = resting_torque if device.config.elastic else _needed
         true = np.array([needed(device, theta) for theta in poses])
         error = np.abs(wanted * strength - true)
@@ -185,47 +205,71 @@ def _needed(device: SimulatedArm, theta: np.ndarray) -> np.ndarray:
     return np.asarray(device.data.qfrc_bias - device.data.qfrc_passive)
 
 
-def outcome(part: tuple[int, str]) -> Outcome:
-    """Return what is left of an effect on the device of a seed."""
-    seed, name = part
-    effect = EFFECTS[name]
-    device = Device(seed, effect)
-    cold = device.tours(SCALE_POSES, COLD, loaded=True)
-    temperature = WARM if effect.slope else COLD
-    warm = device.tours(SCALE_POSES, WARM, loaded=False) if effect.slope else []
-    with patch.object(identification, "possible_extras", lambda rows: ()):
-        before, _ = device.judged(cold, temperature, np.zeros(len(ASSUMED)))
-    return Outcome(seed, name, before, *device.judged(cold + warm, temperature, device.measured))
+def _as_calibrated(found: Identified) -> Tilt:
+    """Return the tilt of an upright trunk as an IMU shows it whose mounting was corrected by what was found."""
+    across, forward, down = Rotation.from_rotvec(mounting_turn(found)[2]).apply(Tilt.of("right").direction)
+    return Tilt.of_gravity("right", (forward, -across, -down))
+
+
+def outcome(seed: int) -> Outcome:
+    """Return what is left on the device of a seed."""
+    device = Device(seed)
+    temperature, warm = COLD, []
+    try:
+        cold = device.tours(SCALE_POSES, COLD, loaded=True)
+        if "warm motors" in device.effects:
+            temperature, warm = WARM, device.tours(SCALE_POSES, WARM, loaded=False)
+        with patch.object(identification, "possible_extras", lambda rows: ()):
+            before, _ = device.judged(cold, temperature, np.zeros(len(ASSUMED)))
+        return Outcome(seed, device.effects, "", before, *device.judged(cold + warm, temperature, device.measured))
+    except (RuntimeError, DataError) as error:
+        return Outcome(seed, device.effects, str(error))
 
 
 def told(found: Outcome) -> str:
     """Return the line of one device."""
+    head = f"device {found.seed}, {', '.join(found.effects) or 'no effect'}"
+    if found.before is None or found.after is None:
+        return f"{head}: {found.trouble}"
     left = f"{found.before.error:.2%} before, {found.after.error:.2%} after"
-    return f"device {found.seed}, {found.effect}: {left}, {found.chosen[0]} springs, {found.chosen[1]} slopes"
+    cover = " ".join(f"{share:.2f}" for share in found.after.cover)
+    return f"{head}: {left}, covered {cover}; {found.chosen[0]} springs, {found.chosen[1]} slopes"
 
 
 def rows_of(found: list[Outcome]) -> list[Row]:
     """Return the table: error of peak (median, 95th percentile, worst) and cover of each joint."""
-    rows = []
+    rows = [Row("devices whose tours gave no result", str(sum(one.after is None for one in found)), "0", True)]
+    groups = {"all devices": found}
     for name in EFFECTS:
-        own = [one for one in found if one.effect == name]
+        groups[name] = [one for one in found if name in one.effects]
+    groups["neither zeros off nor axes askew"] = [one for one in found if not set(OF_GEOMETRY) & set(one.effects)]
+    for name, own in groups.items():
         for when, judged in (("before", [one.before for one in own]), ("after", [one.after for one in own])):
-            error = np.array([one.error for one in judged])
-            cover = " ".join(f"{share:.2f}" for share in np.mean([one.cover for one in judged], axis=0))
+            kept = [one for one in judged if one is not None]
+            if len(kept) < 2:
+                continue
+            error = np.array([one.error for one in kept])
             large = float(np.quantile(error, 0.95))
-            shown = f"{np.median(error):.2%}, {large:.2%}, {error.max():.2%}; covered {cover}"
+            shown = f"{np.median(error):.2%}, {large:.2%}, {error.max():.2%}; covered {_cover(kept)}"
             held = when == "before" or bool(np.median(error) <= MEDIAN and large <= LARGE)
             limit = "" if when == "before" else f"{MEDIAN:.0%}, {LARGE:.1%}"
-            rows.append(Row(f"{name}, {when}: error of peak (median, 95 %, worst)", shown, limit, held))
+            what = f"{name} ({len(kept)}), {when}: error of peak (median, 95 %, worst)"
+            rows.append(Row(what, shown, limit, held))
     return rows
+
+
+def _cover(judged: list[Judged]) -> str:
+    """Return the cover of each joint with its 99 % interval; the poses of a device count as one."""
+    cover = np.array([one.cover for one in judged])
+    mean, wide = cover.mean(axis=0), Z_99 * cover.std(axis=0, ddof=1) / np.sqrt(len(cover))
+    return " ".join(f"{share:.3f}+-{width:.3f}" for share, width in zip(mean, wide, strict=True))
 
 
 def main() -> int:
     """Run the study; return the exit code."""
-    description = "What calibrate leaves of cables, warm motors and elastic joints."
+    description = "What calibrate leaves of effects that the moments do not explain."
     options = options_of("bench.calibration.effects", description, Path("build/calibration_effects"))
-    parts = [(seed, name) for name in EFFECTS for seed in options.seeds]
-    rows = rows_of(play("calibration_effects", outcome, parts, told))
+    rows = rows_of(play("calibration_effects", outcome, options.seeds, told))
     text = f"{as_markdown(rows)}\n"
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
