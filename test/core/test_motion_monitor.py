@@ -49,7 +49,7 @@ def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt
     for _ in range(100):
         theta, tilt = random.uniform(-1.6, 2.5, 4), Tilt.of(side, *random.uniform(-1.5, 1.5, 2))
         lighter = ArmModel.from_moments(ROBOT.length, random.uniform(0.0, 1.0, 4) * ROBOT.first_moment)
-        monitor.follow(tilt)
+        monitor.follow(tilt, None)
         low, high = monitor.explained(theta)
         torque = gravity_torque(lighter, theta, tilt.direction)
         assert np.all(np.array(low) - 1e-3 <= torque) and np.all(torque <= np.array(high) + 1e-3)
