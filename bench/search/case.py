@@ -64,6 +64,8 @@ class Bound(NamedTuple):
 
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
+TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
+SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
 
 
 class Kind(NamedTuple):
@@ -178,8 +180,10 @@ KINDS = {
     "payload_dropped": Kind("wearer", bound=LOAD_LOST),
     "payload_flicked": Kind("wearer", bound=LOAD_LOST),
     "out_of_cuff": Kind("wearer", bound=LOAD_LOST),
-    "imu_wrong": Kind("imu", one_of(pitch=(-0.52, 0.0, 0.52), roll=(-0.52, 0.52), duration=(0.05, 0.2, 2.0))),
-    "imu_creeps": Kind("imu", one_of(pitch=(-3.1, 1.0, 3.1), roll=(0.0,), duration=(0.2, 0.6))),
+    "imu_wrong": Kind(
+        "imu", one_of(pitch=(-0.52, 0.0, 0.52), roll=(-0.52, 0.52), duration=(0.05, 0.2, 2.0)), TILT_JUMPED
+    ),
+    "imu_creeps": Kind("imu", one_of(pitch=(-3.1, 1.0, 3.1), roll=(0.0,), duration=(0.2, 0.6)), TILT_JUMPED),
     "imu_frozen": Kind("imu", lasting(0.1, 5.0)),
     "imu_silent": Kind("imu", lasting(0.05, 2.0)),
     "trunk_falls": Kind("wearer", one_of(bow=(-0.6, 0.8, 1.4), duration=(0.4, 0.8))),
@@ -243,4 +247,5 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     clamped: whether the compensator or the bridge had to clamp a torque.
     """
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
+    bounds += [TILT_CREPT for event in case.events if event.name == "imu_wrong" and event.values["duration"] > SLOWLY]
     return Bound(max(bound.speed for bound in bounds), max(bound.energy for bound in bounds))

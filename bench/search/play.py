@@ -54,7 +54,9 @@ def play_case(case: Case) -> tuple[Played, np.ndarray]:
     stage.arm.bus.close()
     records = stage.truth.records
     was_clamped = stage.controller.was_clamped
-    done = driven(records, [motor.joint.spec for motor in stage.motors])
+    config = stage.device.arm.config
+    stops = config.position_min, config.position_max
+    done = driven(records, [motor.joint.spec for motor in stage.motors], stops)
     return Played(case, done, bound_of(case, was_clamped), tuple(stage.states), begin, error), records
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
 import can
+import numpy as np
 
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
@@ -115,8 +116,8 @@ class FailingController:
 class Stage:
     """The arm of `case`, hanging, with its motors off, and an IMU on the trunk.
 
-    imu_error: rad of pitch and roll that the IMU adds. imu_frozen: the reading that it repeats. imu_silent: whether it
-    sends nothing.
+    imu_error: rad of pitch and roll that the IMU adds, as one that comes loose: its gyroscope agrees. imu_frozen: the
+    reading that it repeats. imu_silent: whether it sends nothing.
     """
 
     def __init__(self, case: Case) -> None:
@@ -142,6 +143,7 @@ class Stage:
         self.arm = VirtualArm(self.device, self.controller, configured.motors, limits, case.rate, self.wire)
         self.safety = self.arm.safety
         self.imu_error = [0.0, 0.0]
+        self._last_error = [0.0, 0.0]  # at the last reading
         self.imu_frozen: TrunkReading | None = None
         self.imu_silent = False
         self.newest_reading: TrunkReading | None = None
@@ -182,8 +184,16 @@ class Stage:
     def _read_imu(self) -> None:
         self.arm.catch_up()
         trunk = self.device.trunk
-        pitch, roll = trunk.pitch + self.imu_error[0], trunk.roll + self.imu_error[1]
-        reading = self.imu_frozen or TrunkReading(gravity_in_trunk(pitch, roll).tolist(), None, trunk.angular_velocity)
+        pitch_rate, roll_rate = np.subtract(self.imu_error, self._last_error) / IMU_PERIOD
+        self._last_error = list(self.imu_error)
+        seen = trunk._replace(
+            pitch=trunk.pitch + self.imu_error[0],
+            roll=trunk.roll + self.imu_error[1],
+            pitch_rate=trunk.pitch_rate + pitch_rate,
+            roll_rate=trunk.roll_rate + roll_rate,
+        )
+        gravity = gravity_in_trunk(seen.pitch, seen.roll).tolist()
+        reading = self.imu_frozen or TrunkReading(gravity, None, seen.angular_velocity)
         self.newest_reading = reading
         if not self.imu_silent:
             taken = self.now

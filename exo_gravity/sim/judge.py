@@ -6,7 +6,8 @@
 Wearers may move the arm as fast as they like. While they touch it, its speed is theirs. Afterwards only the speed that
 a joint gains is judged: by how much it exceeds the least that it has had since. `driven` is the part of it that a motor
 causes, from the moment of release on: the largest such speed of a joint in the direction of its motor's torque. A motor
-that brakes causes none. When the hand lets go and the arm falls, the first HAND_OFF s are the wearer's.
+that brakes causes none. When the hand lets go and the arm falls, the first HAND_OFF s are the wearer's. A stop that a
+joint hits touches the arm, too: one that fell into it at 3 rad/s turned its shoulder at 15.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ MAX_ENERGY = 0.3  # J that one motor may give its joint in one stretch
 MAX_DAMPING = 1.5  # by the rated torque: `max_effort` bounds it by the newest speed, which changes until the next
 SLOW = 0.1  # rad/s, below which a motor that moves a joint does not throw it
 COAST = 0.02  # s for which a motor may stop driving within a stretch: a light arm is thrown and caught by turns
+NEAR = 0.01  # rad before a mechanical stop, at which a joint that is faster than HIT rad/s hits it
+HIT = 0.5
 LITTLE = 0.005  # J, of a stretch: as much as a bare elbow has at 0.8 rad/s
 WEAK = 0.1  # Nm, below which a motor drives nothing: half of a joint's friction
 CODES = 2  # of a command, by which a torque may differ from what is meant
@@ -61,12 +64,17 @@ def resolution(motors: Sequence[MotorSpec] = USUAL) -> float:
     return CODES * 2 * max(motor.torque_range for motor in motors) / 0xFFF
 
 
-def driven(records: np.ndarray, motors: Sequence[MotorSpec] = USUAL) -> Driven:
+def driven(
+    records: np.ndarray,
+    motors: Sequence[MotorSpec] = USUAL,
+    stops: tuple[Sequence[float], Sequence[float]] | None = None,
+) -> Driven:
     """Return what the motors did in these records (sim/truth.py); at least one.
 
     motors: of the joints (n,), by default those of the paper's arm.
+    stops: the lower and upper mechanical stops, (n,) rad each; None if none is hit.
     """
-    is_free, _, gained = _gained(records)
+    is_free, _, gained = _gained(records, stops)
     power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
     power[np.abs(records["torque"]) < WEAK] = 0.0
     is_moved = (power > 0.0) & (gained > SLOW)
@@ -178,9 +186,15 @@ def measure(
     )
 
 
-def _gained(records: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return when no hand was on the arm (n,), and the speed (n, 4) in rad/s gained HAND_OFF s after it and at once."""
+def _gained(
+    records: np.ndarray, stops: tuple[Sequence[float], Sequence[float]] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return when nothing touched the arm (n,), and the speed (n, 4) in rad/s gained HAND_OFF s later and at once."""
     time, touched = records["time"], records["wearer"].any(axis=1)
+    if stops:
+        low, high = stops
+        at_stop = (records["position"] < np.add(low, NEAR)) | (records["position"] > np.subtract(high, NEAR))
+        touched |= (at_stop & (np.abs(records["velocity"]) > HIT)).any(axis=1)
     since = time - np.maximum.accumulate(np.where(touched, time, -np.inf))
     return ~touched, _gained_while(records, since > HAND_OFF), _gained_while(records, since > 0.0)
 

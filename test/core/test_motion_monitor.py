@@ -17,7 +17,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import FaultCode
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.motion_monitor import MotionMonitor
+from exo_gravity.core.safety.motion_monitor import MOTION, MotionMonitor
 
 from ..support.thorough import quick
 
@@ -51,7 +51,7 @@ def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt
     for _ in range(100):
         theta, tilt = random.uniform(-1.6, 2.5, 4), Tilt.of(side, *random.uniform(-1.5, 1.5, 2))
         lighter = ArmModel.from_moments(ROBOT.length, random.uniform(0.0, 1.0, 4) * ROBOT.first_moment)
-        monitor.follow(tilt)
+        monitor.follow(tilt, None)
         low, high = monitor.explained(theta)
         torque = gravity_torque(lighter, theta, tilt.direction)
         assert np.all(np.array(low) - 1e-3 <= torque) and np.all(torque <= np.array(high) + 1e-3)
@@ -83,6 +83,17 @@ def test_a_torque_may_be_as_old_as_its_ride_while_the_wearer_moves() -> None:
         monitor = MotionMonitor(LIMITS)
         faults = [monitor.step(PERIOD, moved, old, age)[1] for _ in range(200)]
         assert any(faults) is is_fault
+
+
+def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some_seconds() -> None:
+    before, lying = Tilt.of("left"), Tilt.of("left", math.radians(80.0), math.radians(-60.0))
+    torque = gravity_torque(ROBOT, RAISED, before.direction)
+    for overtaken, fault_after in ((None, 0.0), (before, MOTION.guided)):
+        monitor, now = MotionMonitor(LIMITS), 0.0
+        monitor.follow(lying, overtaken)
+        while not monitor.step(PERIOD, joints(RAISED), torque)[1]:
+            now += PERIOD
+        assert fault_after <= now + PERIOD < fault_after + 0.2
 
 
 def test_an_impossible_torque_is_passed_on_to_the_check_that_names_it() -> None:

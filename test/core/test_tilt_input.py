@@ -39,6 +39,7 @@ def test_bowed_beyond_90_degrees_lying_and_upside_down_the_torque_is_pinocchios_
         run = CompensatorRun(side=side, use_imu=True)
         efforts = []
         for gravity in (*[circle[0]] * 600, *circle):  # past the ramp
+            run.now += 0.01  # the trunk turns as people turn
             if by_angles:
                 run.compensator.tilt.set_tilt(run.now, *pitch_roll(gravity))
             else:
@@ -149,3 +150,16 @@ def test_noise_and_a_quick_bow_are_accepted():
         noise = random.normal(0.0, 0.02, 2)
         tilt.set_tilt(now, bowed + noise[0], noise[1])
     assert tilt.problem(1.0) == ""
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_tilt_faster_than_people_turn_overtakes_one_that_is_not_for_as_long_as_that_takes(side):
+    tilt, overtaken = TiltInput(side, TIMEOUT), []
+    for k in range(200):
+        angle = min(0.6, 1.5 * TILT.usual * 0.01 * k)
+        tilt.set_gravity(10.0 + 0.01 * k, (0.0, -math.sin(angle), -math.cos(angle)))
+        overtaken.append(tilt.overtaken.roll if tilt.overtaken else None)
+    behind = [k for k, roll in enumerate(overtaken) if roll is not None]
+    expected = 2.0 * TILT.sudden / TILT.usual, (0.6 - TILT.sudden) / TILT.usual  # s
+    assert 0.01 * np.array((behind[0], behind[-1])) == pytest.approx(expected, abs=0.021)
+    assert [overtaken[k] for k in behind] == pytest.approx([TILT.usual * 0.01 * k for k in behind], abs=0.01)

@@ -5,16 +5,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
+from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_arm import TrunkReading
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.copies import prepared
 from ..support.thorough import quick
@@ -95,6 +99,54 @@ def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll)
     carry_again(arm)
     arm.run(6.0)
     assert 0.1 < arm.driven < SAFE_SPEED
+
+
+@prepared
+def carried_with_imu(**given: Any) -> tuple[CompensatedArm, Imu]:
+    """Return a carried arm, and its IMU."""
+    imu = Imu()
+    return CompensatedArm(limit=PEAK, imu=imu, rate=0.5 / CYCLE, **given), imu
+
+
+LOOSE = [({"pose": RAISED, "has_wearer": False, "mode": "one_g"}, 30.0), ({}, 30.0), ({}, 60.0)]
+
+
+@pytest.mark.parametrize(("given", "roll"), quick(LOOSE[:1], LOOSE), ids=["empty, 30 degrees", "worn, 30", "worn, 60"])
+def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll):
+    arm, imu = carried_with_imu(**given)
+    duration, steps = 0.2, 20
+    rate = math.radians(roll) / duration
+    for angle in np.linspace(0.0, math.radians(roll), steps + 1):
+        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist(), None, (rate, 0.0, 0.0))
+        arm.run(duration / steps)
+    imu.reading = imu.reading._replace(angular_velocity=ZERO)
+    arm.run(4.0)
+    assert 0.1 < arm.driven < SAFE_SPEED
+
+
+def sensed(now: float, state: TrunkState) -> TrunkReading:
+    """Return what a perfect IMU reads."""
+    return TrunkReading(gravity_in_trunk(state.pitch, state.roll).tolist(), None, state.angular_velocity)
+
+
+def bow(arm: CompensatedArm, angle: float, duration: float) -> list[bool]:
+    """Let the trunk bow; return in which cycles of these 4 s the motors damped the joints."""
+    arm.device.start(VirtualWearer(TrialScript.parse({"name": "bow", "steps": [{"bow": angle, "over": duration}]})))
+    end, damped = arm.now + 4.0, []
+    while arm.now < end:
+        arm.loop.cycle()
+        damped.append(arm.answer.damped)
+    return damped
+
+
+def test_a_trunk_that_falls_takes_the_arm_along_and_one_that_bows_is_not_felt():
+    arm = CompensatedArm(imu=sensed, rate=0.5 / CYCLE)
+    assert not any(bow(arm, 0.5, 1.0))
+    bow(arm, 0.0, 1.0)
+    arm.forget()
+    assert any(bow(arm, 1.4, 0.8))
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    assert arm.top_speed < 4.0  # where the torque follows at once it is 7.7
 
 
 MODES = [ZERO_G, ONE_G] * 4

@@ -178,6 +178,20 @@ def test_of_a_joint_that_falls_the_motor_gave_only_what_it_adds(records):
     assert driven(records).speed == pytest.approx(1.5, abs=0.01)
 
 
+def test_a_stop_that_an_arm_falls_into_gives_speed_and_a_motor_that_threw_it_there_is_blamed(records):
+    since = records["time"] - FAULT
+    stops = (-1.0,) * 4, (1.0,) * 4
+    records["position"][:, 1] = np.where((since >= 1.99) & (since < 2.0), 1.0, 0.0)
+    records["velocity"][:, 1] = np.where((since >= 1.0) & (since < 2.0), 3.0, 0.0)  # joint 2 falls, and hits its stop,
+    records["torque"][:, 1] = 0.0
+    struck = (since >= 1.99) & (since < 2.2)
+    records["velocity"][struck, 2], records["torque"][struck, 2] = 2.0, 0.3  # which gives joint 3 its speed
+    assert driven(records).speed == pytest.approx(2.0)
+    assert driven(records, stops=stops).speed < 0.1
+    records["torque"][:, 1] = np.where((since >= 1.0) & (since < 1.99), 3.0, 0.0)
+    assert driven(records, stops=stops).speed == pytest.approx(3.0)
+
+
 def test_a_motor_that_throws_and_catches_by_turns_drives_for_the_whole_time(records):
     since = records["time"] - FAULT
     thrown = (since >= 1.0) & (since < 2.0)

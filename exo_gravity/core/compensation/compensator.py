@@ -64,6 +64,7 @@ class Load(NamedTuple):
 
     settings: Settings
     terms: TermsInForce  #: on top of gravity compensation
+    tilt: Tilt | None  #: at which it is carried; None: the newest one
 
 
 class Compensator:
@@ -128,7 +129,7 @@ class Compensator:
         self._follow_request(now)
         if self.settings.payload_mass and velocity:
             self._withdraw_lost_load(now, theta, velocity)
-        before = self._replace_load(self._pending) if self._pending else None
+        before = self._load_before()
         was_replaced = bool(self._fallback)
         gravity = self._law(now, theta)
         if not all(map(math.isfinite, gravity)):
@@ -171,9 +172,16 @@ class Compensator:
         torques = [self.settings.exact.torque(theta, axis) for axis in AXES]
         return max(math.hypot(*components) for components in zip(*torques, strict=True))
 
-    def _replace_load(self, settings: Settings) -> Load:
-        """Use new settings; return what was carried before them."""
-        before = Load(self.settings, self.terms.in_force)
+    def _load_before(self) -> Load | None:
+        """Return what was carried until now if the settings or, suddenly, the tilt have changed; use new settings."""
+        overtaken = self.tilt.overtaken if self.settings.use_imu else None
+        before = Load(self.settings, self.terms.in_force, overtaken)
+        if self._pending:
+            self._use(self._pending)
+            return before
+        return before if overtaken and not self._active_weighing else None
+
+    def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
@@ -181,7 +189,6 @@ class Compensator:
             weighing.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, "the settings changed")
         self.tilt.timeout = settings.tilt_timeout
         self.terms.apply(settings.terms, settings.moving)
-        return before
 
     def _withdraw_lost_load(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> None:
         """Carry a load that has left the hand no longer."""
@@ -222,7 +229,10 @@ class Compensator:
 
     def _torque_of(self, reading: Reading, load: Load) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""
-        torque, _ = self._gravity(load.settings, reading.time, reading.theta)
+        if load.tilt:
+            torque, _ = load.settings.torque(reading.theta, load.tilt, exact=False)
+        else:
+            torque, _ = self._gravity(load.settings, reading.time, reading.theta)
         if reading.velocity:
             torque = tuple(map(operator.add, torque, self.terms.torque_of(load.terms)))
         return clamped(torque, load.settings.max_effort)

@@ -41,6 +41,7 @@ class MotionLimits:
     slow: float = 0.1  #: s, time constant; faster than this, torque changes only with the pose
     patience: float = 0.012  #: s of the full load
     memory: float = 1.0  #: s, time constant
+    guided: float = 5.0  #: s for which the torque may still be on its way to a tilt that came suddenly
 
 
 MOTION = MotionLimits()
@@ -48,8 +49,6 @@ MOTION = MotionLimits()
 
 class MotionMonitor:
     """The unexplained impulse of each joint.
-
-    gravity: (3,) unit vector in the arm's base frame, for an arm with `axes` in its root link's axes; set by `follow`.
 
     limits.largest_moment: (n,) kg m; zeros switch the monitor off.
     impulse: (n,) Nm s. full: (n,) Nm, the largest load.
@@ -60,12 +59,20 @@ class MotionMonitor:
         self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
         self._is_on = any(self._load if self._axes else self._load[1:])
         self.full = tuple(accumulate(self._load[::-1]))[::-1]
-        self.follow(Tilt.of(SIDES[0]))
+        self._guided = 0.0  # s for which the torque may still be on its way from an overtaken tilt
+        self._overtaken = self._down(Tilt.of(SIDES[0]))
+        self.follow(Tilt.of(SIDES[0]), None)
         self.reset()
 
-    def follow(self, tilt: Tilt) -> None:
-        """Take the tilt of the trunk; upright before the first one."""
-        self.gravity: Floats3 = tilt.gravity_in_trunk if self._axes else tilt.direction
+    def follow(self, tilt: Tilt, overtaken: Tilt | None) -> None:
+        """Take the tilt of the trunk; upright before the first one.
+
+        overtaken: from which the torque is guided, if the trunk has turned suddenly (`TiltInput.overtaken`).
+        """
+        self._gravity = self._down(tilt)
+        if overtaken:
+            self._overtaken = self._overtaken if self._guided else self._down(overtaken)
+            self._guided = MOTION.guided
 
     def reset(self) -> None:
         """Forget the past."""
@@ -82,6 +89,7 @@ class MotionMonitor:
         asked = zip(effort, self._limits.max_command, strict=True)
         if not self._is_on or not all(abs(torque) <= most for torque, most in asked):
             return effort, None
+        self._guided = max(0.0, self._guided - dt)
         fastest = max([abs(joint.velocity) for joint in joints])
         lowest, highest = self.explained([joint.position for joint in joints])
         self._slow = self._slow or list(effort)
@@ -111,15 +119,27 @@ class MotionMonitor:
 
         Potential -g sum(M_n u_n), u_n being how far down link n points; torques are its derivatives.
         """
-        parts = self._parts_of_axes(theta) if self._axes else self._parts(theta)
+        lowest, highest = self._range(theta, self._gravity)
+        if self._guided:
+            low, high = self._range(theta, self._overtaken)
+            lowest, highest = tuple(map(min, lowest, low)), tuple(map(max, highest, high))
+        return lowest, highest
+
+    def _down(self, tilt: Tilt) -> Floats3:
+        """Return gravity's unit vector (3,) in the arm's base frame, for an arm with axes in its root link's axes."""
+        return tilt.gravity_in_trunk if self._axes else tilt.direction
+
+    def _range(self, theta: Sequence[float], gravity: Floats3) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the same for one direction of gravity."""
+        parts = self._parts_of_axes(theta, gravity) if self._axes else self._parts(theta, gravity)
         lowest = tuple([MOTION.surplus * sum([min(0.0, torque) for torque in torques]) for torques in parts])
         highest = tuple([MOTION.surplus * sum([max(0.0, torque) for torque in torques]) for torques in parts])
         return lowest, highest
 
-    def _parts(self, theta: Sequence[float]) -> Sequence[Sequence[float]]:
+    def _parts(self, theta: Sequence[float], gravity: Floats3) -> Sequence[Sequence[float]]:
         """Return the torque of each joint of the paper's arm by the moment of each link from its own on."""
         one, two, three, four = theta
-        x, y, z = self.gravity
+        x, y, z = gravity
         s1, c1, s2, c2 = math.sin(one), math.cos(one), math.sin(two), math.cos(two)
         s3, c3, s4, c4 = math.sin(three), math.cos(three), math.sin(three + four), math.cos(three + four)
         out, ahead = c1 * x + s1 * y, c1 * y - s1 * x  # gravity outwards along link 1, and forwards
@@ -133,11 +153,11 @@ class MotionMonitor:
             (turn4,),
         )
 
-    def _parts_of_axes(self, theta: Sequence[float]) -> Sequence[Sequence[float]]:
+    def _parts_of_axes(self, theta: Sequence[float], gravity: Floats3) -> Sequence[Sequence[float]]:
         """Return the same of any arm: the axis turned by the joints before, the link by its own joint, too."""
         turn, levers, moments = NO_TURN, list[Floats3](), list[Floats3]()
         for angle, axis, way, load in zip(theta, self._axes, self._ways, self._load, strict=True):
-            levers.append(cross(rotated(turn, axis), self.gravity))
+            levers.append(cross(rotated(turn, axis), gravity))
             half = math.sin(angle / 2.0)
             turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
             x, y, z = rotated(turn, way)

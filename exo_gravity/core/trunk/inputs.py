@@ -38,6 +38,10 @@ class TiltLimits:
     #: rad, by which a tilt may deviate from a reference direction that follows the tilts no faster than `speed`. Noise
     #: stays within it; neither a jump nor many small ones in a row do
     jump: float = 0.1
+    #: rad/s, from which on a turn is sudden: faster than a bow of 30 degrees in a second. A fall is, and an IMU that
+    #: comes loose: the torque follows as a guided motion,
+    usual: float = 0.75
+    sudden: float = 0.05  #: rad, once the tilt is so far ahead of one that turns no faster
     #: s by which a stamp may be ahead of our clock: /clock comes in steps, hosts differ by ms. A clock that goes fast
     #: gets further ahead, which shows only that: no sample arrives before it was taken. So a lead is added to all ages,
     lead: float = 0.05
@@ -73,6 +77,9 @@ class TiltInput:
         self._arrival = -math.inf
         self._lead = 0.0  # s, of the stamps
         self._reference = self._tilt.direction  # (3,), follows the tilts no faster than a trunk tilts
+        self._usual = self._reference  # (3,), the same no faster than people usually turn
+        #: the tilt of a trunk that turns no faster, while the newest one is far ahead of it; else None
+        self.overtaken: Tilt | None = None
         self._vector_arrival = -math.inf  # of a gravity vector, accepted or not
         self._refusal = ""  # why the newest one was refused; contains no measured value
 
@@ -100,8 +107,7 @@ class TiltInput:
             return self._tilt
         lead *= min(1.0, TILT.speed / rate)
         # A vector at rest in the world turns in the axes of a body by -w: g' = g x w.
-        b, a, c = self._tilt.direction  # in the arm's base frame, whose right one is mirrored
-        b, c = (b if self._side == "left" else -b), -c
+        a, b, c = self._in_trunk(self._tilt.direction)
         x, y, z = self._angular_velocity
         turned = a + lead * (b * z - c * y), b + lead * (c * x - a * z), c + lead * (a * y - b * x)
         return Tilt.of_gravity(self._side, turned)
@@ -151,17 +157,33 @@ class TiltInput:
         lead = max(lead, -age)
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
-        way, reach = angle_between(tilt.direction, self._reference), TILT.speed * max(0.0, measured - self._time)
-        if way > TILT.jump + reach:
+        elapsed = max(0.0, measured - self._time)
+        reference, way = _followed(self._reference, tilt.direction, TILT.speed * elapsed)
+        if way > TILT.jump:
             expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last ones"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
-        share = 1.0 if way <= reach else reach / way
-        x, y, z = (old + share * (new - old) for new, old in zip(tilt.direction, self._reference, strict=True))
-        self._reference = x, y, z
+        self._reference = reference
+        self._usual, ahead = _followed(self._usual, tilt.direction, TILT.usual * elapsed)
+        is_sudden = ahead > TILT.sudden
+        self.overtaken = Tilt.of_gravity(self._side, self._in_trunk(self._usual)) if is_sudden else None
         self._tilt, self._angular_velocity = tilt, angular_velocity
         self._time, self._arrival, self._lead, self._refusal = measured, now, lead, ""
         if now - measured <= self.timeout:
             self._in_time = measured
+
+    def _in_trunk(self, direction: Floats3) -> Floats3:
+        """Return in the trunk's axes what is in the arm's base frame, whose right one is mirrored."""
+        b, a, c = direction
+        return a, b if self._side == "left" else -b, -c
+
+
+def _followed(reference: Floats3, direction: Floats3, reach: float) -> tuple[Floats3, float]:
+    """Return `reference` turned towards `direction` by `reach` rad at most, both (3,), and the rad that are left."""
+    way = angle_between(direction, reference)
+    share = 1.0 if way <= reach else reach / way
+    x, y, z = (old + share * (new - old) for new, old in zip(direction, reference, strict=True))
+    norm = math.hypot(x, y, z) or 1.0
+    return (x / norm, y / norm, z / norm), (1.0 - share) * way
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None]) -> N
 
     def pass_on(now: float) -> None:
         if loop := get_loop():
-            loop.safety.motion.follow(tilt.at(now))
+            loop.safety.motion.follow(tilt.at(now), tilt.overtaken)
 
     TiltSubscription(node, tilt, threading.Lock(), on_tilt=pass_on)
 
