@@ -12,7 +12,6 @@ from __future__ import annotations
 import copy
 import math
 import os
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -39,6 +38,7 @@ from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
+from exo_gravity.hardware.urdf_tree import Frames, JointTree
 
 PACKAGE = "package://"
 # The compensator's parameters.
@@ -46,7 +46,6 @@ MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for w
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
-INERTIAL = 10  # parameters of a link in Pinocchio's regressor: mass, first moment, inertia
 Base = Sequence[tuple[int, np.ndarray]]
 
 
@@ -128,18 +127,17 @@ class UrdfArm:
             links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
             raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
         self._joints = [self._model.getJointId(name) for name in names]
+        self._numbers = [joint - 1 for joint in self._joints]  # in the tree, which has no joint of the root link
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self._held = Held()
         self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
         self._turn = np.zeros((len(names), 3))  # rad, likewise
-        self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
         self._identity = text, tuple(names)
         self._bare = self._by_mass = self._model  # without load and wearer
         self._data = self._model.createData()
-        self._pin.computeSubtreeMasses(self._model, self._data)
-        self._own_mass = max(self._data.mass[joint] for joint in self._joints)
+        self._own_mass = max(self._tree.masses[self._numbers].tolist())
         if not self._own_mass > 0.0:
             raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
         self.max_effort, unused = usable_efforts(self._moves)
@@ -224,9 +222,7 @@ class UrdfArm:
         direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
         """
         x, y, z = np.transpose(direction)
-        felt = self.gravity * np.transpose((y, x, -z))
-        pairs = zip(np.asarray(theta), felt, strict=True)
-        return np.array([self._holding(pose, own, ZERO) for pose, own in pairs])
+        return self.gain * self._torques(np.asarray(theta), self.gravity * np.transpose((y, x, -z)))
 
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.
@@ -324,8 +320,8 @@ class UrdfArm:
         for n, joint in enumerate(self._joints):
             if self._bare.inertias[joint].mass:
                 across += [(n, way) for way in self._across(n)]
-        columns = np.concatenate([self._columns(*one, across) for one in self._sampled(0)])
-        size = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
+        rows = self._rows(*self._sampled(0), across).reshape(-1, len(across))
+        size = np.abs(np.diag(np.linalg.qr(rows, mode="r")))
         return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
 
     def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -333,16 +329,14 @@ class UrdfArm:
 
         theta: (m, n) rad. direction: (3,) or (m, 3), gravity's unit vector in the root link's axes. Gains do not count.
         """
-        down = np.broadcast_to(direction, (len(theta), 3))
-        return np.array([self._columns(*one, self.base) for one in zip(theta, self.gravity * down, strict=True)])
+        return self._rows(theta, self.gravity * np.broadcast_to(direction, (len(theta), 3)), self.base)
 
     @property
     def moments(self) -> np.ndarray:
         """The moments (k,) in kg m of `base`, of all that the arm holds."""
         sampled = self._sampled(1)
-        columns = [self._columns(*one, self.base) for one in sampled]
-        torque = [np.divide(self._holding(pose.tolist(), way.tolist(), ZERO), self.gain) for pose, way in sampled]
-        return np.asarray(np.linalg.lstsq(np.concatenate(columns), np.concatenate(torque), rcond=None)[0])
+        rows, torque = self._rows(*sampled, self.base), self._torques(*sampled)
+        return np.asarray(np.linalg.lstsq(rows.reshape(-1, rows.shape[-1]), torque.ravel(), rcond=None)[0])
 
     def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
         """Return this arm with `moments` (k,) kg m of `base` added to those of the robot. Raises ParameterError."""
@@ -351,39 +345,28 @@ class UrdfArm:
             change[n] += more * way
         return self.corrected(change)
 
-    @cached_property
+    @property
     def _axes(self) -> np.ndarray:
         """The joints' axes (n, 3) in their own frames."""
-        pin, model = self._pin, self._bare
-        pin.computeJointJacobians(model, self._data, pin.neutral(model))
-        own, axes = pin.ReferenceFrame.LOCAL, []
-        for joint in self._joints:
-            jacobian = np.reshape(pin.getJointJacobian(model, self._data, joint, own), (6, -1))
-            axes.append(jacobian[3:, model.joints[joint].idx_v].copy())
-        return np.array(axes)
+        return self._tree.axes[self._numbers]
 
     @cached_property
     def turns(self) -> np.ndarray:
         """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
         return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
 
-    def frames(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the joints' frames are turned at `theta` (n,) rad, (n, 3, 3) to the root link's axes.
+    def frames(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how the joints' frames are turned at `theta` (m, n) rad, (m, n, 3, 3) to the root link's axes.
 
         First as they would be with the joint itself at 0, then as they are.
         """
-        with self._lock:
-            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
-            parents = [self._data.oMi[self._model.parents[joint]].rotation for joint in self._joints]
-            after = np.array([self._data.oMi[joint].rotation for joint in self._joints])
-        places = [self._model.jointPlacements[joint].rotation for joint in self._joints]
-        return np.array(parents) @ np.array(places), after
+        before, after, _ = self._frames(theta)
+        return before, after
 
     @property
     def moved_by(self) -> np.ndarray:
         """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
-        supports = [set(self._model.supports[joint].tolist()) for joint in self._joints]
-        return np.array([[joint in support for support in supports] for joint in self._joints])
+        return self._tree.moves[np.ix_(self._numbers, self._numbers)]
 
     def _across(self, n: int) -> np.ndarray:
         """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
@@ -395,24 +378,23 @@ class UrdfArm:
         The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
         vectors (n, 3) across them, as far as possible along the links.
         """
-        own, along = self._axes, []  # before the places, because it moves the joints
-        origins = self.places(theta)
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        own, along = self._axes, []
         for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
             across = way - axis * (axis @ way)
             size = float(np.linalg.norm(across))
             along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
+        poses = np.array([theta])
+        turns = self.frames(poses)[1][0]
         axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
-        return origins, axes, links
+        return self.places(poses)[0], axes, links
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
 
         While all angles are 0, in the root link's axes.
         """
-        self.places([0.0] * len(self.names))
         links = [self._bare.inertias[joint] for joint in self._joints]
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        turns = self.frames(np.zeros((1, len(links))))[1][0]
         centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
         return np.array([link.mass for link in links]), np.array(centres)
 
@@ -421,45 +403,48 @@ class UrdfArm:
         parents = [self._model.parents[joint] for joint in self._joints]
         if not self.moves_alone or parents[1:] != self._joints[:-1]:
             return None
-        self.places([0.0] * len(self.names))
-        self._pin.computeSubtreeMasses(self._model, self._data)
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
+        turns, carried = self.frames(np.zeros((1, len(parents))))[1][0], self._tree.masses[self._numbers]
         ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
         for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
             link = self._model.inertias[joint]
             own = link.mass * link.lever
-            beyond = length * (self._data.mass[joint] - link.mass)
+            beyond = length * (carried[n] - link.mass)
             moments[n] = max(0.0, float(own @ way) + beyond) if np.any(way) else 0.0
             beside[n] = np.linalg.norm(own + beyond * ways[n] - moments[n] * ways[n])
         axes = np.einsum("nab,nb->na", turns, self._axes)
         return Skeleton(axes, np.einsum("nab,nb->na", turns, ways), moments, np.cumsum(beside[::-1])[::-1])
 
-    def places(self, theta: Sequence[float]) -> np.ndarray:
-        """Return where the joints are at `theta` (n,) rad, and the hand or the last joint again: (n + 1, 3) m.
+    def places(self, theta: np.ndarray) -> np.ndarray:
+        """Return where the joints are at `theta` (m, n) rad, and the hand or the last joint again: (m, n + 1, 3) m.
 
         In the root link's axes.
         """
-        with self._lock:
-            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
-            frames = [self._data.oMi[joint] for joint in self._joints]
-            return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
+        _, after, origins = self._frames(theta)
+        return np.concatenate((origins, origins[:, -1:] + after[:, -1:] @ self._along[-1]), axis=1)
 
-    def _sampled(self, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return poses (n,) rad at random, each with a vector (3,) of gravity in m/s^2."""
+    @cached_property
+    def _tree(self) -> JointTree:
+        """The joints with all that the arm holds."""
+        return JointTree(self._pin, self._model)
+
+    def _frames(self, theta: np.ndarray) -> Frames:
+        """Return the frames of the arm's joints at `theta` (m, n) rad."""
+        return Frames(*(part[:, self._numbers] for part in self._tree.frames(self._moves.positions(theta))))
+
+    def _torques(self, theta: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n) in Nm, gains of 1, at `theta` (m, n) rad. gravity: (m, 3) m/s^2 in root axes."""
+        return self._moves.folded(self._tree.torques(self._moves.positions(theta), gravity).T).T
+
+    def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
+        """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
+        links, ways = [self._numbers[n] for n, _ in base], np.array([way for _, way in base])
+        return self._moves.folded(self._tree.rows(self._moves.positions(theta), gravity, links, ways))
+
+    def _sampled(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses (m, n) in rad at random, each with a vector of gravity (m, 3) in m/s^2."""
         random = np.random.default_rng(seed)
         poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
-        return list(zip(poses, random.normal(size=(BASE_POSES, 3)), strict=True))
-
-    def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
-        """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""
-        model, data, compute = self._bare, self._data, self._pin.computeJointTorqueRegressor
-        at, still = self._moves.configuration(theta.tolist()), np.zeros(model.nv)
-        with self._lock:
-            model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
-            whole = compute(model, data, at, still, still)
-            parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
-        moments = parts.reshape(len(self.names), -1, INERTIAL)[:, :, 1:4]
-        return np.stack([moments[:, self._joints[n] - 1] @ way for n, way in base], axis=-1)
+        return poses, random.normal(size=(BASE_POSES, 3))
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
@@ -499,7 +484,7 @@ class UrdfArm:
 
     def _anew(self) -> UrdfArm:
         """Forget what was computed for the arm that this is a copy of."""
-        for name in ("scale", "links"):
+        for name in ("scale", "links", "_tree"):
             self.__dict__.pop(name, None)
         self._data = self._model.createData()
         return self
@@ -527,18 +512,13 @@ class UrdfArm:
 
     def _ways(self) -> list[np.ndarray]:
         """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
-        pin, model = self._pin, self._model
-        pin.forwardKinematics(model, self._data, pin.neutral(model))
-        pin.updateFramePlacements(model, self._data)
-        places = self._data.oMi
-        ways = []
+        model, ways = self._model, []
+        hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
         for joint in self._joints:
             following = [other for other in self._joints if model.parents[other] == joint]
             if len(following) == 1:
-                ways.append(places[joint].actInv(places[following[0]].translation))
-                continue
-            hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
-            if hand is not None and hand.parentJoint == joint:
+                ways.append(model.jointPlacements[following[0]].translation.copy())
+            elif hand is not None and hand.parentJoint == joint:
                 ways.append(hand.placement.translation.copy())
             else:
                 ways.append(np.zeros(3))
