@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-BLOCK = 2048  # poses at once: what is computed on the way stays in the processor's cache
+BLOCK = 4096  # poses at once: what is computed on the way stays in the processor's cache
 
 
 class TreeJoint(NamedTuple):
@@ -46,6 +46,9 @@ class JointTree:
 
     def __init__(self, pin: Any, model: Any) -> None:
         self._joints = tuple(_joints(pin, model))
+        self._slides = np.array([joint.slides for joint in self._joints])
+        across = _across(np.where(self._slides[:, None], 0.0, self.axes))
+        self._across, self._twice_across = across, across @ across  # of Rodrigues' formula
 
     @property
     def masses(self) -> np.ndarray:
@@ -68,19 +71,18 @@ class JointTree:
 
     def frames(self, positions: np.ndarray) -> Frames:
         """Return the joints' frames for their positions (m, nv) in rad or m."""
-        size = (len(positions), len(self._joints))
-        before, after, origin = np.empty((*size, 3, 3)), np.empty((*size, 3, 3)), np.empty((*size, 3))
-        for n, (joint, position) in enumerate(zip(self._joints, positions.T, strict=True)):
-            if joint.parent < 0:
-                before[:, n], origin[:, n] = joint.turn, joint.place
-            else:
-                before[:, n] = after[:, joint.parent] @ joint.turn
-                origin[:, n] = origin[:, joint.parent] + after[:, joint.parent] @ joint.place
+        sine, cosine = np.sin(positions)[:, :, None, None], np.cos(positions)[:, :, None, None]
+        turns = np.eye(3) + sine * self._across + (1.0 - cosine) * self._twice_across
+        before, after, origin = np.empty_like(turns), np.empty_like(turns), np.empty((*positions.shape, 3))
+        for n, joint in enumerate(self._joints):
+            before[:, n], origin[:, n] = joint.turn, joint.place
+            if joint.parent >= 0:
+                parent = after[:, joint.parent]
+                before[:, n] = parent @ joint.turn
+                origin[:, n] = origin[:, joint.parent] + parent @ joint.place
             if joint.slides:
-                after[:, n] = before[:, n]
-                origin[:, n] += before[:, n] @ joint.axis * position[:, None]
-            else:
-                after[:, n] = before[:, n] @ _turns(joint.axis, position)
+                origin[:, n] += before[:, n] @ joint.axis * positions[:, n, None]
+            after[:, n] = before[:, n] @ turns[:, n]
         return Frames(before, after, origin)
 
     def torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
@@ -102,46 +104,55 @@ class JointTree:
         ways: (k, 3) unit vectors along the moments, in these joints' own frames.
         """
         turned = self.frames(positions).after
-        axes = np.where([[joint.slides] for joint in self._joints], 0.0, self.axes)  # no force of theirs shows a moment
-        levers = np.cross(np.einsum("mnab,nb->mna", turned, axes), gravity[:, None])
-        moments = np.einsum("mkab,kb->mka", turned[:, links], ways)
-        return np.asarray(np.einsum("mna,mka->mnk", levers, moments) * self.moves[:, links])
+        axes = np.where(self._slides[:, None], 0.0, self.axes)  # the force of one that slides shows no moment
+        levers = (turned @ axes[:, :, None])[..., 0] @ _across(gravity)  # axis x gravity
+        moments = (turned[:, links] @ ways[:, :, None])[..., 0]
+        return np.asarray(levers @ moments.swapaxes(1, 2) * self.moves[:, links])
 
     def _torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         """Return the torques (nv, m). positions: (nv, m). gravity: (3, m)."""
-        sine, cosine = np.sin(positions), np.cos(positions)
+        sine, cosine = _sine_and_cosine(positions)
         felt = np.empty((len(positions), *gravity.shape))  # gravity in the frames about the axes
         for n, joint in enumerate(self._joints):
             own = joint.outwards @ (gravity if joint.parent < 0 else felt[joint.parent])
-            felt[n] = own if joint.slides else _about_z(own, cosine[n], -sine[n])
-        moment = np.empty_like(felt)
-        moment[:] = [joint.moment[:, None] for joint in self._joints]
+            if joint.slides:
+                felt[n] = own
+            else:
+                _turn_about_z(own, cosine[n], -sine[n], felt[n])
+        moment = [np.repeat(joint.moment[:, None], positions.shape[1], axis=1) for joint in self._joints]
         torque = np.empty_like(positions)
         for n in reversed(range(len(positions))):
-            joint, own, down = self._joints[n], moment[n], felt[n]
+            joint, own, down = self._joints[n], moment.pop(), felt[n]
             if joint.slides:
                 torque[n] = -joint.mass * down[2]
                 own[2] += joint.mass * positions[n]
             else:
-                torque[n] = own[1] * down[0] - own[0] * down[1]
-                own = _about_z(own, cosine[n], sine[n])
+                np.subtract(own[1] * down[0], own[0] * down[1], out=torque[n])
+                _turn_about_z(own, cosine[n], sine[n], own)
             if joint.parent >= 0:
                 moment[joint.parent] += joint.outwards.T @ own
         return torque
 
 
-def _about_z(vectors: np.ndarray, cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """Return vectors (3, m) turned about the z axis."""
+def _sine_and_cosine(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both by the tangent of half the angle, as `core.arm.gravity` does: they take most of the time."""
+    tangent = np.tan(0.5 * angle)
+    one_plus_cosine = 2.0 / (1.0 + tangent * tangent)
+    return tangent * one_plus_cosine, one_plus_cosine - 1.0
+
+
+def _turn_about_z(vectors: np.ndarray, cosine: np.ndarray, sine: np.ndarray, out: np.ndarray) -> None:
+    """Write vectors (3, m) turned about the z axis to `out`, which may be the same."""
     x, y, z = vectors
-    return np.stack((cosine * x - sine * y, sine * x + cosine * y, z))
+    turned = sine * x + cosine * y
+    np.subtract(cosine * x, sine * y, out=out[0])
+    out[1], out[2] = turned, z
 
 
-def _turns(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Return the rotations (m, 3, 3) about `axis` (3,) by `angle` (m,) in rad, by Rodrigues' formula."""
-    x, y, z = axis
-    across = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * across + (1.0 - cosine) * (across @ across))
+def _across(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices (m, 3, 3) that multiply by `vectors` (m, 3) crosswise, from the left."""
+    x, y, z = vectors.T
+    return np.array([(0.0 * x, -z, y), (z, 0.0 * x, -x), (-y, x, 0.0 * x)]).transpose(2, 0, 1)
 
 
 def _joints(pin: Any, model: Any) -> Iterator[TreeJoint]:
