@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,17 +33,16 @@ from exo_gravity.core.arm.arm import (
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import ParameterError, with_extra
-from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
-from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import Vector, floats, one_float
+from exo_gravity.hardware.urdf_checks import check_masses, usable_efforts
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
-from exo_gravity.hardware.urdf_tree import Frames, JointTree
+from exo_gravity.hardware.urdf_shape import LEAST_LENGTH, UrdfShape
 
 PACKAGE = "package://"
 # The compensator's parameters.
 MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for what in ("moment", "turn"))
-LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
 Base = Sequence[tuple[int, np.ndarray]]
@@ -92,16 +91,7 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
     return arm_from(values, read_urdf(values["urdf.file"]))
 
 
-class Skeleton(NamedTuple):
-    """What `can_bridge` needs to compute the gravity of an arm of n joints itself, in the root link's axes."""
-
-    axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
-    ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
-    moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, the most by which masses beside the links load each joint in any pose
-
-
-class UrdfArm:
+class UrdfArm(UrdfShape):
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
     It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm.
@@ -114,37 +104,25 @@ class UrdfArm:
 
     max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
     notes: sentences on what is doubtful in the URDF, for the log.
-    length: (n,) m from each joint to the next one, and from the last one to the hand; 0 if there is no hand.
     """
 
     def __init__(self, text: str, joint_names: Sequence[str], hand: str = "", rotors: Sequence[float] = ()) -> None:
-        self._pin, names = _pinocchio(), list(joint_names)
-        if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
-            raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
-        self._moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
-        self._model = self._moves.model
-        if hand and not self._model.existBodyName(hand):
-            links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
-            raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
-        self._joints = [self._model.getJointId(name) for name in names]
-        self._numbers = [joint - 1 for joint in self._joints]  # in the tree, which has no joint of the root link
+        super().__init__(text, joint_names, hand)
+        names = self.names
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self._held = Held()
-        self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
         self._turn = np.zeros((len(names), 3))  # rad, likewise
-        self._identity = text, tuple(names)
-        self._bare = self._by_mass = self._model  # without load and wearer
+        self._identity = text, names
+        self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
         self._own_mass = max(self._tree.masses[self._numbers].tolist())
         if not self._own_mass > 0.0:
             raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
-        self._along = self._ways()
         self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
-        self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UrdfArm) and self._key == other._key
@@ -278,12 +256,6 @@ class UrdfArm:
         return self._with(replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
 
     @property
-    def directions(self) -> np.ndarray:
-        """Unit vectors (n, 3) along the links in their joints' frames, zeros for one without length."""
-        length = np.array(self.length)[:, None]
-        return np.divide(self._along, length, out=np.zeros((len(length), 3)), where=length >= LEAST_LENGTH)
-
-    @property
     def change(self) -> np.ndarray:
         """By what `corrected` changed the moments, (n, 3) kg m."""
         return self._change
@@ -292,21 +264,6 @@ class UrdfArm:
     def turn(self) -> np.ndarray:
         """By what `turned` turned the joints' places, (n, 3) rad."""
         return self._turn
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The joints (n,)."""
-        return self._moves.names
-
-    @property
-    def moves_alone(self) -> bool:
-        """Whether the links move with the arm's joints alone, and no joint follows another one."""
-        return len(self._joints) == self._bare.njoints - 1
-
-    @cached_property
-    def ranges(self) -> np.ndarray:
-        """The joints' limits in the URDF, (2, n) rad."""
-        return np.transpose([self._moves.limits(name) for name in self.names])
 
     @cached_property
     def base(self) -> tuple[tuple[int, np.ndarray], ...]:
@@ -344,92 +301,6 @@ class UrdfArm:
         for (n, way), more in zip(self.base, moments, strict=True):
             change[n] += more * way
         return self.corrected(change)
-
-    @property
-    def _axes(self) -> np.ndarray:
-        """The joints' axes (n, 3) in their own frames."""
-        return self._tree.axes[self._numbers]
-
-    @cached_property
-    def turns(self) -> np.ndarray:
-        """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
-        return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
-
-    def frames(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the joints' frames are turned at `theta` (m, n) rad, (m, n, 3, 3) to the root link's axes.
-
-        First as they would be with the joint itself at 0, then as they are.
-        """
-        before, after, _ = self._frames(theta)
-        return before, after
-
-    @property
-    def moved_by(self) -> np.ndarray:
-        """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
-        return self._tree.moves[np.ix_(self._numbers, self._numbers)]
-
-    def _across(self, n: int) -> np.ndarray:
-        """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
-        return np.asarray(np.linalg.svd(self._axes[n][None])[2][1:])
-
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad, in the root link's axes.
-
-        The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
-        vectors (n, 3) across them, as far as possible along the links.
-        """
-        own, along = self._axes, []
-        for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
-            across = way - axis * (axis @ way)
-            size = float(np.linalg.norm(across))
-            along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
-        poses = np.array([theta])
-        turns = self.frames(poses)[1][0]
-        axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
-        return self.places(poses)[0], axes, links
-
-    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
-
-        While all angles are 0, in the root link's axes.
-        """
-        links = [self._bare.inertias[joint] for joint in self._joints]
-        turns = self.frames(np.zeros((1, len(links))))[1][0]
-        centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
-        return np.array([link.mass for link in links]), np.array(centres)
-
-    def skeleton(self) -> Skeleton | None:
-        """Return axes, links and largest moments of all that the arm holds; None if its joints are no single chain."""
-        parents = [self._model.parents[joint] for joint in self._joints]
-        if not self.moves_alone or parents[1:] != self._joints[:-1]:
-            return None
-        turns, carried = self.frames(np.zeros((1, len(parents))))[1][0], self._tree.masses[self._numbers]
-        ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
-        for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
-            link = self._model.inertias[joint]
-            own = link.mass * link.lever
-            beyond = length * (carried[n] - link.mass)
-            moments[n] = max(0.0, float(own @ way) + beyond) if np.any(way) else 0.0
-            beside[n] = np.linalg.norm(own + beyond * ways[n] - moments[n] * ways[n])
-        axes = np.einsum("nab,nb->na", turns, self._axes)
-        return Skeleton(axes, np.einsum("nab,nb->na", turns, ways), moments, np.cumsum(beside[::-1])[::-1])
-
-    def places(self, theta: np.ndarray) -> np.ndarray:
-        """Return where the joints are at `theta` (m, n) rad, and the hand or the last joint again: (m, n + 1, 3) m.
-
-        In the root link's axes.
-        """
-        _, after, origins = self._frames(theta)
-        return np.concatenate((origins, origins[:, -1:] + after[:, -1:] @ self._along[-1]), axis=1)
-
-    @cached_property
-    def _tree(self) -> JointTree:
-        """The joints with all that the arm holds."""
-        return JointTree(self._pin, self._model)
-
-    def _frames(self, theta: np.ndarray) -> Frames:
-        """Return the frames of the arm's joints at `theta` (m, n) rad."""
-        return Frames(*(part[:, self._numbers] for part in self._tree.frames(self._moves.positions(theta))))
 
     def _torques(self, theta: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         """Return the torque (m, n) in Nm, gains of 1, at `theta` (m, n) rad. gravity: (m, 3) m/s^2 in root axes."""
@@ -509,25 +380,3 @@ class UrdfArm:
         model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
         torque = self._pin.computeGeneralizedGravity(model, self._data, self._moves.configuration(theta))
         return tuple((self.gain * self._moves.folded(torque)).tolist())
-
-    def _ways(self) -> list[np.ndarray]:
-        """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
-        model, ways = self._model, []
-        hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
-        for joint in self._joints:
-            following = [other for other in self._joints if model.parents[other] == joint]
-            if len(following) == 1:
-                ways.append(model.jointPlacements[following[0]].translation.copy())
-            elif hand is not None and hand.parentJoint == joint:
-                ways.append(hand.placement.translation.copy())
-            else:
-                ways.append(np.zeros(3))
-        return ways
-
-
-def _pinocchio() -> Any:
-    try:
-        import pinocchio
-    except ImportError:
-        raise ParameterError("law", "urdf", f"used with Pinocchio: {with_extra('urdf')}") from None
-    return pinocchio
