@@ -13,11 +13,10 @@ import sys
 import time
 
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import Drive, Send
-from exo_gravity.core.safety.power import SwitchingOn
+from exo_gravity.core.safety.drive import Drive
 from exo_gravity.hardware.clock import favour
 
-from .direct_arm import DirectArm, run_paced
+from .direct_arm import DirectArm, Starting, run_paced
 
 
 def main() -> None:
@@ -29,14 +28,14 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: stopping.append(True))
     favour(20)
     bus = arm.open()
-    switching = SwitchingOn(bus.replies)
+    starting = Starting(bus.replies)
 
     def cycle() -> None:
         now = time.monotonic()
-        all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
+        all_replied = UNKNOWN not in bus.samples
         effort = arm.law([joint.position for joint in bus.samples]) if all_replied else arm.no_torque
-        send = switching.step() if all_replied else (Send.POLL,) * len(bus.replies)
-        bus.exchange(Drive(effort, arm.no_torque, send, all_replied), now + REPLY_SHARE * period)
+        drive = Drive(effort, arm.no_torque, starting.send, all_replied)
+        starting.note(bus.exchange(drive, now + REPLY_SHARE * period))
 
     try:
         run_paced(period, cycle, stopping)

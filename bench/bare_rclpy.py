@@ -23,12 +23,11 @@ from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, UNKNOWN
-from exo_gravity.core.safety.drive import Drive, Send
-from exo_gravity.core.safety.power import SwitchingOn
+from exo_gravity.core.safety.drive import Drive
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine
 
-from .direct_arm import DirectArm, run_paced
+from .direct_arm import DirectArm, Starting, run_paced
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
@@ -36,7 +35,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool]) -> threading.Thread:
     """Return the thread that commands the motors and publishes what they reply."""
     bus, newest = arm.open(), {"effort": arm.no_torque}
-    switching = SwitchingOn(bus.replies)
+    starting = Starting(bus.replies)
 
     def on_effort_commands(message: JointState) -> None:
         newest["effort"] = tuple(message.effort)
@@ -45,14 +44,9 @@ def bridge_thread(node: Node, arm: DirectArm, period: float, stopping: list[bool
     node.create_subscription(JointState, "effort_commands", on_effort_commands, 1)
 
     def cycle() -> None:
-        all_replied = UNKNOWN not in bus.samples  # an ENTER sent earlier might be lost
-        drive = Drive(
-            newest["effort"],
-            arm.no_torque,
-            switching.step() if all_replied else (Send.POLL,) * len(bus.replies),
-            all_replied,
-        )
-        bus.exchange(drive, time.monotonic() + REPLY_SHARE * period)
+        all_replied = UNKNOWN not in bus.samples
+        drive = Drive(newest["effort"], arm.no_torque, starting.send, all_replied)
+        starting.note(bus.exchange(drive, time.monotonic() + REPLY_SHARE * period))
         if all_replied:
             position, velocity, effort, *_ = zip(*bus.samples, strict=True)
             message = JointState(name=arm.joint_names, position=position, velocity=velocity, effort=effort)

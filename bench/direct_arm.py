@@ -10,11 +10,15 @@ from pathlib import Path
 
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.safety.drive import Send
+from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
+
+REPLIES = 2  # to a frame that switches a motor on; the first one may be late, and answer the frame before
 
 
 class DirectArm:
@@ -44,6 +48,28 @@ class DirectArm:
     def open(self) -> MotorBus:
         """Open the bus."""
         return MotorBus(self._on_bus.ports(COMPUTER_CLOCK), self.motors)
+
+
+class Starting:
+    """Switches the motors of an arm on, as `SwitchingOn` does. Each step is repeated until all motors have replied.
+
+    replies: (n,) whether a motor's board replies to commands.
+
+    send: what each motor (n,) is sent in the next cycle. At first they are polled, until all are known.
+    """
+
+    def __init__(self, replies: Sequence[bool]) -> None:
+        self.send: tuple[Send, ...] = (Send.POLL,) * len(replies)
+        self._switching = SwitchingOn(replies)
+        self._replies = 0
+
+    def note(self, is_complete: bool) -> None:
+        """Note whether all motors have replied to what they were sent."""
+        if self._switching.done:
+            return
+        self._replies += is_complete
+        if self._replies == REPLIES:
+            self.send, self._replies = self._switching.step(), 0
 
 
 def run_paced(period: float, cycle: Callable[[], None], stopping: Sequence[object]) -> None:

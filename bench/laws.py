@@ -14,9 +14,14 @@ from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.params import values_of
+from exo_gravity.hardware.urdf_arm import read_urdf
+from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
 from .table import Row, race, range_of
+
+URDF_ARMS = ("three_joints.yaml", "seven_joints.yaml")
 
 POSES = 100_000
 LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
@@ -81,3 +86,28 @@ def measure_laws(quick: bool) -> Iterator[Row]:
         "us",
         spread,
     )
+    for file in URDF_ARMS:
+        yield _measure_urdf(file, blocks)
+
+
+def _measure_urdf(file: str, blocks: int) -> Row:
+    """Return the row of the arm from a URDF that a file in config describes."""
+    import pinocchio as pin
+
+    arm = carried_arm(load(packaged_config(file)), "/right").settings.robot
+    text = read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"])
+    model = pin.buildModelFromXML(text)
+    model.gravity.linear = np.array((0.0, 0.0, -arm.gravity))
+    data, count = model.createData(), len(arm.length)
+    poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, count))
+    upright = np.tile(Tilt.of("left").direction, (POSES, 1))
+
+    def loop() -> list[Any]:
+        return [pin.computeGeneralizedGravity(model, data, pose) for pose in poses[:LOOP]]
+
+    np.testing.assert_allclose(arm.gain * loop(), arm.torques(poses[:LOOP], upright[:LOOP]), atol=1e-12)
+    ours, peer = race(((lambda: arm.torques(poses, upright), 1), (loop, 1)), blocks)
+    ratios = [one / other / POSES * LOOP for one, other in zip(ours.blocks, peer.blocks, strict=True)]
+    name = f"law of a URDF with {count} joints, 100,000 poses, per pose: Pinocchio in a loop"
+    spread = f"{ours.text(1e6 / POSES)}, x{range_of(ratios)}"
+    return Row(name, ours.median / POSES * 1e6, peer.median / LOOP * 1e6, "us", spread)

@@ -12,12 +12,11 @@ from __future__ import annotations
 import copy
 import math
 import os
-import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,19 +33,18 @@ from exo_gravity.core.arm.arm import (
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import ParameterError, with_extra
-from exo_gravity.core.numbers import MAX_JOINTS, Vector, floats, one_float
-from exo_gravity.hardware.urdf_checks import UrdfJoints, check_masses, usable_efforts
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import Vector, floats, one_float
+from exo_gravity.hardware.urdf_checks import check_masses, usable_efforts
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
+from exo_gravity.hardware.urdf_shape import LEAST_LENGTH, UrdfShape
 
 PACKAGE = "package://"
 # The compensator's parameters.
 MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for what in ("moment", "turn"))
-LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
-INERTIAL = 10  # parameters of a link in Pinocchio's regressor: mass, first moment, inertia
 Base = Sequence[tuple[int, np.ndarray]]
 
 
@@ -93,16 +91,7 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
     return arm_from(values, read_urdf(values["urdf.file"]))
 
 
-class Skeleton(NamedTuple):
-    """What `can_bridge` needs to compute the gravity of an arm of n joints itself, in the root link's axes."""
-
-    axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
-    ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
-    moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, the most by which masses beside the links load each joint in any pose
-
-
-class UrdfArm:
+class UrdfArm(UrdfShape):
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
     It is an `Arm` of core/arm/interface.py, of which tilts are those of the left arm.
@@ -115,38 +104,25 @@ class UrdfArm:
 
     max_effort: (n,) Nm, the joints' effort limits in the URDF, 0 where it has none that a joint can have.
     notes: sentences on what is doubtful in the URDF, for the log.
-    length: (n,) m from each joint to the next one, and from the last one to the hand; 0 if there is no hand.
     """
 
     def __init__(self, text: str, joint_names: Sequence[str], hand: str = "", rotors: Sequence[float] = ()) -> None:
-        self._pin, names = _pinocchio(), list(joint_names)
-        if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
-            raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
-        self._moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
-        self._model = self._moves.model
-        if hand and not self._model.existBodyName(hand):
-            links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
-            raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
-        self._joints = [self._model.getJointId(name) for name in names]
+        super().__init__(text, joint_names, hand)
+        names = self.names
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self._held = Held()
-        self._hand = hand
         self._rotors = tuple(rotors) or (0.0,) * len(names)
         self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
         self._turn = np.zeros((len(names), 3))  # rad, likewise
-        self._lock = threading.Lock()  # a calibration chooses its poses on another thread than it holds the arm on
-        self._identity = text, tuple(names)
-        self._bare = self._by_mass = self._model  # without load and wearer
+        self._identity = text, names
+        self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
-        self._pin.computeSubtreeMasses(self._model, self._data)
-        self._own_mass = max(self._data.mass[joint] for joint in self._joints)
+        self._own_mass = max(self._tree.masses[self._numbers].tolist())
         if not self._own_mass > 0.0:
             raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
-        self._along = self._ways()
         self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
-        self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UrdfArm) and self._key == other._key
@@ -224,9 +200,7 @@ class UrdfArm:
         direction: (m, 3), gravity's unit vectors in the left arm's base frame, as `Tilt.direction`.
         """
         x, y, z = np.transpose(direction)
-        felt = self.gravity * np.transpose((y, x, -z))
-        pairs = zip(np.asarray(theta), felt, strict=True)
-        return np.array([self._holding(pose, own, ZERO) for pose, own in pairs])
+        return self.gain * self._torques(np.asarray(theta), self.gravity * np.transpose((y, x, -z)))
 
     def turning_torque(self, side: str, theta: Sequence[float], angular_acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm that turns the arm at `theta` (n,) rad along with its base.
@@ -282,12 +256,6 @@ class UrdfArm:
         return self._with(replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
 
     @property
-    def directions(self) -> np.ndarray:
-        """Unit vectors (n, 3) along the links in their joints' frames, zeros for one without length."""
-        length = np.array(self.length)[:, None]
-        return np.divide(self._along, length, out=np.zeros((len(length), 3)), where=length >= LEAST_LENGTH)
-
-    @property
     def change(self) -> np.ndarray:
         """By what `corrected` changed the moments, (n, 3) kg m."""
         return self._change
@@ -296,21 +264,6 @@ class UrdfArm:
     def turn(self) -> np.ndarray:
         """By what `turned` turned the joints' places, (n, 3) rad."""
         return self._turn
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The joints (n,)."""
-        return self._moves.names
-
-    @property
-    def moves_alone(self) -> bool:
-        """Whether the links move with the arm's joints alone, and no joint follows another one."""
-        return len(self._joints) == self._bare.njoints - 1
-
-    @cached_property
-    def ranges(self) -> np.ndarray:
-        """The joints' limits in the URDF, (2, n) rad."""
-        return np.transpose([self._moves.limits(name) for name in self.names])
 
     @cached_property
     def base(self) -> tuple[tuple[int, np.ndarray], ...]:
@@ -324,8 +277,8 @@ class UrdfArm:
         for n, joint in enumerate(self._joints):
             if self._bare.inertias[joint].mass:
                 across += [(n, way) for way in self._across(n)]
-        columns = np.concatenate([self._columns(*one, across) for one in self._sampled(0)])
-        size = np.abs(np.diag(np.linalg.qr(columns, mode="r")))
+        rows = self._rows(*self._sampled(0), across).reshape(-1, len(across))
+        size = np.abs(np.diag(np.linalg.qr(rows, mode="r")))
         return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
 
     def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -333,16 +286,14 @@ class UrdfArm:
 
         theta: (m, n) rad. direction: (3,) or (m, 3), gravity's unit vector in the root link's axes. Gains do not count.
         """
-        down = np.broadcast_to(direction, (len(theta), 3))
-        return np.array([self._columns(*one, self.base) for one in zip(theta, self.gravity * down, strict=True)])
+        return self._rows(theta, self.gravity * np.broadcast_to(direction, (len(theta), 3)), self.base)
 
     @property
     def moments(self) -> np.ndarray:
         """The moments (k,) in kg m of `base`, of all that the arm holds."""
         sampled = self._sampled(1)
-        columns = [self._columns(*one, self.base) for one in sampled]
-        torque = [np.divide(self._holding(pose.tolist(), way.tolist(), ZERO), self.gain) for pose, way in sampled]
-        return np.asarray(np.linalg.lstsq(np.concatenate(columns), np.concatenate(torque), rcond=None)[0])
+        rows, torque = self._rows(*sampled, self.base), self._torques(*sampled)
+        return np.asarray(np.linalg.lstsq(rows.reshape(-1, rows.shape[-1]), torque.ravel(), rcond=None)[0])
 
     def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
         """Return this arm with `moments` (k,) kg m of `base` added to those of the robot. Raises ParameterError."""
@@ -351,115 +302,20 @@ class UrdfArm:
             change[n] += more * way
         return self.corrected(change)
 
-    @cached_property
-    def _axes(self) -> np.ndarray:
-        """The joints' axes (n, 3) in their own frames."""
-        pin, model = self._pin, self._bare
-        pin.computeJointJacobians(model, self._data, pin.neutral(model))
-        own, axes = pin.ReferenceFrame.LOCAL, []
-        for joint in self._joints:
-            jacobian = np.reshape(pin.getJointJacobian(model, self._data, joint, own), (6, -1))
-            axes.append(jacobian[3:, model.joints[joint].idx_v].copy())
-        return np.array(axes)
+    def _torques(self, theta: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        """Return the torque (m, n) in Nm, gains of 1, at `theta` (m, n) rad. gravity: (m, 3) m/s^2 in root axes."""
+        return self._moves.folded(self._tree.torques(self._moves.positions(theta), gravity).T).T
 
-    @cached_property
-    def turns(self) -> np.ndarray:
-        """Of each joint's frame its axis and two unit vectors across it, (n, 3, 3), one a row."""
-        return np.array([np.vstack((axis, self._across(n))) for n, axis in enumerate(self._axes)])
+    def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
+        """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
+        links, ways = [self._numbers[n] for n, _ in base], np.array([way for _, way in base])
+        return self._moves.folded(self._tree.rows(self._moves.positions(theta), gravity, links, ways))
 
-    def frames(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return how the joints' frames are turned at `theta` (n,) rad, (n, 3, 3) to the root link's axes.
-
-        First as they would be with the joint itself at 0, then as they are.
-        """
-        with self._lock:
-            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
-            parents = [self._data.oMi[self._model.parents[joint]].rotation for joint in self._joints]
-            after = np.array([self._data.oMi[joint].rotation for joint in self._joints])
-        places = [self._model.jointPlacements[joint].rotation for joint in self._joints]
-        return np.array(parents) @ np.array(places), after
-
-    @property
-    def moved_by(self) -> np.ndarray:
-        """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
-        supports = [set(self._model.supports[joint].tolist()) for joint in self._joints]
-        return np.array([[joint in support for support in supports] for joint in self._joints])
-
-    def _across(self, n: int) -> np.ndarray:
-        """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
-        return np.asarray(np.linalg.svd(self._axes[n][None])[2][1:])
-
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad, in the root link's axes.
-
-        The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
-        vectors (n, 3) across them, as far as possible along the links.
-        """
-        own, along = self._axes, []  # before the places, because it moves the joints
-        origins = self.places(theta)
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
-        for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
-            across = way - axis * (axis @ way)
-            size = float(np.linalg.norm(across))
-            along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
-        axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
-        return origins, axes, links
-
-    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
-
-        While all angles are 0, in the root link's axes.
-        """
-        self.places([0.0] * len(self.names))
-        links = [self._bare.inertias[joint] for joint in self._joints]
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
-        centres = [turn @ link.lever for turn, link in zip(turns, links, strict=True)]
-        return np.array([link.mass for link in links]), np.array(centres)
-
-    def skeleton(self) -> Skeleton | None:
-        """Return axes, links and largest moments of all that the arm holds; None if its joints are no single chain."""
-        parents = [self._model.parents[joint] for joint in self._joints]
-        if not self.moves_alone or parents[1:] != self._joints[:-1]:
-            return None
-        self.places([0.0] * len(self.names))
-        self._pin.computeSubtreeMasses(self._model, self._data)
-        turns = [self._data.oMi[joint].rotation for joint in self._joints]
-        ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
-        for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
-            link = self._model.inertias[joint]
-            own = link.mass * link.lever
-            beyond = length * (self._data.mass[joint] - link.mass)
-            moments[n] = max(0.0, float(own @ way) + beyond) if np.any(way) else 0.0
-            beside[n] = np.linalg.norm(own + beyond * ways[n] - moments[n] * ways[n])
-        axes = np.einsum("nab,nb->na", turns, self._axes)
-        return Skeleton(axes, np.einsum("nab,nb->na", turns, ways), moments, np.cumsum(beside[::-1])[::-1])
-
-    def places(self, theta: Sequence[float]) -> np.ndarray:
-        """Return where the joints are at `theta` (n,) rad, and the hand or the last joint again: (n + 1, 3) m.
-
-        In the root link's axes.
-        """
-        with self._lock:
-            self._pin.forwardKinematics(self._model, self._data, self._moves.configuration(theta))
-            frames = [self._data.oMi[joint] for joint in self._joints]
-            return np.array([*(frame.translation for frame in frames), frames[-1].act(self._along[-1])])
-
-    def _sampled(self, seed: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return poses (n,) rad at random, each with a vector (3,) of gravity in m/s^2."""
+    def _sampled(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses (m, n) in rad at random, each with a vector of gravity (m, 3) in m/s^2."""
         random = np.random.default_rng(seed)
         poses = random.uniform(-math.pi, math.pi, (BASE_POSES, len(self.names)))
-        return list(zip(poses, random.normal(size=(BASE_POSES, 3)), strict=True))
-
-    def _columns(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
-        """Return the torque (n, k) in Nm of moments of 1 kg m. gravity: (3,) m/s^2 in the root link's axes."""
-        model, data, compute = self._bare, self._data, self._pin.computeJointTorqueRegressor
-        at, still = self._moves.configuration(theta.tolist()), np.zeros(model.nv)
-        with self._lock:
-            model.gravity.linear, model.gravity.angular = gravity, np.zeros(3)
-            whole = compute(model, data, at, still, still)
-            parts = self._moves.folded(whole.reshape(model.nv, -1))  # of one joint Pinocchio returns a vector
-        moments = parts.reshape(len(self.names), -1, INERTIAL)[:, :, 1:4]
-        return np.stack([moments[:, self._joints[n] - 1] @ way for n, way in base], axis=-1)
+        return poses, random.normal(size=(BASE_POSES, 3))
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
@@ -499,7 +355,7 @@ class UrdfArm:
 
     def _anew(self) -> UrdfArm:
         """Forget what was computed for the arm that this is a copy of."""
-        for name in ("scale", "links"):
+        for name in ("scale", "links", "_tree"):
             self.__dict__.pop(name, None)
         self._data = self._model.createData()
         return self
@@ -524,30 +380,3 @@ class UrdfArm:
         model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
         torque = self._pin.computeGeneralizedGravity(model, self._data, self._moves.configuration(theta))
         return tuple((self.gain * self._moves.folded(torque)).tolist())
-
-    def _ways(self) -> list[np.ndarray]:
-        """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
-        pin, model = self._pin, self._model
-        pin.forwardKinematics(model, self._data, pin.neutral(model))
-        pin.updateFramePlacements(model, self._data)
-        places = self._data.oMi
-        ways = []
-        for joint in self._joints:
-            following = [other for other in self._joints if model.parents[other] == joint]
-            if len(following) == 1:
-                ways.append(places[joint].actInv(places[following[0]].translation))
-                continue
-            hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
-            if hand is not None and hand.parentJoint == joint:
-                ways.append(hand.placement.translation.copy())
-            else:
-                ways.append(np.zeros(3))
-        return ways
-
-
-def _pinocchio() -> Any:
-    try:
-        import pinocchio
-    except ImportError:
-        raise ParameterError("law", "urdf", f"used with Pinocchio: {with_extra('urdf')}") from None
-    return pinocchio

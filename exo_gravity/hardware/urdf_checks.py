@@ -108,17 +108,24 @@ class UrdfJoints:
 
         Raises ParameterError while a joint that cannot be at 0 is not reported.
         """
-        for other in self.others:
-            if not other.can_be_at_zero and other.name not in self._reported:
-                raise _missing(other)
+        self._check_others()
         return self._placed(np.asarray(theta, dtype=float), self._at)
+
+    def positions(self, theta: np.ndarray) -> np.ndarray:
+        """Return the positions (m, nv) of the model's joints for the angles `theta` (m, n) in rad. Raises likewise."""
+        self._check_others()
+        still = self._coupling[:, len(self.names) :] @ self._at + self._offset
+        return np.asarray(theta @ self._own.T + still)
 
     def spread(self, values: Sequence[float]) -> np.ndarray:
         """Return the velocities or accelerations (nv,) of the model for the arm's (n,)."""
         return np.asarray(self._own @ np.asarray(values))
 
     def folded(self, torque: np.ndarray) -> np.ndarray:
-        """Return the torque (n,) in Nm of the arm's joints for that of all joints of the model, (nv,)."""
+        """Return the torque (n,) in Nm of the arm's joints for that of all joints of the model, (nv,).
+
+        Also (n, m) for (nv, m), and (m, n, k) for (m, nv, k).
+        """
         return np.asarray(self._own.T @ torque)
 
     def folded_matrix(self, matrix: np.ndarray) -> np.ndarray:
@@ -158,6 +165,11 @@ class UrdfJoints:
             return ()
         names = ", ".join(other.name for other in self.others)
         return (f"{names} change the torque and are not in joint_names: at 0, unless the joint states have them",)
+
+    def _check_others(self) -> None:
+        for other in self.others:
+            if not other.can_be_at_zero and other.name not in self._reported:
+                raise _missing(other)
 
     def _couple(self) -> None:
         """Find how the joints of the model follow the arm's and the others."""

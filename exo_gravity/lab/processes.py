@@ -6,6 +6,8 @@
 The bridges stop first, because they need the other nodes while they let the arms down. If this process dies, the nodes
 stop by themselves: each watches its standard input, whose other end `Launcher` holds.
 
+Nodes that no arm waits for import what they need once the others have: two cores then carry an arm sooner.
+
 If a bridge dies, its watchdog lets the arm down. If both die, the bridge's executable is started once more, to let the
 arm down and nothing else.
 """
@@ -41,6 +43,12 @@ sys.argv[0] = {name!r}
 from {module} import main
 sys.exit(main())
 """
+# What the executable of a node in `LAST` does before that: it waits for a line on its standard input.
+WAIT = """import select
+select.select([0], [], [], {patience})
+"""
+LAST = ("/wearer", "/robot_model")  # what no arm waits for, and no operator
+PATIENCE = 5.0  # s for which these wait for the others; nodes with a high log level say nothing
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
 STOP_TIMEOUT = 5.0  # s for any other node to end
@@ -71,16 +79,17 @@ def node_modules() -> dict[str, str]:
     return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
 
 
-def command_of(node: str, module: str = "") -> list[str]:
+def command_of(node: str, module: str = "", first: str = "") -> list[str]:
     """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
 
     module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
     too.
+    first: what the program does before.
     """
     name, modules = node.rpartition("/")[2], node_modules()
     if name not in modules:
         raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
-    return [sys.executable, "-c", PROGRAM.format(name=name, module=module or modules[name])]
+    return [sys.executable, "-c", first + PROGRAM.format(name=name, module=module or modules[name])]
 
 
 def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
@@ -186,6 +195,7 @@ class Launcher:
         self._commands = {node: self._command(node) for node in names if node not in self._guests.values()}
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
+        self._starting = {node for node in self._commands if not node.endswith(LAST)}  # which have said nothing yet
         self._on_line = on_line
         self._ended_observers: set[str] = set()
         self.maybe_powered: list[str] = []
@@ -196,6 +206,18 @@ class Launcher:
         """Start every node."""
         for node in self._commands:
             self._processes[node], self._readers[node] = self._start(node, SUPERVISED)
+        self._note_start("")
+
+    def _note_start(self, node: str) -> None:
+        """Note that a node has started; let those in `LAST` start once all others have."""
+        self._starting.discard(node)
+        if self._starting:
+            return
+        for last in filter(lambda name: name.endswith(LAST), tuple(self._processes)):
+            if pipe := self._processes[last].stdin:
+                with contextlib.suppress(OSError):  # it has ended
+                    pipe.write("\n")
+                    pipe.flush()
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
@@ -291,7 +313,8 @@ class Launcher:
     def _command(self, node: str) -> list[str]:
         if guest := self._guests.get(node):
             return [*command_of(node, ONE_PROCESS), *self._words(node), "--", *self._words(guest)]
-        return [*command_of(node), *self._words(node)]
+        first = WAIT.format(patience=PATIENCE) if node.endswith(LAST) else ""
+        return [*command_of(node, first=first), *self._words(node)]
 
     def _words(self, node: str) -> list[str]:
         return node_arguments(f"{self._namespace}{node}", self.params, self._namespace, self._log_level)
@@ -300,6 +323,8 @@ class Launcher:
         names = (node, self._guests[node]) if node in self._guests else ()
         loggers = {f"{self._namespace}{name}"[1:].replace("/", "."): name for name in names}
         for line in process.stdout or ():
+            if node in self._starting:
+                self._note_start(node)
             logger, _, rest = line.partition(" ")
             name, text = (loggers[logger], rest) if logger in loggers else (node, line)
             with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block

@@ -13,22 +13,21 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Vector3, Vector3Stamped
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
-from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.imu_sources import Reopening, open_source
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
-from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row, to_nanoseconds
+from exo_gravity.nodes.ros.imu_messages import message_of, sample_of
+from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
 from exo_gravity.nodes.ros.parameters import declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import (
@@ -214,37 +213,6 @@ class ImuDevice(PeriodicThread):
             sentence = f"{source.name}: {source.lost} samples lost since it was opened, the last because: {source.loss}"
             self._node.get_logger().warning(sentence, throttle_duration_sec=LOG_PERIOD)
         self._lost = source.lost if source else 0
-
-
-def sample_of(message: Imu) -> ImuSample:
-    """Return the message's sample; a quantity that the driver does not measure is None."""
-    q = message.orientation
-    return ImuSample(
-        to_nanoseconds(message.header.stamp) * 1e-9,
-        reported_vector(_vector(message.angular_velocity), message.angular_velocity_covariance[0]),
-        reported_vector(_vector(message.linear_acceleration), message.linear_acceleration_covariance[0]),
-        reported_orientation((q.x, q.y, q.z, q.w), message.orientation_covariance[0]),
-    )
-
-
-def message_of(sample: ImuSample) -> Imu:
-    """Return the sample's message, in the IMU's axes; what was not measured has the covariance -1 (REP-145)."""
-    message = Imu()
-    message.header.stamp, message.header.frame_id = Time(nanoseconds=round(sample.time * 1e9)).to_msg(), "imu"
-    for vector, covariance, values in (
-        (message.orientation, message.orientation_covariance, sample.orientation),
-        (message.angular_velocity, message.angular_velocity_covariance, sample.angular_velocity),
-        (message.linear_acceleration, message.linear_acceleration_covariance, sample.acceleration),
-    ):
-        if values is None:
-            covariance[0] = NOT_REPORTED
-        for axis, value in zip("xyzw", values or (), strict=False):
-            setattr(vector, axis, value)
-    return message
-
-
-def _vector(message: Vector3) -> tuple[float, float, float]:
-    return message.x, message.y, message.z
 
 
 def main() -> None:

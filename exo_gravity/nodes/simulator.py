@@ -25,7 +25,7 @@ from exo_gravity.core.vocabulary import words
 from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.lab.packages import extras
 from exo_gravity.lab.vocabulary import NodeState, SimulatorWarning
-from exo_gravity.nodes.imu import message_of
+from exo_gravity.nodes.ros.imu_messages import message_of
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
 from exo_gravity.nodes.ros.parameters import accept_changes, bus_of, declare, given_to
 from exo_gravity.nodes.ros.run import run

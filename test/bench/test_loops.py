@@ -14,9 +14,15 @@ import pytest
 from rich.console import Console
 
 from bench import loop, loops
+from bench.direct_arm import Starting
 from bench.loop import LoopRun
 from bench.table import show
 from bench.timing import LoopTiming
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.safety.drive import Drive, Send
+from exo_gravity.hardware.can.motor_bus import MotorBus
+
+from ..hardware.rig import CYCLE, VirtualRig
 
 TIMING = LoopTiming(np.full(100, 1e-3), np.full(100, 2e-3), 100, 0, 0, 0, 0)
 
@@ -97,3 +103,16 @@ def test_the_time_of_a_child_is_our_own_and_not_that_of_other_programs():
     finally:
         busy.kill()
         busy.wait()
+
+
+def test_a_peer_switches_a_motor_on_whose_first_enter_is_lost():
+    rig = VirtualRig(pose=NO_TORQUE, carried=False)
+    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
+    starting, motor, enters = Starting(bus.replies), rig.device.motors[1], 0
+    for _ in range(100):
+        enters += starting.send[1] is Send.ENTER
+        motor.unplugged = enters == 1
+        begin = rig.clock.monotonic()
+        starting.note(bus.exchange(Drive(NO_TORQUE, NO_TORQUE, starting.send, True), begin + CYCLE))
+        rig.clock.sleep(max(0.0, begin + CYCLE - rig.clock.monotonic()))
+    assert enters > 1 and rig.motors_on == [True] * 4

@@ -9,11 +9,13 @@ import pytest
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.hardware import urdf_tree
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.tools.urdf import urdf_of
 
+from ..support.chains import random_chain
 from ..support.urdf_oracle import MujocoArm
 
 PUBLISHED = Path(__file__).parents[1] / "data" / "arms"
@@ -25,6 +27,20 @@ ARMS = {
     "kinova": (PUBLISHED / "kinova.urdf", [f"j2s6s200_joint_{n}" for n in range(1, 7)]),
 }  # fmt: skip
 POSES = 200
+# Joints on two branches: of the arm j1, j3 and j4; j2 slides as j1 turns, and j5 is where it is reported.
+BRANCHES = "".join(
+    f"<link name='l{n}'><inertial><origin xyz='0.05 0 -{n / 20}'/><mass value='{n}'/>"
+    "<inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' iyz='0'/></inertial></link>"
+    f"<joint name='j{n}' type='{kind}'><parent link='{parent}'/><child link='l{n}'/><origin xyz='0 0.1 -0.3' "
+    f"rpy='0.3 {n} 0'/><axis xyz='{axis}'/><limit lower='-2' upper='2' effort='30' velocity='1'/>{more}</joint>"
+    for n, kind, parent, axis, more in (
+        (1, "revolute", "base", "0 1 0.4", ""),
+        (2, "prismatic", "l1", "1 0 0", "<mimic joint='j1' multiplier='0.2' offset='0.05'/>"),
+        (3, "continuous", "l2", "0.2 1 0", ""),
+        (4, "revolute", "l1", "0 1 0", ""),
+        (5, "prismatic", "l4", "0 0 1", ""),
+    )
+)
 ONE_LINK = """<robot name="one">
 <link name="base"/>
 <link name="link"><inertial><origin xyz="0 0 -0.5"/><mass value="{mass}"/>
@@ -114,6 +130,40 @@ def test_the_papers_arm_as_a_urdf_carries_a_wearer_and_a_load_like_the_closed_fo
         assert held.with_payload(0.0).with_wearer((0.0,) * 4, (0.0,) * 4) == arm.with_payload(0.0).with_wearer(
             (0.0,) * 4, (0.0,) * 4
         )
+
+
+def worn(count: int, random: np.random.Generator) -> UrdfArm:
+    """Return an arm of `count` joints whose places lie askew, with gains, a wearer and a load."""
+    text, names = random_chain(count, seed=count)
+    arm = UrdfArm(text, names, "hand").turned(random.normal(0.0, 0.05, (count, 3)))
+    worn = arm.with_wearer_moments(random.normal(0.0, 0.2, (count, 3))).with_payload(1.2, (0.02, -0.03, 0.05))
+    return worn.scaled(random.uniform(0.5, 1.0, count), 9.7)
+
+
+def branched() -> UrdfArm:
+    arm = UrdfArm(f"<robot name='branches'><link name='base'/>{BRANCHES}</robot>", ["j1", "j3", "j4"])
+    arm.follow(["j5"], [0.35])
+    assert not arm.fixed
+    return arm
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 0], ids=lambda count: f"{count} joints" if count else "branches")
+def test_many_poses_at_once_have_the_torques_that_pinocchio_computes_for_each(count, monkeypatch):
+    monkeypatch.setattr(urdf_tree, "BLOCK", 150)
+    random = np.random.default_rng(5)
+    arm = worn(count, random) if count else branched()
+    theta = random.uniform(-3.0, 3.0, (POSES, len(arm.names)))
+    tilts = [Tilt.of_gravity("left", random_gravity(random)) for _ in theta]
+    each = [arm.torque(pose, tilt) for pose, tilt in zip(theta, tilts, strict=True)]
+    assert np.allclose(arm.torques(theta, [tilt.direction for tilt in tilts]), each, rtol=0.0, atol=1e-12)
+    assert np.max(np.abs(each)) > 1.0
+
+    down = np.array([tilt.gravity_in_trunk for tilt in tilts])
+    rows = arm.regressor(theta, down) * arm.gain[:, None]
+    for k, more in enumerate(np.eye(rows.shape[-1])):
+        changed = arm.with_more_moments(0.1 * more)
+        with_more = [changed.torque(pose, tilt) for pose, tilt in zip(theta, tilts, strict=True)]
+        assert np.allclose(np.subtract(with_more, each), 0.1 * rows[:, :, k], rtol=0.0, atol=1e-12)
 
 
 def test_one_link_takes_its_weight_times_its_lever():

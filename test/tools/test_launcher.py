@@ -5,6 +5,7 @@ test/nodes starts real nodes.
 """
 
 import importlib
+import io
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab import packages
 from exo_gravity.lab.inputs.parameter_file import load, stages
-from exo_gravity.lab.processes import Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
+from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import main
 
@@ -119,7 +120,7 @@ class Process:
     """A node's process that has printed `log`, and ends when it is terminated."""
 
     def __init__(self, log: Sequence[str]) -> None:
-        self.stdout, self._code = log, None
+        self.stdin, self.stdout, self._code = io.StringIO(), log, None
 
     def poll(self) -> int | None:
         return self._code
@@ -178,6 +179,31 @@ def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_
     ]
     alone, _ = launched(*one_process, "--only", "*/can_bridge", "/imu")
     assert list(alone) == ["/lab/imu", "/lab/right/can_bridge"] and "--" not in alone["/lab/right/can_bridge"]
+
+
+@pytest.mark.parametrize("silent", ["", "/right/simulator"], ids=["all have started", "one is silent"])
+def test_a_wearer_is_told_to_start_once_all_that_an_arm_waits_for_have_started(monkeypatch, silent):
+    processes: dict[str, Process] = {}
+
+    def start(command: list[str], **_: object) -> Process:
+        node = command[command.index("--enclave") + 1]
+        processes[node] = Process(() if node in (silent, "/right/wearer") else ("INFO started\n", "INFO running\n"))
+        return processes[node]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    launcher = Launcher(SIM, lambda node, line: None)
+    launcher.start()
+    launcher.stop()  # after the last line of each log
+    assert {node for node, process in processes.items() if process.stdin.getvalue()} == (
+        set() if silent else {"/right/wearer"}
+    )
+
+
+def test_a_process_that_waits_for_the_others_begins_at_a_line_and_when_its_launcher_has_died():
+    program = [sys.executable, "-c", f"{WAIT.format(patience=600.0)}print('begun')"]
+    for given in ("\n", ""):
+        ended = subprocess.run(program, input=given, capture_output=True, text=True, timeout=120, check=True)
+        assert ended.stdout == "begun\n"
 
 
 NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]

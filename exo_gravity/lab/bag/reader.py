@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from exo_gravity.core.arm.arm import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
@@ -42,7 +41,7 @@ from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.pairing import Thinning, arrival_of, clocks_of, efforts_in_force
 from exo_gravity.lab.bag.storage import Storage, StoredRows
-from exo_gravity.lab.inputs.parameter_file import Loader
+from exo_gravity.lab.inputs.parameter_file import recorded_parameters
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
 
@@ -316,9 +315,10 @@ class _Contents:
                 raise DataError(f"{topic}: invalid session") from None
         else:
             node = message.data.partition(":")[0].strip()
-            if _has_parameters(message.data, node):
+            try:
+                recorded_parameters(message.data, node)
                 self.parameters[node] = message.data
-            else:
+            except DataError:
                 self._damaged[topic] = self._damaged.get(topic, 0) + 1
 
     def _add_status(self, row: Row, status: Any) -> None:
@@ -429,14 +429,6 @@ class _Contents:
                 self.notes.append(f"{arm}: the recording ends {missing}")
                 self.is_partial = True
         return tuple(spans)
-
-
-def _has_parameters(text: str, node: str) -> bool:
-    """Return whether a text is YAML with the parameters of `node`."""
-    try:
-        return {*map(type, yaml.load(text, Loader)[node]["ros__parameters"].keys())} <= {str}
-    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError):
-        return False
 
 
 def _value(value: Any) -> object:

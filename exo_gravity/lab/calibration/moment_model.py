@@ -250,8 +250,7 @@ class UrdfMoments:
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
         """Return the derivative (m, n, k, 3, 3 n) of `along_axes` by turns of the joints' places."""
-        frames = np.array([self.arm.frames(pose) for pose in theta.tolist()])
-        before, after = frames[:, 0], frames[:, 1]
+        before, after = self.arm.frames(theta)
         link, ways = np.array([n for n, _ in self.arm.base]), np.array([way for _, way in self.arm.base])
         moments = np.einsum("mkab,kb->mka", after[:, link], ways)
         turns = np.einsum("mnab,ntb->mnta", before, self.arm.turns)
@@ -269,8 +268,7 @@ class UrdfMoments:
         wanted = self.rows(poses, down) @ moments
         wanted += np.einsum("mnkat,ma,k,t->mn", self.turned(poses), down, moments, askew, optimize=True)
         turned = self.arm.turned(self.arm.turn + across)
-        tilts = [Tilt.of_gravity(SIDES[0], way) for way in down]
-        own = [turned.torque(pose, tilt) for pose, tilt in zip(poses.tolist(), tilts, strict=True)]
+        own = turned.torques(poses, [Tilt.of_gravity(SIDES[0], way).direction for way in down])
         rows = turned.regressor(poses, down).reshape(-1, len(moments))
         return turned.with_more_moments(np.linalg.lstsq(rows, (wanted - own).ravel(), rcond=None)[0])
 
@@ -293,7 +291,7 @@ class UrdfMoments:
 
     def upwards(self, theta: np.ndarray) -> np.ndarray:
         """Return the sine (m,) of the largest angle of a link above the plane across the root link's z axis."""
-        ways = np.diff([self.arm.places(pose) for pose in theta], axis=1)
+        ways = np.diff(self.arm.places(theta), axis=1)
         length = np.linalg.norm(ways, axis=2)
         rise = np.divide(ways[:, :, 2], length, out=np.full_like(length, -1.0), where=length > 0.0)
         return np.asarray(rise.max(axis=1))

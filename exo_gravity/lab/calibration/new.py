@@ -90,7 +90,7 @@ def write_new(new: NewArm, output: Path) -> list[str]:
     low, high = np.transpose(ranges)
     poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
     upright = Tilt.of("left")
-    needed = np.max(np.abs([arm.torque(pose, upright) for pose in poses.tolist()]), axis=0)
+    needed = np.max(np.abs(arm.torques(poses, np.tile(upright.direction, (POSES, 1)))), axis=0)
     rated = [MOTORS[motor].rated_torque for motor in new.motors]
     efforts = [min(most, own or most) for most, own in zip(rated, arm.max_effort, strict=True)]
     home = hanging(arm, ranges)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-import yaml
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.interface import Arm
@@ -30,7 +29,7 @@ from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
-from exo_gravity.lab.inputs.parameter_file import Loader, Nodes, load, node_of, packaged_config
+from exo_gravity.lab.inputs.parameter_file import Nodes, load, node_of, packaged_config, recorded_parameters
 
 MASSES = {"robot.mass", "robot.first_moment"}  # a file with one of them describes the paper's arm
 
@@ -202,8 +201,8 @@ def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dic
     node = node_of(arm, executable)
     if node not in parameters:
         return {}
-    given = yaml.load(parameters[node], Loader)[node]["ros__parameters"]
-    given = {new: plain for name, value in given.items() for new, plain in in_force(name, value).items()}
+    recorded = recorded_parameters(parameters[node], node)
+    given = {new: plain for name, value in recorded.items() for new, plain in in_force(name, value).items()}
     table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
     if given.get("law") == URDF_LAW:
         table = urdf_table(given)

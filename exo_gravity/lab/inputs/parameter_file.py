@@ -9,13 +9,15 @@ the same (ros_yaml.py).
 """
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import yaml
 
 from exo_gravity import packaged
-from exo_gravity.core.errors import ParameterError, named
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
 from exo_gravity.core.params import joint_count
 from exo_gravity.lab.inputs import ros_yaml
@@ -23,6 +25,7 @@ from exo_gravity.lab.inputs.ros_yaml import Nodes
 
 # Of recordings, whose parameters the recorder writes; libyaml is ten times faster than PyYAML alone.
 Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+RECORDED_TEXTS = 32  # remembered of a recording: more than it has nodes whose parameters are used
 
 
 def packaged_config(name: str) -> Path:
@@ -44,6 +47,18 @@ def load(path: str | Path) -> Nodes:
         raise ParameterError("params", str(path), f"a readable file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("params", str(path), f"YAML ({' '.join(str(error).split())})") from None
+
+
+@lru_cache(RECORDED_TEXTS)
+def recorded_parameters(text: str, node: str) -> Mapping[str, Any]:
+    """Return the parameters of `node` by name, from the text that the recorder wrote. Raises DataError."""
+    try:
+        given = yaml.load(text, Loader)[node]["ros__parameters"]
+        if {*map(type, given.keys())} <= {str}:
+            return MappingProxyType(given)
+    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError):
+        pass
+    raise DataError(f"{node}: the recording has no parameters of it that can be read")
 
 
 def node_of(arm: str, executable: str) -> str:

@@ -168,7 +168,7 @@ class UrdfDescription(Described):
     @property
     def base(self) -> Point:
         """Origin of the first joint in the trunk's axes, m."""
-        x, y, z = self.robot.places(self._zero)[0].tolist()
+        x, y, z = self.robot.places(np.array([self._zero]))[0, 0].tolist()
         return x, y, z
 
     def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -177,7 +177,7 @@ class UrdfDescription(Described):
 
     def link_vectors(self) -> np.ndarray:
         """Return the vectors between the joints, and from the last one to the hand."""
-        return np.diff(self.robot.places(self._zero), axis=0)
+        return np.diff(self.robot.places(np.array([self._zero]))[0], axis=0)
 
     def bodies(self) -> list[tuple[float, Point]]:
         """Return mass and centre of gravity of each link."""

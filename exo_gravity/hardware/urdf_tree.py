@@ -1,0 +1,188 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""Where the joints of an arm from a URDF are, and what gravity asks of each, in many poses at once, by NumPy.
+
+Pinocchio computes one pose a call. Here each step of Newton-Euler for gravity alone is done for a block of poses:
+outwards gravity in the frame of each joint, inwards the first moment of all that the joint moves, about its origin. The
+torque of a joint about its axis a is a . (g x S), the force of one that slides is -m a . g.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+BLOCK = 4096  # poses at once: what is computed on the way stays in the processor's cache
+
+
+class TreeJoint(NamedTuple):
+    """One joint. Its own frame is Pinocchio's; the frame about its axis is one whose z axis that is."""
+
+    parent: int  #: number of the joint before it; -1 for the root link
+    turn: np.ndarray  #: (3, 3) from its own frame while it is at 0, to that of the joint before it
+    place: np.ndarray  #: (3,) m, of its origin there
+    axis: np.ndarray  #: (3,) unit vector in its own frame
+    slides: bool  #: along its axis; else it turns about it
+    mass: float  #: kg of its link and of all beyond it
+    moment: np.ndarray  #: (3,) kg m, of its link and, in their origins, of all beyond it, in the frame about its axis
+    outwards: np.ndarray  #: (3, 3) from the frame about the axis before it to its own one, while it is at 0
+
+
+class Frames(NamedTuple):
+    """The joints' own frames in m poses, in the root link's axes."""
+
+    before: np.ndarray  #: (m, nv, 3, 3) how they would be turned with the joint itself at 0
+    after: np.ndarray  #: (m, nv, 3, 3) how they are turned
+    origin: np.ndarray  #: (m, nv, 3) m
+
+
+class JointTree:
+    """The joints (nv,) of a model of Pinocchio, each of which turns or slides, with their links.
+
+    pin: the module pinocchio. model: of which a later change is not seen.
+    """
+
+    def __init__(self, pin: Any, model: Any) -> None:
+        self._joints = tuple(_joints(pin, model))
+        self._slides = np.array([joint.slides for joint in self._joints])
+        across = _across(np.where(self._slides[:, None], 0.0, self.axes))
+        self._across, self._twice_across = across, across @ across  # of Rodrigues' formula
+
+    @property
+    def masses(self) -> np.ndarray:
+        """What each joint (nv,) moves, in kg."""
+        return np.array([joint.mass for joint in self._joints])
+
+    @property
+    def axes(self) -> np.ndarray:
+        """The joints' axes (nv, 3) in their own frames."""
+        return np.array([joint.axis for joint in self._joints])
+
+    @cached_property
+    def moves(self) -> np.ndarray:
+        """Whether a joint moves the link of another, (nv, nv): the first index is that joint's."""
+        moves = np.eye(len(self._joints), dtype=bool)
+        for n, joint in enumerate(self._joints):
+            if joint.parent >= 0:
+                moves[:, n] |= moves[:, joint.parent]
+        return moves
+
+    def frames(self, positions: np.ndarray) -> Frames:
+        """Return the joints' frames for their positions (m, nv) in rad or m."""
+        sine, cosine = np.sin(positions)[:, :, None, None], np.cos(positions)[:, :, None, None]
+        turns = np.eye(3) + sine * self._across + (1.0 - cosine) * self._twice_across
+        before, after, origin = np.empty_like(turns), np.empty_like(turns), np.empty((*positions.shape, 3))
+        for n, joint in enumerate(self._joints):
+            before[:, n], origin[:, n] = joint.turn, joint.place
+            if joint.parent >= 0:
+                parent = after[:, joint.parent]
+                before[:, n] = parent @ joint.turn
+                origin[:, n] = origin[:, joint.parent] + parent @ joint.place
+            if joint.slides:
+                origin[:, n] += before[:, n] @ joint.axis * positions[:, n, None]
+            after[:, n] = before[:, n] @ turns[:, n]
+        return Frames(before, after, origin)
+
+    def torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        """Return what each joint must give to hold its links, (m, nv) Nm or N.
+
+        positions: (m, nv) rad or m. gravity: (m, 3) m/s^2 in the root link's axes.
+        """
+        result = np.empty(positions.shape)
+        for begin in range(0, len(positions), BLOCK):
+            part = slice(begin, begin + BLOCK)
+            result[part] = self._torques(positions[part].T.copy(), gravity[part].T.copy()).T
+        return result
+
+    def rows(self, positions: np.ndarray, gravity: np.ndarray, links: Sequence[int], ways: np.ndarray) -> np.ndarray:
+        """Return what each joint must give per first moment of a link, (m, nv, k) in Nm per kg m.
+
+        positions, gravity: as in `torques`.
+        links: (k,) numbers of the joints whose links have the moments.
+        ways: (k, 3) unit vectors along the moments, in these joints' own frames.
+        """
+        turned = self.frames(positions).after
+        axes = np.where(self._slides[:, None], 0.0, self.axes)  # the force of one that slides shows no moment
+        levers = (turned @ axes[:, :, None])[..., 0] @ _across(gravity)  # axis x gravity
+        moments = (turned[:, links] @ ways[:, :, None])[..., 0]
+        return np.asarray(levers @ moments.swapaxes(1, 2) * self.moves[:, links])
+
+    def _torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        """Return the torques (nv, m). positions: (nv, m). gravity: (3, m)."""
+        sine, cosine = _sine_and_cosine(positions)
+        felt = np.empty((len(positions), *gravity.shape))  # gravity in the frames about the axes
+        for n, joint in enumerate(self._joints):
+            own = joint.outwards @ (gravity if joint.parent < 0 else felt[joint.parent])
+            if joint.slides:
+                felt[n] = own
+            else:
+                _turn_about_z(own, cosine[n], -sine[n], felt[n])
+        moment = [np.repeat(joint.moment[:, None], positions.shape[1], axis=1) for joint in self._joints]
+        torque = np.empty_like(positions)
+        for n in reversed(range(len(positions))):
+            joint, own, down = self._joints[n], moment.pop(), felt[n]
+            if joint.slides:
+                torque[n] = -joint.mass * down[2]
+                own[2] += joint.mass * positions[n]
+            else:
+                np.subtract(own[1] * down[0], own[0] * down[1], out=torque[n])
+                _turn_about_z(own, cosine[n], sine[n], own)
+            if joint.parent >= 0:
+                moment[joint.parent] += joint.outwards.T @ own
+        return torque
+
+
+def _sine_and_cosine(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return both by the tangent of half the angle, as `core.arm.gravity` does: they take most of the time."""
+    tangent = np.tan(0.5 * angle)
+    one_plus_cosine = 2.0 / (1.0 + tangent * tangent)
+    return tangent * one_plus_cosine, one_plus_cosine - 1.0
+
+
+def _turn_about_z(vectors: np.ndarray, cosine: np.ndarray, sine: np.ndarray, out: np.ndarray) -> None:
+    """Write vectors (3, m) turned about the z axis to `out`, which may be the same."""
+    x, y, z = vectors
+    turned = sine * x + cosine * y
+    np.subtract(cosine * x, sine * y, out=out[0])
+    out[1], out[2] = turned, z
+
+
+def _across(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices (m, 3, 3) that multiply by `vectors` (m, 3) crosswise, from the left."""
+    x, y, z = vectors.T
+    return np.array([(0.0 * x, -z, y), (z, 0.0 * x, -x), (-y, x, 0.0 * x)]).transpose(2, 0, 1)
+
+
+def _joints(pin: Any, model: Any) -> Iterator[TreeJoint]:
+    """Yield the joints of a model of Pinocchio, in its order."""
+    data = model.createData()
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    pin.computeSubtreeMasses(model, data)
+    numbers = range(1, model.njoints)  # 0 is the root link
+    axes, slide = [], []
+    for number in numbers:
+        jacobian = np.reshape(pin.getJointJacobian(model, data, number, pin.ReferenceFrame.LOCAL), (6, -1))
+        along, about = np.split(jacobian[:, model.joints[number].idx_v], 2)
+        slide.append(bool(np.any(along)))
+        axes.append(along if slide[-1] else about)
+    about_axes = [_frame_about(axis) for axis in axes]
+    for n, number in enumerate(numbers):
+        link, place, parent = model.inertias[number], model.jointPlacements[number], model.parents[number] - 1
+        moment = link.mass * link.lever
+        for other in numbers:
+            if model.parents[other] == number:
+                moment = moment + data.mass[other] * model.jointPlacements[other].translation
+        before = np.eye(3) if parent < 0 else about_axes[parent]
+        outwards = (before.T @ place.rotation @ about_axes[n]).T
+        yield TreeJoint(
+            parent, place.rotation.copy(), place.translation.copy(), axes[n], slide[n], float(data.mass[number]),
+            about_axes[n].T @ moment, outwards,
+        )  # fmt: skip
+
+
+def _frame_about(axis: np.ndarray) -> np.ndarray:
+    """Return a rotation (3, 3) whose third column is `axis` (3,)."""
+    across = np.linalg.svd(axis[None])[2][1]
+    return np.column_stack((across, np.cross(axis, across), axis))
