@@ -344,7 +344,7 @@ class Tracker:
     def _push(self, dt: float, way: np.ndarray, velocity: np.ndarray, stiffness: np.ndarray) -> None:
         """Push light joints that stick, stand and are behind towards `way` (n,), -1, 0 or 1.
 
-        velocity: (n,) rad/s. stiffness: (n,) Nm/rad of the controller, which pushes a heavy joint hard enough by itself.
+        velocity: (n,) rad/s. stiffness: (n,) Nm/rad of the controller, which moves a heavy joint by itself.
         """
         most = np.maximum(0.0, TRACKER.most_push_off - stiffness * TRACKER.slow_error)
         stands = self.sticks & (np.abs(velocity) < TRACKER.standing) & (self.error * way > TRACKER.ahead)
