@@ -111,7 +111,7 @@ class Device:
         mass = nominal.mass * rng.uniform(low, high, count)
         cog = np.minimum(nominal.cog * rng.uniform(low, high, count), nominal.length)
         beside = rng.uniform(-LARGEST_OFFSET, LARGEST_OFFSET, (2, count))
-        stiffness = size["elastic joints"] * np.exp(rng.uniform(*map(math.log, JOINTS), count))
+        stiffness = size["elastic joints"] * np.exp(rng.uniform(math.log(JOINTS[0]), math.log(JOINTS[1]), count))
         self.mechanics = {
             "links": ArmModel(nominal.length, cog, mass), "cog_y": beside[0], "cog_z": beside[1],
             "coulomb_friction": rng.uniform(*COULOMB, count), "viscous_friction": rng.uniform(*VISCOUS, count),
