@@ -11,6 +11,7 @@ import pytest
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import LARGEST_WARMING, JointMotor
 from exo_gravity.core.safety.drive import Send
+from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.hardware.can.motor_bus import WARMING, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import Wire
@@ -32,7 +33,7 @@ class Bus(MotorBus):
         self.device = SimulatedDevice(stuck, [SimulatedMotor(motor, firmware) for motor in MOTORS])
         self.warm(temperature)
         wire.play(self.device)
-        super().__init__(wire.open(), MOTORS, clock=wire.clock)
+        super().__init__([CanPort(wire.open(), wire.clock)] * len(MOTORS), MOTORS, clock=wire.clock)
         self.exchange(sending(Send.ENTER), self.clock.monotonic() + 0.01)
 
     def warm(self, temperature: float) -> None:
