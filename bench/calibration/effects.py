@@ -239,7 +239,8 @@ def told(found: Outcome) -> str:
 
 def rows_of(found: list[Outcome]) -> list[Row]:
     """Return the table: error of peak (median, 95th percentile, worst) and cover of each joint."""
-    rows = [Row("devices whose tours gave no result", str(sum(one.after is None for one in found)), "0", True)]
+    refused = sum(one.after is None for one in found)
+    rows = [Row("devices that could not be calibrated", str(refused), "0", not refused)]
     groups = {"all devices": found}
     for name in EFFECTS:
         groups[name] = [one for one in found if name in one.effects]

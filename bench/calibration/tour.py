@@ -30,7 +30,7 @@ from exo_gravity.sim.params import device_of, imu_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
 LONGEST = 420.0  # s
-HANDS, SINKING = 1.0, 5.0  # Nm s/rad of the hands that let the arm hang, and s that it takes
+SINKING = 5.0  # s
 
 
 @dataclass
@@ -93,11 +93,8 @@ def player_of(nodes: Mapping[str, Any], path: Path, namespace: str = "/right") -
 
 
 def let_hang(device: SimulatedDevice) -> None:
-    """Let the arm sink to where it hangs, as by hand; the clock of the device goes on."""
-    damping = device.arm.model.dof_damping.copy()
-    device.arm.model.dof_damping[:] = HANDS
+    """Let the arm sink to where it hangs; the clock of the device goes on."""
     device.advance(SINKING)
-    device.arm.model.dof_damping[:] = damping
 
 
 def run_tour(players: list[Player], prepare: Callable[[Player], None] = lambda player: None) -> Callable[..., LiveTour]:

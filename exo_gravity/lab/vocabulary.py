@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The words that programs read on /diagnostics of the nodes beside the path of a torque: docs/keys.md."""
+"""The words on /diagnostics of nodes off the path of a torque, for programs to read: docs/keys.md."""
 
 from exo_gravity.core.vocabulary import Word
 
@@ -46,7 +46,7 @@ class Adapts(Word):
 
 
 class NodeState(Word):
-    """What a node beside the path does."""
+    """What a node off the path of a torque is doing."""
 
     WAITING = "waiting"
     RUNNING = "running"

@@ -88,21 +88,19 @@ def test_a_torque_within_the_band_is_not_distinguishable_from_zero():
     assert not any(inside.distinguishable) and all(outside.distinguishable)
 
 
+def worn_arm(**joints):
+    """Return a MuJoCo arm with friction and the wearer's arm in it. joints: more of its ArmConfig."""
+    friction = {"coulomb_friction": COULOMB, "viscous_friction": VISCOUS}
+    return SimulatedArm(ArmConfig(DEFAULT_LINKS, wearer_mass=LOAD.mass, wearer_cog=LOAD.cog, **friction, **joints))
+
+
 def simulated(seconds, torque_of, base=None):
     """Yield time, joints, wearer's torque and tilt of a MuJoCo arm of slender rods with the wearer's arm in it.
 
     torque_of: time -> torque (4,) of the wearer in Nm, on top of motors that lead the arm along a path. base: time ->
     TrunkState.
     """
-    arm = SimulatedArm(
-        ArmConfig(
-            DEFAULT_LINKS,
-            wearer_mass=LOAD.mass,
-            wearer_cog=LOAD.cog,
-            coulomb_friction=COULOMB,
-            viscous_friction=VISCOUS,
-        )
-    )
+    arm = worn_arm()
     arm.reset(POSE)
     for n in range(round(seconds / PERIOD)):
         now = n * PERIOD
@@ -197,17 +195,7 @@ def elastic(seconds):
 
     The motors carry both arms. The wearer moves the links.
     """
-    joints = {"joint_stiffness": (SOFT,) * 4, "backlash": (math.radians(1.0),) * 4}
-    arm = SimulatedArm(
-        ArmConfig(
-            DEFAULT_LINKS,
-            wearer_mass=LOAD.mass,
-            wearer_cog=LOAD.cog,
-            coulomb_friction=COULOMB,
-            viscous_friction=VISCOUS,
-            **joints,
-        )
-    )
+    arm = worn_arm(joint_stiffness=(SOFT,) * 4, backlash=(math.radians(1.0),) * 4)
     arm.move_base(np.multiply(DEFAULT_LINKS.gravity, TILT.direction).tolist())
     arm.reset(POSE)
     carries = replace(SETTINGS, mode="zero_g", support=1.0, joint_stiffness=(SOFT,) * 4, max_effort=(18.0,) * 4)

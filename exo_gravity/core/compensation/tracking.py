@@ -330,6 +330,8 @@ class Tracker:
 
     def _frequencies(self, inertia: np.ndarray) -> np.ndarray:
         """Return the natural frequencies (n,) in rad/s of the joints, which carry `inertia` (n,) kg m^2."""
+        if not self._is_soft.any():
+            return self._frequency
         least = np.minimum(_least_frequencies(inertia), self._rigid)
         return np.where(self._is_soft, np.maximum(self._frequency, least), self._frequency)
 
