@@ -76,8 +76,10 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
 
     def carry(**options: int) -> Carrier:
         carriers.append(Carrier(rig, tmp_path, **options))
-        assert carriers[-1].watchdog, carriers[-1].log()
-        assert rig.motors_on == [True] * 4
+        carrier = carriers[-1]
+        if not (carrier.watchdog and all(rig.motors_on)):
+            carrier.kill()
+            pytest.fail(f"the arm is not carried: motors {rig.motors_on}, log: {carrier.log()}")
         return carriers[-1]
 
     yield carry

@@ -9,6 +9,8 @@ import os
 import socket
 from collections.abc import Iterator
 
+from exo_gravity.hardware.ownership.bus_lock import notes_file
+
 FIRST_PORT = 20_000  # of a bus; those of other programs begin at 32,768
 BLOCKS, BLOCK = 25, 500  # blocks, and ports in each
 DOMAINS = 49  # DDS takes ports from 7,400 on, 250 for each domain: these end below the first of a bus
@@ -36,9 +38,18 @@ def own_domain() -> int:
 
 @functools.cache
 def own_ports() -> Iterator[int]:
-    """Return every second port of this process's block, again and again; the ones between are free too."""
+    """Return every second port of this process's block, again and again; the ones between are free too.
+
+    A port on which a process that has ended left its motors on is passed over: whoever takes that bus lets an arm down
+    first, and a watchdog without its simulated motors waits there for them.
+    """
     first = FIRST_PORT + BLOCK * _claim("ports", BLOCKS)[0]
-    return itertools.cycle(range(first, first + BLOCK, 2))
+    return filter(_is_free, itertools.cycle(range(first, first + BLOCK, 2)))
+
+
+def _is_free(port: int) -> bool:
+    folder = notes_file(("udp_multicast", "", {})).parent
+    return not any(folder.glob(f"exo_gravity_*_{port}.bus"))
 
 
 def free_port() -> int:
