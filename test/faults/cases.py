@@ -92,13 +92,16 @@ def left_arm_is_carried(rig: BothArmsRig) -> None:
 
 
 def not_thrown_back(records: np.ndarray) -> str:
-    """Return what is wrong if the elbow leaves the wall faster than half its speed into the wall."""
+    """Return what is wrong if the elbow leaves the wall faster than a fifth of its speed into the wall.
+
+    In virtual time, after this push, it leaves at 0.02 of that speed; at 0.30 where the wall has no damping.
+    """
     velocity = records["velocity"][:, 3]
     inward = int(np.argmax(velocity))
     into, back = float(velocity[inward]), float(-velocity[inward:].min())
     if into < 1.0:
         return f"the push reached only {into:.1f} rad/s"
-    return f"thrown back at {back:.1f} after {into:.1f} rad/s" if back > 0.5 * into else ""
+    return f"thrown back at {back:.1f} after {into:.1f} rad/s" if back > 0.2 * into else ""
 
 
 def push_elbow(rig: Rig) -> None:
