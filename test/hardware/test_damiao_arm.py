@@ -234,6 +234,19 @@ def test_a_motor_with_an_error_is_never_switched_on_again() -> None:
     assert arm.caused.speed < UNKNOWN_LOSS[0] and arm.caused.energy < UNKNOWN_LOSS[1], arm.caused
 
 
+def test_an_error_that_has_passed_is_forgotten_once_the_operator_clears_the_fault() -> None:
+    arm = raised_arm()
+    motor = damiao_of(arm, 1)
+    motor.error = 0xB
+    assert arm.run_until(lambda: arm.loop.is_off, 30.0)
+    motor.error = 0
+    arm.run(1.0)
+    assert motor.latched == 0xB
+    assert arm.safety.clear(arm.now)
+    arm.carry()  # at once: the last reply still shows the error
+    assert motor.latched == 0 and motor.entered
+
+
 def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
     arm = arm_of()
     joints = [replace(joint_of(name, 1 + i), master_id=0x20 + i if i == 1 else 0) for i, name in enumerate(NAMES)]

@@ -290,6 +290,7 @@ DAMIAO_MIT = DamiaoFormat(
     last_id=LAST_ID,
     id_bits=8,
     on=((0, CLEAR_ERROR), (0, ENTER)),
+    clear_error=((0, CLEAR_ERROR),),
     stops=frozenset((EXIT, CLEAR_ERROR)),
     needs_timeout=True,
     let_go=frozenset((LOST,)),

@@ -225,6 +225,7 @@ class WireFormat(ABC):
     #: frames that switch a motor on, before its first command; none if the command itself does
     on: tuple[Frame, ...] = ((0, ENTER),)
     off: tuple[Frame, ...] = ((0, EXIT),)  #: frames that switch a motor off
+    clear_error: tuple[Frame, ...] = ()  #: frames that clear an error of a motor, which stays off; none if none does
     #: frames that make the present angle zero; none if the board has no such frame
     zero: tuple[Frame, ...] = ((0, SET_ZERO),)
     stops: frozenset[bytes] = frozenset((EXIT,))  #: data of all commands that switch a motor off

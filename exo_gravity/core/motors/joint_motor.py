@@ -89,11 +89,12 @@ class JointMotor:
     command_id: int = field(init=False)  #: the arbitration ID of commands
     reply_id: int = field(init=False)  #: the arbitration ID of replies or status frames
     settings: Sequence[Setting] = field(init=False)  #: that the board must have
-    #: the frames that switch the motor on, before its next command; that switch it off; and that make its present angle
-    #: zero, none if its board has no such frame
+    #: the frames that switch the motor on, before its next command; that switch it off; that make its present angle
+    #: zero, and that clear its error, none if its board has no such frame
     enter: tuple[Frame, ...] = field(init=False)
     exit: tuple[Frame, ...] = field(init=False)
     set_zero: tuple[Frame, ...] = field(init=False)
+    clear_error: tuple[Frame, ...] = field(init=False)
     #: Nm at the joint, for any time: a motor that gives less than commanded already has its rated current when its
     #: rated torque is commanded; and for seconds
     rated_effort: float = field(init=False)
@@ -122,7 +123,7 @@ class JointMotor:
             expected = f"{never}from {shortest:g} to {longest:g} s: set it in the motor's firmware (docs/wiring.md)"
             raise ParameterError("motor_timeout", self.timeout, expected)
         reply_id = board.reply_id(self.can_id, self.master_id)
-        frames = {"enter": board.on, "exit": board.off, "set_zero": board.zero}
+        frames = {"enter": board.on, "exit": board.off, "set_zero": board.zero, "clear_error": board.clear_error}
         derived: dict[str, object] = {
             "command_id": board.first_id + self.can_id,
             "reply_id": reply_id,

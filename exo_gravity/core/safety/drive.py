@@ -47,6 +47,7 @@ class Send(Enum):
     ENTER = "enter"  #: is switched on
     CLEAR = "clear"  #: is switched on and, at once, forgets the command that it remembers
     EXIT = "exit"  #: is switched off
+    CLEAR_ERROR = "clear error"  #: forgets an error that keeps it off; polled where a board has no such frame
 
 
 class Drive(NamedTuple):

@@ -136,6 +136,8 @@ class SafetyMachine:
         if self.state is not State.FAULT:
             return False
         self.fault = None
+        for power in self.power:
+            power.clear_error()
         self._on(StateEvent.CLEAR, now)
         return True
 
@@ -286,6 +288,8 @@ class SafetyMachine:
         effort: (n,) Nm, what is asked for, None if that is not known.
         """
         readings, limits = self._readings, self.limits
+        if any(power.is_clearing for power in self.power):
+            return
         missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
         if isinstance(missing, Fault):
             self._trip(missing)

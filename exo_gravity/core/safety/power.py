@@ -102,6 +102,7 @@ class MotorPower:
     replies: whether its board replies to commands (V1, V2), or reports on its own timer (V3).
 
     state: of the motor. may_return: whether it may be switched on again, once, if it is found off while it carries.
+    is_clearing: whether it has yet to forget its error: its last reply still shows it.
     """
 
     def __init__(self, replies: bool) -> None:
@@ -113,6 +114,7 @@ class MotorPower:
         self._torque = 0.0  # Nm, smoothed since it replies
         self._told_off = 0  # replies in a row that said that it is off
         self._exits: list[float] = []  # s, of the last two
+        self.is_clearing = False
 
     @property
     def may_be_on(self) -> bool:
@@ -141,12 +143,17 @@ class MotorPower:
             return
         if self.state is Power.ENTERING:
             self.may_return = True
+            self.is_clearing = False
         elif self.state in (Power.UNSURE, Power.UNKNOWN):
             self.may_return = False
             self._torque = self._heard_for = 0.0
             self._told_off = 0
         elif self.state is Power.LEAVING:
             self._exits = []
+
+    def clear_error(self) -> None:
+        """Let the motor forget its error, once, while it is off: an operator has cleared the fault."""
+        self.is_clearing = self._board == 0
 
     def step(self, dt: float, joint: JointSample, is_silent: bool) -> None:
         """Take the newest reply, `dt` s after the last call."""
@@ -181,6 +188,9 @@ class MotorPower:
     def send(self, now: float) -> Send:
         """Return what the motor is sent at `now` s."""
         send = SENT[self.state][self._board]
+        if send is Send.POLL and self.is_clearing:
+            self.is_clearing = False
+            return Send.CLEAR_ERROR
         if self.state is Power.OFF and (not self._exits or now - self._exits[-1] >= POWER.exit_period):
             send = Send.EXIT
         if send is Send.EXIT:

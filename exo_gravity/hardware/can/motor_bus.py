@@ -200,9 +200,8 @@ class MotorBus:
 
         Nothing is sent to others: another owner may have left them on.
         """
-        left = [
-            joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in (Send.POLL, Send.EXIT)
-        ]
+        off = (Send.POLL, Send.EXIT, Send.CLEAR_ERROR)
+        left = [joint for joint, send in enumerate(self._drive.send) if self._has_sent and send in off]
         for _ in range(2 if left else 0):
             self._failed.clear()
             self._answered.clear()
@@ -240,6 +239,8 @@ class MotorBus:
             return motor.exit
         if send is Send.ENTER:
             return motor.enter
+        if send is Send.CLEAR_ERROR:
+            return motor.clear_error or ((motor.idle,) if self.replies[joint] else ())
         return (*motor.enter, motor.idle) if send is Send.CLEAR else ()
 
     def _sort(self, port: CanPort, message: can.Message) -> tuple[str, int]:
