@@ -9,6 +9,7 @@ supply of all motors is switched, they stay off until the arm is enabled.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -132,8 +133,9 @@ def start_on_the_second_bus(rig: Rig) -> None:
 OWNERSHIP = (
     FaultCase("can_bridge of another session on the bus", start_in_another_session, limit=None, outcomes=("active",),
         afterwards=has_refused),
+    # Motors that were cut off for so long drop, under full damping, what has faded meanwhile: no frame tells before.
     FaultCase("motors silent for long, then the next can_bridge", start_with_silent_motors, HandedOverRig, limit=None,
-        unreached=ALL_JOINTS, afterwards=next_bridge_let_it_down, ends_rig=True),
+        unreached=ALL_JOINTS, steps_from=math.inf, afterwards=next_bridge_let_it_down, ends_rig=True),
     FaultCase("can_bridge: SIGHUP", send_signal("can_bridge", HANG_UP), limit=PROCESS_REACTION),
     FaultCase("launcher's terminal closed", lambda rig: rig.launcher.send_signal(HANG_UP), LauncherRig,
         PROCESS_REACTION),
