@@ -20,6 +20,7 @@ import numpy as np
 from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.descent import DESCENT
 
 from ..support.launched_nodes import SECOND_GROUP
 from ..support.ros_probe import Timeout
@@ -49,7 +50,8 @@ from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, Action, FaultCas
 from .rig import Rig
 from .rigs import HandedOverRig, LauncherRig, ShortEnableRig, TwoBusRig, TwoBusV3Rig, V3Rig
 
-GIVEN_UP = 8.0  # s after which a watchdog says that its motors do not reply
+# s after which a watchdog has faded the torque of motors that do not reply, and hands the bus over
+GIVEN_UP = DESCENT.blind_hold + DESCENT.blind_fade_time + 1.0
 START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, or to be refused
 OBSERVED = 3.0  # s after the release
 DEAD = simulator(fault__cut_off=[False, False, True, True])
