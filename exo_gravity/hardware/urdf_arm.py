@@ -22,14 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from exo_gravity import packaged
-from exo_gravity.core.arm.arm import (
-    MAX_GAIN,
-    MAX_GRAVITY,
-    MAX_MASS,
-    MAX_PAYLOAD,
-    MAX_REACH,
-    STANDARD_GRAVITY,
-)
+from exo_gravity.core.arm.arm_data import MAX_GAIN, MAX_GRAVITY, MAX_MASS, MAX_PAYLOAD, MAX_REACH, STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
