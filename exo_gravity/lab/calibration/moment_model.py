@@ -136,7 +136,7 @@ class PapersMoments:
     shows_tilt, expects_scales = True, False
     suggested = np.radians(list(itertools.product(*GRID)))
 
-    def __init__(self, arm: ArmModel, keeps_tilt: bool = True) -> None:
+    def __init__(self, arm: ArmModel, keeps_tilt: bool) -> None:
         self.length, self.gravity, self.moments = arm.length, arm.gravity, moments_of(arm)
         self.keeps_tilt = keeps_tilt
 

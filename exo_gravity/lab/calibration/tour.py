@@ -338,4 +338,5 @@ def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:
     moments = values["first_moment"], values["off_axis"]
-    return PapersMoments(ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"]))
+    arm = ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"])
+    return PapersMoments(arm, values["use_imu"])
