@@ -32,7 +32,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.numbers import COVER, Vector

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.params import values_of
-from exo_gravity.hardware.urdf_arm import read_urdf
+from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
@@ -87,14 +87,17 @@ def measure_laws(quick: bool) -> Iterator[Row]:
         spread,
     )
     for file in URDF_ARMS:
-        yield _measure_urdf(file, blocks)
+        yield from _measure_urdf(file, blocks)
 
 
-def _measure_urdf(file: str, blocks: int) -> Row:
-    """Return the row of the arm from a URDF that a file in config describes."""
+def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
+    """Yield the rows of the arm from a URDF that a file in config describes.
+
+    One pose as the loop asks for it, and as a calibration's does, which has moments of its own for each joint.
+    """
     import pinocchio as pin
 
-    arm = carried_arm(load(packaged_config(file)), "/right").settings.robot
+    arm = cast(UrdfArm, carried_arm(load(packaged_config(file)), "/right").settings.robot)
     text = read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"])
     model = pin.buildModelFromXML(text)
     model.gravity.linear = np.array((0.0, 0.0, -arm.gravity))
@@ -108,6 +111,23 @@ def _measure_urdf(file: str, blocks: int) -> Row:
     np.testing.assert_allclose(arm.gain * loop(), arm.torques(poses[:LOOP], upright[:LOOP]), atol=1e-12)
     ours, peer = race(((lambda: arm.torques(poses, upright), 1), (loop, 1)), blocks)
     ratios = [one / other / POSES * LOOP for one, other in zip(ours.blocks, peer.blocks, strict=True)]
-    name = f"law of a URDF with {count} joints, 100,000 poses, per pose: Pinocchio in a loop"
+    name = f"law of a URDF with {count} joints"
     spread = f"{ours.text(1e6 / POSES)}, x{range_of(ratios)}"
-    return Row(name, ours.median / POSES * 1e6, peer.median / LOOP * 1e6, "us", spread)
+    whole = f"{name}, 100,000 poses, per pose: Pinocchio in a loop"
+    yield Row(whole, ours.median / POSES * 1e6, peer.median / LOOP * 1e6, "us", spread)
+
+    theta, still, tilt = poses[0].tolist(), np.zeros(count), Tilt.of("left")
+    hold = arm.by_moments(np.tile(arm.moments, (count, 1)))
+    np.testing.assert_allclose(hold(theta, tilt), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
+    loop_pose, peer, tour_pose, regressor = race(
+        (
+            (lambda: arm.torque(theta, tilt), 500),
+            (lambda: pin.computeGeneralizedGravity(model, data, poses[0]), 500),
+            (lambda: hold(theta, tilt), 200),
+            (lambda: pin.computeJointTorqueRegressor(model, data, poses[0], still, still), 200),
+        ),
+        blocks,
+    )
+    yield Row(f"{name}, one pose: Pinocchio", loop_pose.median * 1e6, peer.median * 1e6, "us", loop_pose.text(1e6))
+    what = f"{name}, one pose, moments of each joint: Pinocchio's regressor"
+    yield Row(what, tour_pose.median * 1e6, regressor.median * 1e6, "us", tour_pose.text(1e6))

@@ -21,7 +21,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 from exo_gravity.core import paper_static_torque
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel, papers
+from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import NO_TORQUE, Torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer

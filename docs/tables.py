@@ -170,7 +170,10 @@ def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
     for _, group in groupby(params, lambda param: re.sub("_[xyz]$", "_", param.name)):
         first, *others = group
         names = ", ".join(f"`{param.name}`" for param in (first, *others))
-        meaning = re.sub(r"\b(along|about) x\b", r"\1 x, y, z", first.description) if others else first.description
+        axes = ", ".join(rf"{param.name[-1]}\2" for param in (first, *others))
+        meaning = (
+            re.sub(r"\b(along|about) [xyz](_n)?\b", rf"\1 {axes}", first.description) if others else first.description
+        )
         permitted = _range(first) if with_range else ""
         rows.append((names, f"{_default(first)} {permitted}".rstrip(), meaning))
     return markdown(("parameter", "default (range)" if with_range else "default", "meaning"), rows)

@@ -23,7 +23,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.arm import ModelError
+from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt

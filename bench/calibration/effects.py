@@ -163,7 +163,7 @@ class Device:
         limits = Limits(ARM.joint_names, max_effort=MAX_EFFORT, sign_check_torque=0.0)
         tilt = Tilt.of(device.side, *stand)
         expected = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-        guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), expected, tilt)
+        guess = TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), expected, tilt)
         tour = Tour(limits, guess, Itinerary(limits, poses, DURATION), RATE, load)
         fault = Player(tour, device, ASSUMED, limits, RATE, tilt).play().fault
         if not tour.done:

@@ -17,7 +17,7 @@ from exo_gravity.lab.calibration.poses import next_pose
 from exo_gravity.lab.moments import load_moments, regressor
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
-PAPERS = PapersMoments(ArmModel.from_moments(LENGTH, (0.0,) * 4))
+PAPERS = PapersMoments(ArmModel.from_moments(LENGTH, (0.0,) * 4), keeps_tilt=True)
 LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something
 UPRIGHT = (0.0, 0.0, 1.0)
 Direction = tuple[float, float, float]

@@ -20,7 +20,8 @@ import numpy as np
 from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
 from bench.calibration.random_device import LEANING, LENGTH, PAPERS, UPRIGHT, Device, off_axis_of
 from bench.motion_monitor import MOTOR_NAMES
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer

@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, papers
+from exo_gravity.core.arm.arm import papers
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk

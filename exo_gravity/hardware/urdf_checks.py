@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 
 Pinocchio = Any  # the module, and its models: it has no type hints
@@ -93,7 +93,7 @@ class UrdfJoints:
                 raise ParameterError("joint_names", name, expected)
         self._leaders = {name: self._leader(name) for name in movable}
         free = sorted({leader.joint for leader in self._leaders.values() if leader.joint in movable} - set(self.names))
-        self._reported: dict[str, float] = {}
+        self._reported: set[str] = set()
         self.others = [self._limits(name) for name in free]  #: joints that are not the arm's and change its torque
         self._couple()
         self.peak, effects = self._tried()  #: (n,) Nm, the largest torque that gravity needs in any pose and tilt
@@ -109,13 +109,12 @@ class UrdfJoints:
         Raises ParameterError while a joint that cannot be at 0 is not reported.
         """
         self._check_others()
-        return self._placed(np.asarray(theta, dtype=float), self._at)
+        return self._configuration_at(self._own @ np.asarray(theta) + self._still)
 
     def positions(self, theta: np.ndarray) -> np.ndarray:
         """Return the positions (m, nv) of the model's joints for the angles `theta` (m, n) in rad. Raises likewise."""
         self._check_others()
-        still = self._coupling[:, len(self.names) :] @ self._at + self._offset
-        return np.asarray(theta @ self._own.T + still)
+        return np.asarray(theta @ self._own.T + self._still)
 
     def spread(self, values: Sequence[float]) -> np.ndarray:
         """Return the velocities or accelerations (nv,) of the model for the arm's (n,)."""
@@ -138,7 +137,8 @@ class UrdfJoints:
         Raises ParameterError if one that changes the torque is not finite, or is missing although it was reported
         before or cannot be at 0.
         """
-        for other in self.others:
+        at, reported = self._at.copy(), set()
+        for number, other in enumerate(self.others):
             if other.name not in names:
                 if other.name in self._reported or not other.can_be_at_zero:
                     raise _missing(other)
@@ -146,7 +146,11 @@ class UrdfJoints:
             position = float(positions[list(names).index(other.name)])
             if not math.isfinite(position):
                 raise ParameterError(f"position of {other.name}", position, "finite: the arm's torque depends on it")
-            self._reported[other.name] = self._at[self.others.index(other)] = position
+            at[number] = position
+            reported.add(other.name)
+        if reported:
+            self._reported |= reported
+            self._hold_others(at)
 
     def limits(self, name: str) -> tuple[float, float]:
         """Return the lowest and the highest angle of an arm's joint in rad; a continuous one may be anywhere."""
@@ -182,27 +186,30 @@ class UrdfJoints:
                     coupling[model.joints[number].idx_v, order.index(leader)] = multiplier
         self._coupling, self._own = coupling, coupling[:, : len(self.names)]
         self._neutral, self._data = self._pin.neutral(model), model.createData()
-        self._at = np.array([min(max(0.0, other.lower), other.upper) for other in self.others])
+        self._hold_others(np.array([min(max(0.0, other.lower), other.upper) for other in self.others]))
+
+    def _hold_others(self, at: np.ndarray) -> None:
+        """Take the positions `at` of the other joints, and compute once what they add to those of the model, (nv,)."""
+        self._at, self._still = at, self._coupling[:, len(self.names) :] @ at + self._offset
 
     def _lock(self, others: list[Other]) -> None:
         """Keep the arm's joints, `others`, and what follows them; lock all other joints of the model."""
         kept = {*self.names, *(other.name for other in others)}
         names = enumerate(self.model.names)
         locked = [n for n, name in names if n and (name not in self._leaders or self._leaders[name].joint not in kept)]
-        self.model = self._pin.buildReducedModel(self.model, locked, self._placed(np.zeros(len(self.names)), self._at))
+        self.model = self._pin.buildReducedModel(self.model, locked, self._configuration_at(self._still))
         self.others = others
         self._couple()
 
-    def _placed(self, positions: np.ndarray, at: Sequence[float] | np.ndarray = ()) -> np.ndarray:
-        """Return the configuration for the positions of the arm's joints and, `at`, of the others."""
-        moved: np.ndarray = self._coupling @ np.concatenate((positions, at)) + self._offset
+    def _configuration_at(self, positions: np.ndarray) -> np.ndarray:
+        """Return the configuration (nq,) for the positions of the model's joints, (nv,)."""
         if self.model.nq == self.model.nv:  # no continuous joint, which has two numbers in a configuration
-            return moved
-        return np.asarray(self._pin.integrate(self.model, self._neutral, moved))
+            return positions
+        return np.asarray(self._pin.integrate(self.model, self._neutral, positions))
 
     def _torque(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         self.model.gravity.linear = gravity
-        at = self._placed(positions)
+        at = self._configuration_at(self._coupling @ positions + self._offset)
         return self.folded(self._pin.computeGeneralizedGravity(self.model, self._data, at))
 
     def _tried(self) -> tuple[np.ndarray, np.ndarray]:

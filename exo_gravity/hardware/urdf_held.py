@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import NO_PAYLOAD
+from exo_gravity.core.arm.arm_data import NO_PAYLOAD
 from exo_gravity.core.errors import ParameterError
 
 

@@ -106,15 +106,19 @@ class UrdfShape:
         The origins (n + 1, 3) in m of the joints and the hand, the axes (n, 3) about which the joints turn, and unit
         vectors (n, 3) across them, as far as possible along the links.
         """
-        own, along = self._axes, []
-        for n, (axis, way) in enumerate(zip(own, self._along, strict=True)):
+        frames = self._frames(np.array([theta]))
+        turns, along = frames.after[0], self._along_links
+        return self._with_hand(frames)[0], *(np.einsum("nab,nb->na", turns, ways) for ways in (self._axes, along))
+
+    @cached_property
+    def _along_links(self) -> np.ndarray:
+        """Unit vectors (n, 3) across the joints' axes in their own frames, as far as possible along the links."""
+        along = []
+        for n, (axis, way) in enumerate(zip(self._axes, self._along, strict=True)):
             across = way - axis * (axis @ way)
             size = float(np.linalg.norm(across))
             along.append(across / size if size > LEAST_LENGTH else self._across(n)[0])
-        poses = np.array([theta])
-        turns = self.frames(poses)[1][0]
-        axes, links = (np.einsum("nab,nb->na", turns, ways) for ways in (own, along))
-        return self.places(poses)[0], axes, links
+        return np.array(along)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mass (n,) kg of each joint's link, and where its centre of gravity is from the joint, (n, 3) m.
@@ -147,7 +151,10 @@ class UrdfShape:
 
         In the root link's axes.
         """
-        _, after, origins = self._frames(theta)
+        return self._with_hand(self._frames(theta))
+
+    def _with_hand(self, frames: Frames) -> np.ndarray:
+        _, after, origins = frames
         return np.concatenate((origins, origins[:, -1:] + after[:, -1:] @ self._along[-1]), axis=1)
 
     @cached_property

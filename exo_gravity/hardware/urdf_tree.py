@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 BLOCK = 4096  # poses at once: what is computed on the way stays in the processor's cache
+# (3, 9): each row the matrix that multiplies crosswise by the unit vector along an axis, from the left.
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
 
 
 class TreeJoint(NamedTuple):
@@ -38,6 +40,14 @@ class Frames(NamedTuple):
     origin: np.ndarray  #: (m, nv, 3) m
 
 
+class LinkMoments(NamedTuple):
+    """First moments of links, each along a way of its own."""
+
+    links: np.ndarray  #: (k,) numbers of the joints whose links have them
+    ways: np.ndarray  #: (k, 3, 1) unit vectors along them, in these joints' own frames
+    turned_by: np.ndarray  #: (nv, k) whether a joint turns them
+
+
 class JointTree:
     """The joints (nv,) of a model of Pinocchio, each of which turns or slides, with their links.
 
@@ -47,8 +57,14 @@ class JointTree:
     def __init__(self, pin: Any, model: Any) -> None:
         self._joints = tuple(_joints(pin, model))
         self._slides = np.array([joint.slides for joint in self._joints])
-        across = _across(np.where(self._slides[:, None], 0.0, self.axes))
-        self._across, self._twice_across = across, across @ across  # of Rodrigues' formula
+        turning, sliding = np.where([~self._slides, self._slides], self.axes.T[:, None], 0.0).transpose(1, 2, 0)
+        self._turning, self._sliding = turning[:, :, None], sliding[:, :, None]  # axes (nv, 3, 1); 0 of the others
+        self._turns = np.array([joint.turn for joint in self._joints])
+        self._places = np.array([joint.place[:, None] for joint in self._joints])
+        across = _across(turning)
+        # Rodrigues' formula, from a joint's own frame to that of the joint before it: still + sine - cosine.
+        self._sine, self._cosine = self._turns @ across, self._turns @ across @ across
+        self._still = self._turns + self._cosine
 
     @property
     def masses(self) -> np.ndarray:
@@ -69,21 +85,26 @@ class JointTree:
                 moves[:, n] |= moves[:, joint.parent]
         return moves
 
+    def turned(self, positions: np.ndarray) -> np.ndarray:
+        """Return how the joints' own frames are turned to the root link's axes, (m, nv, 3, 3), as `Frames.after`.
+
+        positions: (m, nv) rad or m.
+        """
+        sine, cosine = np.sin(positions)[:, :, None, None], np.cos(positions)[:, :, None, None]
+        turned = self._still + sine * self._sine - cosine * self._cosine
+        for n, joint in enumerate(self._joints):
+            if joint.parent >= 0:
+                turned[:, n] = turned[:, joint.parent] @ turned[:, n]
+        return np.asarray(turned)
+
     def frames(self, positions: np.ndarray) -> Frames:
         """Return the joints' frames for their positions (m, nv) in rad or m."""
-        sine, cosine = np.sin(positions)[:, :, None, None], np.cos(positions)[:, :, None, None]
-        turns = np.eye(3) + sine * self._across + (1.0 - cosine) * self._twice_across
-        before, after, origin = np.empty_like(turns), np.empty_like(turns), np.empty((*positions.shape, 3))
-        for n, joint in enumerate(self._joints):
-            before[:, n], origin[:, n] = joint.turn, joint.place
-            if joint.parent >= 0:
-                parent = after[:, joint.parent]
-                before[:, n] = parent @ joint.turn
-                origin[:, n] = origin[:, joint.parent] + parent @ joint.place
-            if joint.slides:
-                origin[:, n] += before[:, n] @ joint.axis * positions[:, n, None]
-            after[:, n] = before[:, n] @ turns[:, n]
-        return Frames(before, after, origin)
+        after = self.turned(positions)
+        root = np.broadcast_to(np.eye(3), (len(positions), 1, 3, 3))
+        parents = np.concatenate((root, after), axis=1)[:, [joint.parent + 1 for joint in self._joints]]
+        before = parents @ self._turns
+        ways = parents @ self._places + before @ self._sliding * positions[:, :, None, None]
+        return Frames(before, after, self.moves.T @ ways[..., 0])
 
     def torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         """Return what each joint must give to hold its links, (m, nv) Nm or N.
@@ -96,18 +117,23 @@ class JointTree:
             result[part] = self._torques(positions[part].T.copy(), gravity[part].T.copy()).T
         return result
 
-    def rows(self, positions: np.ndarray, gravity: np.ndarray, links: Sequence[int], ways: np.ndarray) -> np.ndarray:
+    def moments(self, links: Sequence[int], ways: Sequence[np.ndarray]) -> LinkMoments:
+        """Return first moments of links, for `rows`: they are the same in all poses.
+
+        links: (k,) numbers of the joints whose links have them. ways: (k, 3) unit vectors in these joints' own frames.
+        """
+        turned_by = self.moves[:, links] & ~self._slides[:, None]  # the force of one that slides shows no moment
+        return LinkMoments(np.array(links), np.reshape(ways, (-1, 3, 1)), turned_by)
+
+    def rows(self, positions: np.ndarray, gravity: np.ndarray, moments: LinkMoments) -> np.ndarray:
         """Return what each joint must give per first moment of a link, (m, nv, k) in Nm per kg m.
 
         positions, gravity: as in `torques`.
-        links: (k,) numbers of the joints whose links have the moments.
-        ways: (k, 3) unit vectors along the moments, in these joints' own frames.
         """
-        turned = self.frames(positions).after
-        axes = np.where(self._slides[:, None], 0.0, self.axes)  # the force of one that slides shows no moment
-        levers = (turned @ axes[:, :, None])[..., 0] @ _across(gravity)  # axis x gravity
-        moments = (turned[:, links] @ ways[:, :, None])[..., 0]
-        return np.asarray(levers @ moments.swapaxes(1, 2) * self.moves[:, links])
+        turned = self.turned(positions)
+        levers = (turned @ self._turning)[..., 0] @ _across(gravity)  # axis x gravity
+        ways = (turned[:, moments.links] @ moments.ways)[..., 0]
+        return np.asarray(levers @ ways.swapaxes(1, 2) * moments.turned_by)
 
     def _torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         """Return the torques (nv, m). positions: (nv, m). gravity: (3, m)."""
@@ -151,8 +177,7 @@ def _turn_about_z(vectors: np.ndarray, cosine: np.ndarray, sine: np.ndarray, out
 
 def _across(vectors: np.ndarray) -> np.ndarray:
     """Return the matrices (m, 3, 3) that multiply by `vectors` (m, 3) crosswise, from the left."""
-    x, y, z = vectors.T
-    return np.array([(0.0 * x, -z, y), (z, 0.0 * x, -x), (-y, x, 0.0 * x)]).transpose(2, 0, 1)
+    return np.reshape(vectors @ CROSS, (-1, 3, 3))
 
 
 def _joints(pin: Any, model: Any) -> Iterator[TreeJoint]:

@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 

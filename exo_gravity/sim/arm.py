@@ -32,7 +32,8 @@ os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJ
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, NO_PAYLOAD, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, NO_PAYLOAD
 from exo_gravity.core.arm.gravity import MAX_OFFSET
 from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.arm.kinematics import ROTORS

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_PAYLOAD
+from exo_gravity.core.arm.arm_data import MAX_PAYLOAD
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS, floats, one_float
 

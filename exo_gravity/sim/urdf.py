@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm.arm import NO_PAYLOAD, STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import NO_PAYLOAD, STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError

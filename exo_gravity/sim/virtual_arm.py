@@ -48,9 +48,8 @@ class VirtualArm:
 
     device: the arm as it is.
     controller: what turns samples into efforts.
-    motors, limits: the arm as the controller's side assumes it.
+    motors, limits: the arm as the controller's side assumes it; whoever starts a simulated arm has seen it hang.
     rate: cycles of the loop per s.
-    start_pose: in place of that of the limits; by default whoever starts a simulated arm has seen it hang.
     wire: the bus; by default one of its own, whose clock is at 0 s.
     ports: of each joint's motor, if the caller has connected the device; by default one port for all of them.
     look: called after every step of the device, at least every 2 ms.
@@ -71,7 +70,6 @@ class VirtualArm:
         look: Callable[[], None] | None = None,
         note: Callable[[Drive], None] = lambda drive: None,
         hand_over: Callable[[str], bool] = lambda reason: False,
-        start_pose: str = HANGING,
     ) -> None:
         self.device = device
         self.wire = wire or Wire(start=0.0)
@@ -80,7 +78,7 @@ class VirtualArm:
             self._played = self.wire.play(device, look) if look else self.wire.play(device, tick=None)
             ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
-        self.safety = SafetyMachine(replace(limits, start_pose=start_pose), 1.0 / rate, motors)
+        self.safety = SafetyMachine(replace(limits, start_pose=HANGING), 1.0 / rate, motors)
         self.loop = ControlLoop(self.bus, self.safety, 1.0 / rate, controller, hand_over)
 
     @property

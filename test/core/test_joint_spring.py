@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of, urdf_settings_of, urdf_table

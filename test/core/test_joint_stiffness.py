@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm import ModelError
+from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer

@@ -12,7 +12,6 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import CanPort
 from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
@@ -83,9 +82,7 @@ class CarriedArm(DirectController, VirtualArm):
             limits = replace(limits, sign_check_torque=0.0)
         DirectController.__init__(self, Compensator(settings, JOINTS), limits)
         wire = Wire(start=0.0, bitrate=bitrate)
-        wire.play(device, tick=None)
-        port = CanPort(wire.open(), wire.clock, wire.open, is_fd)
-        VirtualArm.__init__(self, device, self, joints, limits, rate, wire, [port] * len(joints))
+        VirtualArm.__init__(self, device, self, joints, limits, rate, wire)
         self.truth = device.truth = TruthRecords()
 
     def carry(self) -> None:

@@ -11,7 +11,7 @@ from can.interfaces.socketcan import SocketcanBus
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import NO_TORQUE
-from exo_gravity.core.errors import BusError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.ak import pack_reply
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, SET_ZERO, MotorCommand, unpack_command
@@ -75,6 +75,13 @@ def test_every_motor_is_read_in_joint_coordinates(bus, device):
     assert bus.exchange(OFF, now(bus) + 1.0)
     for sample, angle in zip(bus.samples, (0.1, 0.2, 0.3, 0.4), strict=True):
         assert sample.position == pytest.approx(angle, abs=0.01)
+
+
+def test_a_bus_in_place_of_the_motors_ports_is_refused_at_once(other):
+    with pytest.raises(ParameterError, match=r"ports = .*must be the port or None for each of 4 motors"):
+        MotorBus(other, MOTORS_OF_ARM)
+    with pytest.raises(ParameterError, match="ports"):
+        MotorBus([None], MOTORS_OF_ARM)
 
 
 def test_an_exchange_moves_the_simulated_arm(bus, device):

@@ -41,6 +41,7 @@ BRANCHES = "".join(
         (5, "prismatic", "l4", "0 0 1", ""),
     )
 )
+BRANCHED = f"<robot name='branches'><link name='base'/>{BRANCHES}</robot>"
 ONE_LINK = """<robot name="one">
 <link name="base"/>
 <link name="link"><inertial><origin xyz="0 0 -0.5"/><mass value="{mass}"/>
@@ -141,7 +142,7 @@ def worn(count: int, random: np.random.Generator) -> UrdfArm:
 
 
 def branched() -> UrdfArm:
-    arm = UrdfArm(f"<robot name='branches'><link name='base'/>{BRANCHES}</robot>", ["j1", "j3", "j4"])
+    arm = UrdfArm(BRANCHED, ["j1", "j3", "j4"])
     arm.follow(["j5"], [0.35])
     assert not arm.fixed
     return arm
@@ -164,6 +165,42 @@ def test_many_poses_at_once_have_the_torques_that_pinocchio_computes_for_each(co
         changed = arm.with_more_moments(0.1 * more)
         with_more = [changed.torque(pose, tilt) for pose, tilt in zip(theta, tilts, strict=True)]
         assert np.allclose(np.subtract(with_more, each), 0.1 * rows[:, :, k], rtol=0.0, atol=1e-12)
+
+
+def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
+    random = np.random.default_rng(6)
+    arm, pin = branched(), pytest.importorskip("pinocchio")
+    model = pin.buildModelFromXML(BRANCHED)
+    data = model.createData()
+    theta = random.uniform(-3.0, 3.0, (POSES, 3))
+    down = np.array([random_gravity(random) for _ in theta]) / STANDARD_GRAVITY
+    moments = random.normal(size=(3, len(arm.base)))
+    by_moments = arm.by_moments(moments)
+    rows, places, (before, after) = arm.regressor(theta, down), arm.places(theta), arm.frames(theta)
+    for n, (j1, j3, j4) in enumerate(theta):
+        one = theta[n : n + 1]
+        assert np.allclose(arm.regressor(one, down[n])[0], rows[n], rtol=0.0, atol=1e-12)
+        own = by_moments(one[0].tolist(), Tilt.of_gravity("left", down[n]))
+        assert np.allclose(own, np.einsum("jk,jk->j", rows[n], moments), rtol=0.0, atol=1e-12)
+        position = dict(zip(("j1", "j2", "j3", "j4", "j5"), (j1, 0.2 * j1 + 0.05, j3, j4, 0.35), strict=True))
+        at = pin.integrate(model, pin.neutral(model), np.array([position[name] for name in list(model.names)[1:]]))
+        pin.forwardKinematics(model, data, at)
+        frames = [data.oMi[model.getJointId(name)] for name in arm.names]
+        assert np.allclose(places[n, :3], [frame.translation for frame in frames], rtol=0.0, atol=1e-12)
+        assert np.allclose(after[n], [frame.rotation for frame in frames], rtol=0.0, atol=1e-12)
+        for own, name in zip(before[n], arm.names, strict=True):
+            joint = model.getJointId(name)
+            place = data.oMi[model.parents[joint]].rotation @ model.jointPlacements[joint].rotation
+            assert np.allclose(own, place, rtol=0.0, atol=1e-12)
+        assert np.allclose(arm.pose(one[0].tolist())[0], places[n], rtol=0.0, atol=1e-12)
+
+
+def test_a_missing_joint_leaves_the_others_where_they_were():
+    arm = branched()
+    before = arm.places(np.zeros((1, 3)))
+    with pytest.raises(ParameterError, match="j5"):
+        arm.follow(["j1"], [1.0])
+    assert np.array_equal(arm.places(np.zeros((1, 3))), before)
 
 
 def test_one_link_takes_its_weight_times_its_lever():

@@ -74,7 +74,7 @@ def acceptance(
     device.motors[0].temperature = spoil.pop("temperature", 25.0)
     for name, value in spoil.items():
         setattr(person, name, value)
-    return played(device, assumed, LIMITS, PapersMoments(DEFAULT_LINKS), WEIGHT, person, RATE)
+    return played(device, assumed, LIMITS, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), WEIGHT, person, RATE)
 
 
 def played(
@@ -168,5 +168,5 @@ def test_a_time_out_that_is_not_that_of_the_file_fails(true, assumed, sentence):
 
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
-    bench = Bench(None, None, MOTORS, PapersMoments(DEFAULT_LINKS), WEIGHT, None, None, None)
+    bench = Bench(None, None, MOTORS, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), WEIGHT, None, None, None)
     assert bench.moments == pytest.approx(moments_of(loaded_links()))

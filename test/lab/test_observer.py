@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.arm import ModelError
+from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.kinematics import links_of, turning_in_base
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings

@@ -110,7 +110,7 @@ def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_u
         BusLock(rig.arm.address, "another")
     rig.device.bus_silent = True
     with monkeypatch.context() as patch:
-        patch.setattr(can_bridge, "DESCENT_TIMEOUT", 1.0)
+        patch.setattr(can_bridge, "TRANSITION_TIMEOUT", 1.0)
         assert bridge.trigger_deactivate() is FAILURE
     rig.device.bus_silent = False
     assert bridge.trigger_deactivate() is SUCCESS  # so the node had stayed active

@@ -9,7 +9,7 @@ import pytest
 
 from bench.calibration.random_device import off_axis_of
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.lab.calibration.imu import ImuRecord
 from exo_gravity.sim.imu import ImuConfig, SimulatedImu
 from exo_gravity.sim.trunk_motion import TrunkState

@@ -57,7 +57,7 @@ class TourRun:
         device.pitch, device.roll = self.tilt
         tilt = Tilt.of("right", *self.tilt)
         moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
-        guess = TorqueGuess(PapersMoments(self.assumed), moments, tilt)
+        guess = TorqueGuess(PapersMoments(self.assumed, keeps_tilt=True), moments, tilt)
         tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
         player = Player(tour, device, MOTORS_AS_MOUNTED, self.limits, self.rate, tilt, self._disturb)
         self.device, self.log = device, player.log

@@ -33,6 +33,7 @@ POSES = np.radians(
 
 
 ROBOT = configured_arm().robot
+PAPERS = PapersMoments(ROBOT, keeps_tilt=True)
 #: The links of the configured arm, a fifth heavier, with centres of gravity off their axes.
 TRUE = ArmModel.from_moments(ROBOT.length, 1.2 * np.array(ROBOT.first_moment), (0.004, -0.006, 0.003, 0.002))
 LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on link 4
@@ -53,11 +54,9 @@ def outcome(outlier: int | None = None, **changes: object) -> CalibrationResult:
         Observation(theta, DOWN, torque, FRICTION, np.full(4, 0.005), *(LOAD if loaded else (0.0, 0.0)))
         for theta, torque, loaded in zip(POSES, effort, LOADED, strict=True)
     )
-    result = identify(taken, PapersMoments(ROBOT))
+    result = identify(taken, PAPERS)
     change = Change("/right/compensator", "robot.first_moment", result.moments.tolist(), "kg m, <±0.001>")
-    found = CalibrationResult(
-        (change,), ("M4 is 20 % larger.",), (), configured_arm(), PapersMoments(ROBOT), taken, result
-    )
+    found = CalibrationResult((change,), ("M4 is 20 % larger.",), (), configured_arm(), PAPERS, taken, result)
     return replace(found, **changes)  # type: ignore[arg-type]
 
 
@@ -69,7 +68,7 @@ def found() -> CalibrationResult:
 
 def remainders_of(result: CalibrationResult) -> tuple[np.ndarray, ...]:
     assert result.identified and result.arm
-    return remainders(result.identified, result.arm, PapersMoments(ROBOT), result.observations)
+    return remainders(result.identified, result.arm, PAPERS, result.observations)
 
 
 def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found: CalibrationResult) -> None:

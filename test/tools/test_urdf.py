@@ -9,7 +9,7 @@ import pinocchio
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import configured_arms

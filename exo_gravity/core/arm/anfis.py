@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import MAX_GRAVITY
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import DataError

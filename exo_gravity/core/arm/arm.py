@@ -3,44 +3,11 @@
 
 from collections.abc import Mapping, Sequence
 
-from exo_gravity.core.arm.arm_data import (
-    MAX_GAIN,
-    MAX_GRAVITY,
-    MAX_LENGTH,
-    MAX_MASS,
-    MAX_MOMENT,
-    MAX_PAYLOAD,
-    MAX_REACH,
-    MAX_WORN_BESIDE,
-    MAX_WORN_MOMENT,
-    NO_PAYLOAD,
-    STANDARD_GRAVITY,
-    ArmData,
-    ModelError,
-    moments_along,
-)
+from exo_gravity.core.arm.arm_data import ArmData
 from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, gravity_torque, moments_of
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
 from exo_gravity.core.numbers import Vector
-
-__all__ = [
-    "MAX_GAIN",
-    "MAX_GRAVITY",
-    "MAX_LENGTH",
-    "MAX_MASS",
-    "MAX_MOMENT",
-    "MAX_PAYLOAD",
-    "MAX_REACH",
-    "MAX_WORN_BESIDE",
-    "MAX_WORN_MOMENT",
-    "NO_PAYLOAD",
-    "STANDARD_GRAVITY",
-    "ArmModel",
-    "ModelError",
-    "moments_along",
-    "papers",
-]
 
 
 class ArmModel(ArmData):

@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange

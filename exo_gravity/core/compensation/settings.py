@@ -9,7 +9,8 @@ from functools import cached_property
 from typing import Any, Protocol, cast
 
 from exo_gravity.core.arm.anfis import AnfisLaw
-from exo_gravity.core.arm.arm import (
+from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.arm.arm_data import (
     MAX_GAIN,
     MAX_GRAVITY,
     MAX_LENGTH,
@@ -20,9 +21,7 @@ from exo_gravity.core.arm.arm import (
     MAX_WORN_BESIDE,
     MAX_WORN_MOMENT,
     STANDARD_GRAVITY,
-    ArmModel,
     ModelError,
-    papers,
 )
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_PAYLOAD
+from exo_gravity.core.arm.arm_data import MAX_PAYLOAD
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings

@@ -25,7 +25,7 @@ from collections.abc import Callable, Sequence
 
 import can
 
-from exo_gravity.core.errors import BusError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.frames import (
     ALIAS,
@@ -70,6 +70,8 @@ class MotorBus:
         sent nothing.
     note: called with each drive before its frames are sent.
     clock: of all times.
+
+    Raises ParameterError if there are not as many ports as motors, as with a python-can bus in their place.
     """
 
     def __init__(
@@ -80,6 +82,8 @@ class MotorBus:
         clock: Clock = COMPUTER_CLOCK,
     ) -> None:
         count = len(motors)
+        if not isinstance(ports, Sequence) or len(ports) != count:
+            raise ParameterError("ports", ports, f"the port or None for each of {count} motors")
         #: The newest reading of each joint, UNKNOWN before the first reply.
         self.samples: list[JointSample] = [UNKNOWN] * count
         self.ignored: Counter[str] = Counter()  #: count of frames that were not replies of these motors, by kind

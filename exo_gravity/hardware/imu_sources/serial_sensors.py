@@ -18,7 +18,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Quaternion, plus, product
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.trunk.imu_checks import ImuSample

@@ -136,7 +136,7 @@ class PapersMoments:
     shows_tilt, expects_scales = True, False
     suggested = np.radians(list(itertools.product(*GRID)))
 
-    def __init__(self, arm: ArmModel, keeps_tilt: bool = True) -> None:
+    def __init__(self, arm: ArmModel, keeps_tilt: bool) -> None:
         self.length, self.gravity, self.moments = arm.length, arm.gravity, moments_of(arm)
         self.keeps_tilt = keeps_tilt
 
@@ -273,13 +273,8 @@ class UrdfMoments:
         return turned.with_more_moments(np.linalg.lstsq(rows, (wanted - own).ravel(), rcond=None)[0])
 
     def holding(self, moments: np.ndarray) -> Holder:
-        """Return what multiplies the regressor of one pose with the moments of each joint."""
-
-        def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
-            rows = self.arm.regressor(np.array([theta]), tilt.magnitude * self.down(tilt))[0]
-            return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
-
-        return torque
+        """Return `UrdfArm.by_moments`."""
+        return self.arm.by_moments(moments)
 
     def common(self, moments: np.ndarray) -> np.ndarray:
         """Return what the joint shows that carries the moment with its own link."""

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import MAX_LENGTH, MAX_MASS, MAX_MOMENT, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.laws import URDF_LAW
@@ -337,4 +338,5 @@ def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()
 
 def _papers_moments(values: Mapping[str, Any]) -> MomentModel:
     moments = values["first_moment"], values["off_axis"]
-    return PapersMoments(ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"]))
+    arm = ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"])
+    return PapersMoments(arm, values["use_imu"])

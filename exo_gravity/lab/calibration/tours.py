@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ModelError, papers
+from exo_gravity.core.arm.arm import papers
+from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.compensation.laws import URDF_LAW

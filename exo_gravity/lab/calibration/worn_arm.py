@@ -11,7 +11,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import moments_along, papers
+from exo_gravity.core.arm.arm import papers
+from exo_gravity.core.arm.arm_data import moments_along
 from exo_gravity.core.arm.gravity import MAX_OFFSET, moments_of
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, wearer_of

@@ -47,7 +47,7 @@ from exo_gravity.nodes.ros.subscriptions import TiltSubscription
 
 REPORT_PERIOD = 0.1  # s
 TILT_TIMEOUT = 0.08  # s for which /imu/data goes before /imu/pitch_yaw
-DESCENT_TIMEOUT = 60.0  # s in which a deactivated arm must be down, with its motors off
+TRANSITION_TIMEOUT = 60.0  # s for a transition to let the arm down; then it is refused, and the arm held as before
 REMINDER_PERIOD = 10.0  # s between two reminders that a motor cannot be reached
 UNREACHED = "a motor does not reply and may still be powered; the node stays active"
 LEAVING = "the node is being deactivated"
@@ -169,7 +169,7 @@ class CanBridge(LifecycleNode):
     @_transition
     def on_deactivate(self) -> None:
         """Let the arm down and wait until its motors are off; the bus stays ours for the next activation."""
-        loop, end = self.loop, time.monotonic() + DESCENT_TIMEOUT
+        loop, end = self.loop, time.monotonic() + TRANSITION_TIMEOUT
         assert loop, "the node is not active"
         loop.call(lambda: loop.safety.disable(time.monotonic())).result(operation.CALL_TIMEOUT)
         while not loop.is_off:
@@ -196,7 +196,7 @@ class CanBridge(LifecycleNode):
         self._is_leaving = True
         try:
             loop.call(lambda: loop.safety.disable(time.monotonic()))
-            await Until(lambda: loop.is_off or loop.failure, DESCENT_TIMEOUT)
+            await Until(lambda: loop.is_off or loop.failure, TRANSITION_TIMEOUT)
         finally:
             self._is_leaving = False
         return "" if loop.is_off or loop.failure or transition in SHUTDOWN else UNREACHED

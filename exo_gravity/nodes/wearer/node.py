@@ -22,7 +22,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt

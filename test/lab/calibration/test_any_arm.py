@@ -206,7 +206,7 @@ def test_the_papers_derivatives_by_turns_are_pinocchios() -> None:
     data, theta, step = model.createData(), np.array((0.4, 0.9, -0.3, 0.8)), 1e-5
     down = np.array((0.2, -0.3, 0.93))
     model.gravity.linear[:] = 9.80665 * down
-    moments = PapersMoments(DEFAULT_LINKS)
+    moments = PapersMoments(DEFAULT_LINKS, keeps_tilt=True)
     shown = np.einsum("nkat,a,k->tn", moments.turned(theta[None])[0], down, moments.moments)
     for number, derivative in enumerate(shown):
         joint, way = 1 + number // 3, np.eye(3)[(2, 0, 1)[number % 3]]

@@ -19,7 +19,7 @@ from bench.calibration.random_device import (
     off_axis_of,
 )
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import COVER

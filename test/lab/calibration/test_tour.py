@@ -34,7 +34,13 @@ TWO = POSE, Station((0.0, 0.3, 0.5, 0.4))
 RATE = 50.0  # Hz
 SCALES = (0.8, 1.2, 0.9, 1.0)
 WEIGHT = (1.0, 0.28)  # kg, m from the elbow
-WEIGHED = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
+MOMENTS, UPRIGHT = moments_of(DEFAULT_LINKS), Tilt.of("right")
+WEIGHED = MOMENTS + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
+
+
+def guess_of(moments=MOMENTS, tilt=UPRIGHT) -> TorqueGuess:
+    """Return what is known of the default arm, or of one with other `moments` (8,) in kg m."""
+    return TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), moments, tilt)
 
 
 def expected(tour, links, scales=(1.0,) * 4):
@@ -147,7 +153,7 @@ def test_a_joint_that_slips_between_two_passes_is_named():
 
 def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
     run = TourRun()
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
         tour = Tour(run.limits, guess, fixed([POSE]), 100.0)
         assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
@@ -156,7 +162,7 @@ def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
 
 
 def test_the_arm_is_held_until_the_next_pose_is_chosen():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     tour = Tour(LIMITS, guess, fixed([POSE]), 100.0)
     for cycle in range(200):
         assert tour.step(0.01 * cycle, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) == pytest.approx((0.0,) * 4, abs=0.01)
@@ -173,7 +179,7 @@ class Broken(Itinerary):
 
 
 def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_reason():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     tour, step = Tour(LIMITS, guess, Broken(LIMITS, 1, 60.0), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
     assert tour.step(0.0, *step) is not None
     tour.plan()
@@ -182,7 +188,7 @@ def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_rea
 
 
 def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     tour, step = Tour(LIMITS, guess, fixed([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
     efforts = [tour.step(0.05 * cycle, *step) for cycle in range(610)]
     assert efforts[590] is not None and efforts[-1] is None
@@ -215,7 +221,7 @@ def test_the_average_of_sweeps_separates_gravity_and_friction_at_different_angle
 def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
     links = DEFAULT_LINKS
     truth = ArmModel(links.length, links.cog * 0.9, links.mass * 1.2)
-    guess = TorqueGuess(PapersMoments(links), moments_of(links), Tilt.of("right", 0.1))
+    guess = guess_of(tilt=Tilt.of("right", 0.1))
     poses = candidates(LIMITS, guess.model)[:60]
     torque = gravity_torque(truth, poses, guess.tilt.direction) / SCALES
     before = guess.torques(poses)
@@ -228,7 +234,7 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 
 
 def test_chosen_poses_are_within_the_limits_and_can_be_held():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     limits = replace(LIMITS, max_effort=(3.0, 4.0, 1.8, 3.0))
     itinerary = Itinerary(limits, 4, 120.0)
     low, high = measurable(LIMITS, POSE.amplitude)
@@ -249,7 +255,7 @@ def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), WEIGHED, Tilt.of("right", 0.05, 0.2))
+    guess = guess_of(WEIGHED, Tilt.of("right", 0.05, 0.2))
     itinerary, taken = Itinerary(LIMITS, 8, 160.0), np.empty((0, 4))
     itinerary.next(taken, np.zeros(4), 0.0, guess, (0.0,) * 4)  # the hanging arm
     while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
@@ -260,7 +266,7 @@ def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more
 
 
 def test_the_first_poses_are_visited_again_at_the_end():
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     itinerary, taken = Itinerary(LIMITS, 4, 160.0, again=2), np.empty((0, 4))
     while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
         taken = np.vstack((taken, station.theta))
@@ -269,7 +275,7 @@ def test_the_first_poses_are_visited_again_at_the_end():
 
 def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
     weak = replace(LIMITS, max_effort=(0.1,) * 4)
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = guess_of()
     itinerary, state = Itinerary(weak, 4, 120.0), (np.zeros((1, 4)), np.zeros(4), 0.0, guess, (0.0,) * 4)
     itinerary.next(*state)  # the hanging arm
     with pytest.raises(DataError, match="max_effort"):
