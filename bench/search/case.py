@@ -74,6 +74,8 @@ ASKED = Bound(slow=DESCENT.speed)
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
 TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
+# A motor that no command reaches keeps its torque: only its own time-out ends what a lost load leaves (invariant 11).
+UNREACHED, LOST_UNREACHED = ("commands_lost", "bus_silent"), Bound(math.inf, math.inf)
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
 
 
@@ -258,6 +260,7 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
     bounds += [TILT_CREPT for event in case.events if event.name == "imu_wrong" and event.values["duration"] > SLOWLY]
     bounds += [LOAD_LOST] * is_pushed_with_too_much(case)
+    bounds += [LOST_UNREACHED] * is_lost_unreached(case)
     return Bound(*map(max, zip(*bounds, strict=True)))
 
 
@@ -269,6 +272,13 @@ def is_pushed_with_too_much(case: Case) -> bool:
     """
     told = min([event.time for event in case.events if tells_too_much(case, event)], default=math.inf)
     return any(KINDS[event.name].group == "wearer" for event in case.events if event.time > told)
+
+
+def is_lost_unreached(case: Case) -> bool:
+    """Return whether a load is lost while commands do not reach a motor."""
+    gaps = [(each.time, each.time + each.values["duration"]) for each in case.events if each.name in UNREACHED]
+    lost = [each.time for each in case.events if KINDS[each.name].bound == LOAD_LOST]
+    return any(begin <= time <= end for begin, end in gaps for time in lost)
 
 
 def tells_too_much(case: Case, event: Event) -> bool:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -47,6 +48,12 @@ def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_a
     for told, speed in ((1.0, 0.6), (2.0, 2.9)):
         taken = Event(1.0, "payload_taken", {"mass": 0.2, "told": told})
         assert bound_of(case_of(taken, push), clamped=False).speed == speed
+
+
+def test_nothing_bounds_what_a_lost_load_leaves_while_no_command_reaches_the_motor():
+    silent, dropped = Event(1.0, "bus_silent", {"duration": 0.5}), Event(1.4, "payload_dropped", {})
+    assert bound_of(case_of(silent, dropped), clamped=False).speed == math.inf
+    assert bound_of(case_of(silent, dropped._replace(time=1.6)), clamped=False).speed == 2.9
 
 
 def test_an_arm_that_is_disabled_comes_down_within_its_bound():
