@@ -4,8 +4,8 @@
 The unknowns are the moments of an arm of n joints (moment_model.py) in kg m, the logarithm of its torque scales, the
 offsets in Nm, the angles by which a known weight seems to lie beside the links (a zero of the paper's joint 3 or 4 that
 is off by a degree moves a weight by more than a light forearm's own moment), the rotation of gravity's direction from
-the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and of an arm from a
-URDF small turns of its joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
+the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and small turns of the
+joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
 linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do not
 show: those whose standard error exceeds `NATURAL`. Angles and turns are known to some degrees before: what the poses do
 not show of them stays within that, and is part of the errors.
@@ -90,9 +90,10 @@ class Fit:
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
-    zero_error: float = 0.026  #: rad, of an encoder's zero in a file: 1.5 degrees
-    #: rad, of a joint's axis in each direction across it: 1 degree, as of printed and welded brackets
-    axis_error: float = 0.0175
+    zero_error: float = 0.015  #: rad, of an encoder's zero in a file, which is at most 1.5 degrees off: over sqrt(3)
+    #: rad, of a joint's axis in each direction across it: at most 1.5 degrees askew, as on printed and welded brackets,
+    #: over sqrt(6)
+    axis_error: float = 0.0107
     scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
     pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each

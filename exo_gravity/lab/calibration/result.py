@@ -183,7 +183,7 @@ def remainders(
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
     used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
-    return old, found.residual + found.left_offset, found.held_out + found.left_offset, used
+    return old, found.remainder, found.held_out + found.remainder - found.residual, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:

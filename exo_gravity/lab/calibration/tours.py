@@ -47,6 +47,7 @@ class CheckTour:
 
     poses: int = 3  #: the hanging arm and two others
     widest: float = 10.0  #: %, of the band of a joint that is judged
+    least: float = 2.0  #: % of a difference that is refused: magnets that are 20 K warmer, at 0.1 % per K
 
 
 CHECK = CheckTour()
@@ -174,7 +175,7 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
     """Yield the new moments. What is unknown keeps its value."""
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    moments = np.where(np.isfinite(error), found.moments, before)
+    moments = np.where(np.isfinite(error), found.in_file, before)
     if isinstance(model, UrdfMoments):
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
         new = model.found(moments, found.turn)
@@ -198,9 +199,8 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
         *_spring_changes(arm, found),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
-        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2) * found.scale
-        note = f"Nm: {row(left_out)} of poses left out, {row(found.of_axes)} of axes that may be askew"
-        changes.append(Change(node, "model_error.torque", np.hypot(left_out, found.of_axes).round(3).tolist(), note))
+        note = "Nm, in poses that no tour visited"
+        changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
     if not found.relative:
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
@@ -279,12 +279,14 @@ def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
 def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
 
-    A joint that differs by more than the band of `model_error.torque` is a refusal.
+    A joint that differs by more than `CHECK.least`, and than the band of this tour and `model_error.torque`, is a
+    refusal.
     """
     observations = at_links(arm, observations)
-    held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
-    error = np.array(for_joints(torque_error(arm), len(arm.joint_names), max))
+    held, (*_, effort, spread) = _needed(arm, model_of(arm), observations), columns(observations)
     size = np.sqrt(np.mean(held**2, axis=0))
+    noise = np.sqrt(np.sum((held * spread) ** 2, axis=0)) / np.maximum(len(held) * size, 1e-9)  # Nm, of this tour
+    error = np.hypot(for_joints(torque_error(arm), len(arm.joint_names), max), noise)
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
     now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
@@ -297,7 +299,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
         warmth = f", its motor has {now[n]:.0f} degC" if math.isfinite(now[n]) else ""
         what = f"{abs(less):.1f} +- {band[n]:.1f} % {'less' if less > 0.0 else 'more'} torque"
         sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
-        (refusals if abs(less) > band[n] else lines).append(sentence)
+        (refusals if abs(less) > max(band[n], CHECK.least) else lines).append(sentence)
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 
