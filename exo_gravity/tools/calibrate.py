@@ -74,7 +74,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
                 help="record of an earlier tour of this arm by the same file, its motors colder or warmer: "
                 "shows how torque_scale depends on the temperature",
             )  # fmt: skip
-            axes = "assumed standard error of each joint's axis in each direction across it, by CAD or brackets (1.0)"
+            axes = "assumed standard error of each joint's axis in each direction across it, by CAD or brackets (0.6)"
             option("--axes", type=float, metavar="DEG", help=axes)
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")

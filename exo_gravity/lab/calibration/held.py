@@ -21,6 +21,7 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import Rows, unmeasured
+from exo_gravity.lab.calibration.poses import PRIOR
 
 POSES = 100  # new ones, at random
 LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
@@ -40,10 +41,14 @@ def held(
     """Return what the file holds of a fit, and how well.
 
     rows: that were fitted. unknowns, covariance: (count,) and (count, count), of the fit.
-    known: (k,), whether the poses show a moment; the others stay as they are.
+    known: (k,), whether the poses show a moment; the others stay as they are, as unsure as before a tour.
     misfit: (n,) Nm as commanded, root mean square of what noise does not explain of the residuals.
     """
     at, scale = rows.layout, np.exp(unknowns[rows.layout.scale])
+    unknowns, covariance = unknowns.copy(), covariance.copy()
+    for index in np.flatnonzero(~known):
+        unknowns[index] = model.moments[index]
+        covariance[index, index] = (PRIOR.share * abs(model.moments[index]) + PRIOR.moment) ** 2
     new = _new_poses(model, rows.start)
     kept = unknowns.copy()
     kept[at.offset] *= unknowns[at.spring] > 0.0

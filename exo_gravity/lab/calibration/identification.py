@@ -140,7 +140,8 @@ def identify(observations: Sequence[Observation], model: MomentModel, axis_error
     extras = asked_for(plain, possible_extras(plain), robust)
     while True:
         rows = plain.with_extras(extras)
-        keep, rejected = without_outliers(rows)
+        # With few poses, zeros and axes that are free could explain that one of them was touched.
+        keep, rejected = without_outliers(rows if model.keeps_axes else rows.holding(range(at.turn.start, at.count)))
         fewer = asked_for(plain.only(keep), extras, final)  # an outlier may have looked like a spring
         if fewer == extras:
             break
@@ -288,8 +289,9 @@ def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: FitLayout) -> Itera
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
         yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
-    elbow = math.degrees(unknowns[at.angle][0])
-    elbow_error = math.degrees(math.sqrt(covariance[at.angle, at.angle][0, 0]))
+    seems = np.zeros(at.count)  # in what the weight shows, both add up
+    seems[[at.angle.start, at.turn.start + 2 * TURNS]] = 1.0
+    elbow, elbow_error = math.degrees(seems @ unknowns), math.degrees(math.sqrt(seems @ covariance @ seems))
     if elbow and abs(elbow) > max(3.0 * elbow_error, ACCEPTED.least_zero_error):
         yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
 

@@ -90,9 +90,9 @@ class Fit:
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
-    zero_error: float = 0.015  #: rad, of an encoder's zero in a file, which is at most 1.5 degrees off: over sqrt(3)
-    #: rad, of a joint's axis in each direction across it: at most 1.5 degrees askew, as on printed and welded brackets,
-    #: over sqrt(6)
+    zero_error: float = 0.015  #: rad, of an encoder's zero in a file: at most 1.5 degrees, over sqrt(3)
+    #: rad, of a joint's axis in each direction across it: it is at most 1.5 degrees askew, as on printed and welded
+    #: brackets, over sqrt(6)
     axis_error: float = 0.0107
     scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
@@ -275,9 +275,15 @@ def solve(rows: Rows, start: np.ndarray | None = None, weight: np.ndarray | floa
         step = inverse @ np.append(root * residual, -rows.anchor @ (unknowns - rows.start))
         if np.all(np.abs(step) < 1e-9 * natural):
             break
-        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
-        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[at.scale]).max()))
-    hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
+        # Beyond a factor of 1.6 of a scale, or 0.2 rad of a turn, in one step the linear model does not reach.
+        turn = float(np.abs(np.append(step[at.tilt], step[at.turn])).max())
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[at.scale]).max()), 5.0 * turn)
+    # A turn that is fitted may seem to show what the poses as measured do not: M1, of a joint whose axis is vertical.
+    measured = unknowns.copy()
+    measured[at.tilt], measured[at.turn] = 0.0, 0.0
+    shown = np.vstack(((rows.jacobian(measured) * root[..., None]).reshape(-1, at.count), rows.anchor)) * natural
+    _, share, ways = np.linalg.svd(shown, full_matrices=False)
+    hidden = 1.0 - np.square(ways[share > 1.0]).sum(axis=0)
     size = np.linalg.svd((poses * natural)[:, : at.angle.start], compute_uv=False)
     singular_values = np.pad(size, (0, at.angle.start - len(size)))
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
@@ -320,7 +326,7 @@ def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
     """
     used, solution = final(rows)
     for index in positive:
-        if solution.unknowns[index] < 0.0:
+        if solution.unknowns[index] < 0.0 and solution.hidden[index] <= FIT.hidden:
             error = solution.covariance[index, index]
             used, solution = final(rows.holding([index]))
             solution.unknowns[index], solution.covariance[index, index] = 0.0, error
