@@ -44,6 +44,7 @@ from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
     FitLayout,
+    Places,
     asked_for,
     bounded,
     final,
@@ -129,14 +130,14 @@ class Identified:
     torque_error: np.ndarray  #: (n,) Nm, standard error of that file's torque in other poses
 
 
-def identify(observations: Sequence[Observation], model: MomentModel, axis_error: float = FIT.axis_error) -> Identified:
+def identify(observations: Sequence[Observation], model: MomentModel, places: Places | None = None) -> Identified:
     """Return what the observations show of an arm.
 
-    axis_error: rad, assumed standard error of the directions of its axes.
+    places: how exactly its zeros and axes are known; by default as usual.
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    at, plain = layout_of(model), rows_of(observations, model, axis_error)
+    at, plain = layout_of(model), rows_of(observations, model, places or Places())
     extras = asked_for(plain, possible_extras(plain), robust)
     while True:
         rows = plain.with_extras(extras)

@@ -110,6 +110,13 @@ class Fit:
 FIT = Fit()
 
 
+class Places(NamedTuple):
+    """How exactly the places of an arm's joints are known before a tour, as standard errors in rad."""
+
+    zero: float = FIT.zero_error  #: of the encoders' zeros
+    axis: float = FIT.axis_error  #: of the axes, in each direction across them
+
+
 MEDIAN_BELOW = 0.64  # by which the median of a sum of as many squares is below their number
 MEDIAN_SQUARE = 0.455  # of a standard normal variable
 DISTURBED = "Was it touched, does a joint slip or touch a stop?"
@@ -205,11 +212,8 @@ class Solution(NamedTuple):
     inverse: np.ndarray  #: (count, m n + c), change of the unknowns with each effort and condition, by its error
 
 
-def rows_of(observations: Sequence[Observation], model: MomentModel, axis_error: float) -> Rows:
-    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation.
-
-    axis_error: rad, assumed standard error of the directions of its axes.
-    """
+def rows_of(observations: Sequence[Observation], model: MomentModel, places: Places) -> Rows:
+    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
     theta, direction, effort, spread = found = columns(observations)
@@ -224,7 +228,7 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, axis_error:
     product = unit[at.scale][list(model.compared)].sum(axis=0, keepdims=True) * (not np.any(load))
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
     scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
-    turned_by = np.resize((FIT.zero_error, axis_error, axis_error), model.turns)
+    turned_by = np.resize((places.zero, places.axis, places.axis), model.turns)
     if model.shows_tilt:
         turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
     turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]

@@ -27,7 +27,7 @@ from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
-from exo_gravity.lab.calibration.pose_fit import FIT, columns, temperatures
+from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -37,7 +37,7 @@ from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
-MOST_ASKEW = 5.0  # deg, of an axis that can be assumed
+MOST_OFF = 5.0  # deg, standard error of a zero or an axis that can be assumed
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 
 
@@ -59,15 +59,19 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier) if options.earlier else []
-    axis_error = axis_error_of(options.axes)
-    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), axis_error)
+    places = places_of(options)
+    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), places)
 
 
-def axis_error_of(degrees: float | None) -> float:
-    """Return the assumed standard error of an axis in rad, by default the usual one. Raises ParameterError."""
-    if degrees is None:
-        return FIT.axis_error
-    return math.radians(one_float("axes", degrees, 0.0, MOST_ASKEW, "degrees"))
+def places_of(options: argparse.Namespace) -> Places:
+    """Return how exactly zeros and axes are known, by default as usual. Raises ParameterError."""
+    given = {"zero": ("zeros", options.zeros), "axis": ("axes", options.axes)}
+    known = {
+        field: math.radians(one_float(name, degrees, 0.0, MOST_OFF, "degrees"))
+        for field, (name, degrees) in given.items()
+        if degrees is not None
+    }
+    return Places(**known)
 
 
 def tour_observations(
@@ -93,7 +97,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     model.load(mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
-    axis_error = axis_error_of(options.axes)
+    places = places_of(options)
     earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
     bare = tour_observations(options, arm, say, poses)
@@ -105,7 +109,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
         hang = _request(arm, mass, lever)
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = tour_observations(options, arm, say, changes, hang)
-    return moments_from(arm, earlier + bare + weighed, axis_error)
+    return moments_from(arm, earlier + bare + weighed, places)
 
 
 def _request(arm: AnyArm, mass: float, lever: float) -> str:
@@ -132,15 +136,13 @@ def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np
     return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
 
 
-def moments_from(
-    arm: AnyArm, observations: Sequence[Observation], axis_error: float = FIT.axis_error
-) -> CalibrationResult:
+def moments_from(arm: AnyArm, observations: Sequence[Observation], places: Places | None = None) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does.
 
-    axis_error: rad, assumed standard error of the directions of its axes.
+    places: how exactly its zeros and axes are known; by default as usual.
     """
     model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
-    found = identify(observations, model, axis_error)
+    found = identify(observations, model, places)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
@@ -218,8 +220,7 @@ def _zero_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
         return
     bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
     zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
-    unshown = f"+-{math.degrees(FIT.zero_error):.2g}: the poses do not show it"
-    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}; {unshown}"
+    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}"
     yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
 
 

@@ -25,7 +25,7 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments, along_axes
-from exo_gravity.lab.calibration.pose_fit import FIT
+from exo_gravity.lab.calibration.pose_fit import FIT, Places
 from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
@@ -189,6 +189,11 @@ def test_zeros_and_axes_that_are_off_leave_little_of_the_torque():
         wrong, found, peak = off_device(seed, PapersMoments(DEFAULT_LINKS), TWO_LEANS, 1.5, 1.5)
         assert wrong.max() < 0.02 * peak  # with fixed zeros and axes 2.1 and 2.9 %
         assert np.max(found.torque_error) < 0.03 * peak / COVER
+
+
+def test_zeros_of_a_jig_are_kept():
+    found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
+    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[1, 0])
 
 
 @pytest.mark.thorough
