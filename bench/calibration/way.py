@@ -37,6 +37,7 @@ from .hand import Hand, hanging, write_bow
 from .tour import Player, run_tour, speed_quantiles
 
 JIG = (0.0, 90.0, 0.0, 90.0)  # deg
+ZEROS = "--zeros", "0"  # of the jig: kept
 MASS, LEVER = 1.0, (0.25, 0.30)  # kg, m
 POSES = (np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4)))  # rad, of the poses of the last step
 TRUNK = {"pitch": 0.1, "roll": -0.06}  # rad, of the wearer
@@ -90,12 +91,12 @@ def go(device: Device, folder: Path, fewer_poses: int = 0) -> Result:
     _calibrate("imu", folder, 1, "--bag", str(bow))
     players: list[Player] = []
     with _offline(players):
-        _calibrate("gravity", folder, 2, "--poses", str(12 - fewer_poses))
+        _calibrate("gravity", folder, 2, *ZEROS, "--poses", str(12 - fewer_poses))
     tour = players[0].tour
     results: list[CalibrationResult] = []
     lever = rng.uniform(*LEVER)
     with _offline(players, device.leant), _noted(results):
-        _calibrate("scale", folder, 3, "--mass", f"{MASS:g}", "--lever", f"{lever:.4f}")
+        _calibrate("scale", folder, 3, *ZEROS, "--mass", f"{MASS:g}", "--lever", f"{lever:.4f}")
     old, new = configured_arm(folder / "2.yaml"), configured_arm(folder / "4.yaml")
     found = results[0].identified
     assert found is not None

@@ -42,7 +42,7 @@ MAX_POSES = 12
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="calibrate", description="Find what differs between an arm and its file.")
-    parser.set_defaults(bag=None, rests=None, earlier=None, axes=None)
+    parser.set_defaults(bag=None, rests=None, earlier=None, axes=None, zeros=None)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, (_, description) in COMMANDS.items():
         command = commands.add_parser(name, help=description, description=f"calibrate {name}: {description}.")
@@ -74,7 +74,9 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
                 help="record of an earlier tour of this arm by the same file, its motors colder or warmer: "
                 "shows how torque_scale depends on the temperature",
             )  # fmt: skip
-            axes = "assumed standard error of each joint's axis in each direction across it, by CAD or brackets (1.0)"
+            zeros = "assumed standard error of the encoders' zeros (0.86); 0 keeps those of a jig"
+            option("--zeros", type=float, metavar="DEG", help=zeros)
+            axes = "assumed standard error of each joint's axis in each direction across it, by CAD or brackets (0.6)"
             option("--axes", type=float, metavar="DEG", help=axes)
         if name == "scale":
             option("--mass", type=float, required=True, metavar="KG", help="of the weight")

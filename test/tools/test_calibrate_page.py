@@ -78,7 +78,8 @@ def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found
     result = found.identified
     assert result is not None
     down = DOWN + np.cross(result.tilt, DOWN)  # the new file's mounting of the IMU
-    unloaded = regressor(POSES[~LOADED], down / np.linalg.norm(down)) @ result.moments / result.scale
+    joints = POSES[~LOADED] + result.turn[:, 0]  # as the new zeros show them
+    unloaded = regressor(joints, down / np.linalg.norm(down)) @ result.in_file / result.scale
     assert (measured - new)[~LOADED] == pytest.approx(unloaded, abs=1e-3)
     assert np.abs(old).max() > 10.0 * np.abs(new).max()
 

@@ -8,11 +8,12 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint, and a slope of its
 scale over the motor's temperature, are identified only where the poses ask for them (`pose_fit.asked_for`).
 
-Of an arm from a URDF the places of the joints are unknowns, too, as small turns: about a joint's axis, which is an
-error of its encoder's zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about
-another axis. The zero of the last joint does not, nor that of one whose next axis is parallel: they look like a moment
-across the link. A turn of the first joint is one of the whole arm: with an IMU it is part of its mounting. What does
-not show stays within its prior. The closed forms of the paper's arm have fixed axes: `askew` says what that may cost.
+The places of the joints are unknowns, too, as small turns: about a joint's axis, which is an error of its encoder's
+zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about another axis. The zero of
+the last joint does not, nor that of one whose next axis is parallel: they look like a moment across the link. A turn of
+the first joint is one of the whole arm: with an IMU it is part of its mounting. What does not show stays within its
+prior. A parameter file takes over the zeros, and the axes of an arm from a URDF; the closed forms of the paper's arm
+have fixed axes. `held` finds the moments that make up for what a file does not take over, and what that may cost.
 
 A pose that does not fit the others (a hand on the arm, a slipping joint) is left out. A result that no arm can have is
 refused, with the pose that is missing. Held poses do not show a common factor of all scales and moments without a known
@@ -37,12 +38,13 @@ from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.lab.calibration.askew import error_of_axes
+from exo_gravity.lab.calibration.held import held
 from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel, PapersMoments
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
     FitLayout,
+    Places,
     asked_for,
     bounded,
     final,
@@ -123,26 +125,24 @@ class Identified:
     #: says, and about two directions across it; (0, 3) if they are not identified
     turn: np.ndarray
     turn_error: np.ndarray  #: likewise, standard errors
-    of_axes: np.ndarray  #: (n,) Nm, error of the torque in other poses from axes that are not as drawn
-
-    @property
-    def left_offset(self) -> np.ndarray:
-        """The part of the offset that no spring carries, (n,) Nm as commanded."""
-        return self.offset + self.stiffness * self.rest / self.scale
+    in_file: np.ndarray  #: (k,) kg m, the moments with which a parameter file holds the arm best
+    remainder: np.ndarray  #: (m, n) Nm, effort minus the prediction of that file
+    torque_error: np.ndarray  #: (n,) Nm, standard error of that file's torque in other poses
 
 
-def identify(observations: Sequence[Observation], model: MomentModel, axis_error: float = FIT.axis_error) -> Identified:
+def identify(observations: Sequence[Observation], model: MomentModel, places: Places | None = None) -> Identified:
     """Return what the observations show of an arm.
 
-    axis_error: rad, assumed standard error of the directions of its axes.
+    places: how exactly its zeros and axes are known; by default as usual.
 
     Raises DataError if the result would be unphysical, naming the missing pose, and if an observation is impossible.
     """
-    at, plain = layout_of(model), rows_of(observations, model, axis_error)
+    at, plain = layout_of(model), rows_of(observations, model, places or Places())
     extras = asked_for(plain, possible_extras(plain), robust)
     while True:
         rows = plain.with_extras(extras)
-        keep, rejected = without_outliers(rows)
+        # With few poses, zeros and axes that are free could explain that one of them was touched.
+        keep, rejected = without_outliers(rows if model.keeps_axes else rows.holding(range(at.turn.start, at.count)))
         fewer = asked_for(plain.only(keep), extras, final)  # an outlier may have looked like a spring
         if fewer == extras:
             break
@@ -167,6 +167,9 @@ def identify(observations: Sequence[Observation], model: MomentModel, axis_error
     _check_extras(stiffness, slope)
     slack = -unknowns[at.offset] * scale / np.where(stiffness > 0.0, stiffness, np.inf)
     residual = rows.effort - rows.predicted(solution.unknowns)
+    beyond_noise = np.maximum(used.sigma**2 - rows.only(keep).sigma ** 2, 0.0)
+    misfit = np.sqrt(beyond_noise.mean(axis=0))
+    file = held(model, used, unknowns, covariance, ~hidden[at.moment], misfit)
     held_out = residual.copy()
     held_out[keep], _ = without_each_pose(solution, used.sigma)
     friction = np.median([observation.friction for observation in observations], axis=0)
@@ -178,7 +181,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, axis_error
         error[at.slope] * (slope != 0.0),
         temperatures(observations).mean(axis=0),
         unknowns[at.turn].reshape(-1, TURNS), error[at.turn].reshape(-1, TURNS),
-        np.zeros(at.joints) if model.turns else error_of_axes(model, used, solution, axis_error),
+        file.unknowns[at.moment], rows.effort - rows.predicted(file.unknowns), file.error,
     )  # fmt: skip
 
 
@@ -287,8 +290,9 @@ def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: FitLayout) -> Itera
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
         yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
-    elbow = math.degrees(unknowns[at.angle][0])
-    elbow_error = math.degrees(math.sqrt(covariance[at.angle, at.angle][0, 0]))
+    seems = np.zeros(at.count)  # in what the weight shows, both add up
+    seems[[at.angle.start, at.turn.start + 2 * TURNS]] = 1.0
+    elbow, elbow_error = math.degrees(seems @ unknowns), math.degrees(math.sqrt(seems @ covariance @ seems))
     if elbow and abs(elbow) > max(3.0 * elbow_error, ACCEPTED.least_zero_error):
         yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
 

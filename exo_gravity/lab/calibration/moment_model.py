@@ -42,6 +42,7 @@ class MomentModel(Protocol):
     gravity: float  #: m/s^2
     beside: int  #: number of directions in which a weight may hang beside its link
     turns: int  #: of the joints' places that are fitted: 3 n or 0
+    keeps_axes: bool  #: whether the parameter file takes over axes that are askew
     compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
     positive: tuple[int, ...]  #: numbers of the moments that are at least 0
     optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
@@ -129,7 +130,7 @@ class PapersMoments:
     count = JOINT_COUNT
     names: tuple[str, ...] = MOMENTS
     start = np.array((0.0, *TYPICAL_MOMENTS[1:]))
-    beside, turns = 3, 0
+    beside, turns, keeps_axes = 3, TURNS * JOINT_COUNT, False
     compared: tuple[int, ...] = 1, 2, 3  # joint 1 carries nothing while its axis is vertical
     positive: tuple[int, ...] = (0,)  # M1, the least certain
     optional: tuple[int, ...] = 0, 4, 8, 12  # M1, W, scale and offset of joint 1
@@ -201,7 +202,7 @@ class UrdfMoments:
     Raises ParameterError if a joint that is not the arm's moves its links, or one of them follows another.
     """
 
-    beside = 2
+    beside, keeps_axes = 2, True
     positive: tuple[int, ...] = ()
     optional: tuple[int, ...] = ()
     expects_scales = True

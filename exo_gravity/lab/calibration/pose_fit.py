@@ -4,8 +4,8 @@
 The unknowns are the moments of an arm of n joints (moment_model.py) in kg m, the logarithm of its torque scales, the
 offsets in Nm, the angles by which a known weight seems to lie beside the links (a zero of the paper's joint 3 or 4 that
 is off by a degree moves a weight by more than a light forearm's own moment), the rotation of gravity's direction from
-the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and of an arm from a
-URDF small turns of its joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
+the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and small turns of the
+joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
 linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do not
 show: those whose standard error exceeds `NATURAL`. Angles and turns are known to some degrees before: what the poses do
 not show of them stays within that, and is part of the errors.
@@ -90,9 +90,10 @@ class Fit:
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
-    zero_error: float = 0.026  #: rad, of an encoder's zero in a file: 1.5 degrees
-    #: rad, of a joint's axis in each direction across it: 1 degree, as of printed and welded brackets
-    axis_error: float = 0.0175
+    zero_error: float = 0.015  #: rad, of an encoder's zero in a file: at most 1.5 degrees, over sqrt(3)
+    #: rad, of a joint's axis in each direction across it: it is at most 1.5 degrees askew, as on printed and welded
+    #: brackets, over sqrt(6)
+    axis_error: float = 0.0107
     scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
     pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each
@@ -107,6 +108,13 @@ class Fit:
 
 
 FIT = Fit()
+
+
+class Places(NamedTuple):
+    """How exactly the places of an arm's joints are known before a tour, as standard errors in rad."""
+
+    zero: float = FIT.zero_error  #: of the encoders' zeros
+    axis: float = FIT.axis_error  #: of the axes, in each direction across them
 
 
 MEDIAN_BELOW = 0.64  # by which the median of a sum of as many squares is below their number
@@ -204,11 +212,8 @@ class Solution(NamedTuple):
     inverse: np.ndarray  #: (count, m n + c), change of the unknowns with each effort and condition, by its error
 
 
-def rows_of(observations: Sequence[Observation], model: MomentModel, axis_error: float) -> Rows:
-    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation.
-
-    axis_error: rad, assumed standard error of the directions of its axes.
-    """
+def rows_of(observations: Sequence[Observation], model: MomentModel, places: Places) -> Rows:
+    """Return the observations of an arm as arrays, with what is held. Raises DataError that names the observation."""
     if not observations:
         raise DataError("no pose was observed")
     theta, direction, effort, spread = found = columns(observations)
@@ -223,7 +228,7 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, axis_error:
     product = unit[at.scale][list(model.compared)].sum(axis=0, keepdims=True) * (not np.any(load))
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
     scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
-    turned_by = np.resize((FIT.zero_error, axis_error, axis_error), model.turns)
+    turned_by = np.resize((places.zero, places.axis, places.axis), model.turns)
     if model.shows_tilt:
         turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
     turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]
@@ -274,9 +279,15 @@ def solve(rows: Rows, start: np.ndarray | None = None, weight: np.ndarray | floa
         step = inverse @ np.append(root * residual, -rows.anchor @ (unknowns - rows.start))
         if np.all(np.abs(step) < 1e-9 * natural):
             break
-        # A scale that jumps by more than a factor of 1.6 in one step has left the range of the linear model.
-        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[at.scale]).max()))
-    hidden = 1.0 - np.diag(inverse @ whitened)  # a projection, up to the units
+        # Beyond a factor of 1.6 of a scale, or 0.2 rad of a turn, in one step the linear model does not reach.
+        turn = float(np.abs(np.append(step[at.tilt], step[at.turn])).max())
+        unknowns = unknowns + step / max(1.0, 2.0 * float(np.abs(step[at.scale]).max()), 5.0 * turn)
+    # A turn that is fitted may seem to show what the poses as measured do not: M1, of a joint whose axis is vertical.
+    measured = unknowns.copy()
+    measured[at.tilt], measured[at.turn] = 0.0, 0.0
+    shown = np.vstack(((rows.jacobian(measured) * root[..., None]).reshape(-1, at.count), rows.anchor)) * natural
+    _, share, ways = np.linalg.svd(shown, full_matrices=False)
+    hidden = 1.0 - np.square(ways[share > 1.0]).sum(axis=0)
     size = np.linalg.svd((poses * natural)[:, : at.angle.start], compute_uv=False)
     singular_values = np.pad(size, (0, at.angle.start - len(size)))
     hat = (poses @ inverse[:, : residual.size]).reshape(2 * residual.shape)
@@ -319,7 +330,7 @@ def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
     """
     used, solution = final(rows)
     for index in positive:
-        if solution.unknowns[index] < 0.0:
+        if solution.unknowns[index] < 0.0 and solution.hidden[index] <= FIT.hidden:
             error = solution.covariance[index, index]
             used, solution = final(rows.holding([index]))
             solution.unknowns[index], solution.covariance[index, index] = 0.0, error

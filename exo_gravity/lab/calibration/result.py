@@ -174,8 +174,8 @@ def remainders(
 ) -> tuple[np.ndarray, ...]:
     """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
 
-    Predicted by the old file; by the new one, which holds a motor's constant offset only in a joint with a spring; and
-    by a result that was found without that pose.
+    Predicted by the old file; by the new one, which holds less than the fit (`held`); and by a result that was found
+    without that pose.
     """
     theta, direction, measured, _ = columns(poses)
     loads = np.array([model.load(pose.load_mass, pose.load_lever) for pose in poses])
@@ -183,7 +183,7 @@ def remainders(
     springs = joint_spring_of(arm.compensator).torques(theta)
     old = measured - np.einsum("njk,nk->nj", rows, model.moments + loads) - springs
     used = ~np.isin(np.arange(len(poses)), [index for index, _ in found.rejected])
-    return old, found.residual + found.left_offset, found.held_out + found.left_offset, used
+    return old, found.remainder, found.held_out + found.remainder - found.residual, used
 
 
 def page_of(result: CalibrationResult, command: str, params: str, today: datetime.date | None = None) -> str:

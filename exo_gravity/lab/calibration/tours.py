@@ -28,7 +28,7 @@ from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
-from exo_gravity.lab.calibration.pose_fit import FIT, columns, temperatures
+from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
@@ -38,7 +38,7 @@ from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
-MOST_ASKEW = 5.0  # deg, of an axis that can be assumed
+MOST_OFF = 5.0  # deg, standard error of a zero or an axis that can be assumed
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 
 
@@ -48,6 +48,7 @@ class CheckTour:
 
     poses: int = 3  #: the hanging arm and two others
     widest: float = 10.0  #: %, of the band of a joint that is judged
+    least: float = 2.0  #: % of a difference that is refused: magnets that are 20 K warmer, at 0.1 % per K
 
 
 CHECK = CheckTour()
@@ -59,15 +60,19 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier) if options.earlier else []
-    axis_error = axis_error_of(options.axes)
-    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), axis_error)
+    places = places_of(options)
+    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), places)
 
 
-def axis_error_of(degrees: float | None) -> float:
-    """Return the assumed standard error of an axis in rad, by default the usual one. Raises ParameterError."""
-    if degrees is None:
-        return FIT.axis_error
-    return math.radians(one_float("axes", degrees, 0.0, MOST_ASKEW, "degrees"))
+def places_of(options: argparse.Namespace) -> Places:
+    """Return how exactly zeros and axes are known, by default as usual. Raises ParameterError."""
+    given = {"zero": ("zeros", options.zeros), "axis": ("axes", options.axes)}
+    known = {
+        field: math.radians(one_float(name, degrees, 0.0, MOST_OFF, "degrees"))
+        for field, (name, degrees) in given.items()
+        if degrees is not None
+    }
+    return Places(**known)
 
 
 def tour_observations(
@@ -93,7 +98,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     model.load(mass, lever)
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
-    axis_error = axis_error_of(options.axes)
+    places = places_of(options)
     earlier = observations_in(options.earlier) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
     bare = tour_observations(options, arm, say, poses)
@@ -105,7 +110,7 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
         hang = _request(arm, mass, lever)
         changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
         weighed = tour_observations(options, arm, say, changes, hang)
-    return moments_from(arm, earlier + bare + weighed, axis_error)
+    return moments_from(arm, earlier + bare + weighed, places)
 
 
 def _request(arm: AnyArm, mass: float, lever: float) -> str:
@@ -132,15 +137,13 @@ def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np
     return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
 
 
-def moments_from(
-    arm: AnyArm, observations: Sequence[Observation], axis_error: float = FIT.axis_error
-) -> CalibrationResult:
+def moments_from(arm: AnyArm, observations: Sequence[Observation], places: Places | None = None) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does.
 
-    axis_error: rad, assumed standard error of the directions of its axes.
+    places: how exactly its zeros and axes are known; by default as usual.
     """
     model, (low, high), observations = model_of(arm), TORQUE_SCALE_BOUNDS, at_links(arm, observations)
-    found = identify(observations, model, axis_error)
+    found = identify(observations, model, places)
     factor = np.where(np.isfinite(found.scale_error), found.scale, 1.0)
     scale = np.round(factor * _scale_before(arm, found), 4).tolist()
     impossible = tuple(
@@ -175,7 +178,7 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
     """Yield the new moments. What is unknown keeps its value."""
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
-    moments = np.where(np.isfinite(error), found.moments, before)
+    moments = np.where(np.isfinite(error), found.in_file, before)
     if isinstance(model, UrdfMoments):
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
         new = model.found(moments, found.turn)
@@ -199,9 +202,8 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
         *_spring_changes(arm, found),
     ]
     if np.all(np.isfinite(found.held_out).any(axis=0)):
-        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2) * found.scale
-        note = f"Nm: {row(left_out)} of poses left out, {row(found.of_axes)} of axes that may be askew"
-        changes.append(Change(node, "model_error.torque", np.hypot(left_out, found.of_axes).round(3).tolist(), note))
+        note = "Nm, in poses that no tour visited"
+        changes.append(Change(node, "model_error.torque", found.torque_error.round(4).tolist(), note))
     if not found.relative:
         known = np.isfinite(found.scale_error)
         share = np.where(known, found.scale_error / found.scale, for_joints(ModelError().scale, len(scale), max))
@@ -219,8 +221,7 @@ def _zero_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
         return
     bridge, (degrees, error) = arm.can_bridge, np.degrees((found.turn[:, 0], found.turn_error[:, 0]))
     zero = np.array(bridge["zero"]) - np.array(bridge["direction"]) * found.turn[:, 0]
-    unshown = f"+-{math.degrees(FIT.zero_error):.2g}: the poses do not show it"
-    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}; {unshown}"
+    note = f"rad; the joints are {row(degrees)} degrees farther than the file said, +-{row(error)}"
     yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
 
 
@@ -280,12 +281,14 @@ def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
 def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
 
-    A joint that differs by more than the band of `model_error.torque` is a refusal.
+    A joint that differs by more than `CHECK.least`, and than the band of this tour and `model_error.torque`, is a
+    refusal.
     """
     observations = at_links(arm, observations)
-    held, effort = _needed(arm, model_of(arm), observations), columns(observations)[2]
-    error = np.array(for_joints(torque_error(arm), len(arm.joint_names), max))
+    held, (*_, effort, spread) = _needed(arm, model_of(arm), observations), columns(observations)
     size = np.sqrt(np.mean(held**2, axis=0))
+    noise = np.sqrt(np.sum((held * spread) ** 2, axis=0)) / np.maximum(len(held) * size, 1e-9)  # Nm, of this tour
+    error = np.hypot(for_joints(torque_error(arm), len(arm.joint_names), max), noise)
     share = np.sum(held * effort, axis=0) / np.maximum(np.sum(held**2, axis=0), 1e-12)  # of the command that was enough
     band = 100.0 * COVER * error / np.maximum(size, 1e-9)
     now, then = temperatures(observations).mean(axis=0), arm.can_bridge["torque_scale_temperature"]
@@ -298,7 +301,7 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
         warmth = f", its motor has {now[n]:.0f} degC" if math.isfinite(now[n]) else ""
         what = f"{abs(less):.1f} +- {band[n]:.1f} % {'less' if less > 0.0 else 'more'} torque"
         sentence = f"{name}: {what} than when it was calibrated, at {then[n]:g} degC{warmth}"
-        (refusals if abs(less) > band[n] else lines).append(sentence)
+        (refusals if abs(less) > max(band[n], CHECK.least) else lines).append(sentence)
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 

@@ -24,8 +24,8 @@ from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
-from exo_gravity.lab.calibration.pose_fit import FIT
+from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments, along_axes
+from exo_gravity.lab.calibration.pose_fit import FIT, Places
 from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
@@ -80,12 +80,12 @@ def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak(devices):
 def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good_as_its_measurement(devices):
     for _, found in devices:
         assert np.nanmax(np.abs(found.held_out)) < 0.15
-        assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 3.0 * np.linalg.norm(found.residual)
+        assert np.linalg.norm(found.residual) < np.linalg.norm(found.held_out) < 5.0 * np.linalg.norm(found.residual)
     observations = Device(1).tour()
     found, without = identify(observations, PAPERS), identify(observations[1:], PAPERS)
-    direction = LEANING + np.cross(without.tilt, LEANING)
-    predicted = regressor(observations[0].theta, direction / np.linalg.norm(direction))[0] @ without.moments
-    predicted = predicted / without.scale + without.offset
+    direction, theta = LEANING + np.cross(without.tilt, LEANING), np.array([observations[0].theta])
+    rows = (along_axes(PAPERS, theta) + PAPERS.turned(theta) @ without.turn.ravel())[0] @ direction
+    predicted = rows @ without.moments / without.scale + without.offset
     np.testing.assert_allclose(found.held_out[0], observations[0].effort - predicted, atol=2e-3)
 
 
@@ -133,7 +133,7 @@ def test_a_zero_that_is_off_looks_like_a_moment_across_the_link_and_the_torque_i
     observations = [o._replace(theta=np.subtract(o.theta, off)) for o in device.tour()]
     found = identify(observations, PAPERS)
     turned = np.arctan2(*(device.moments[[7, 3]])) + off[3]
-    assert np.arctan2(found.moments[7], found.moments[3]) == pytest.approx(turned, abs=0.02)
+    assert np.arctan2(found.moments[7], found.moments[3]) + found.turn[3, 0] == pytest.approx(turned, abs=0.02)
     assert any("Y4 of link 4 from an error of joint 4's zero" in sentence for sentence in found.unknown)
 
 
@@ -156,35 +156,54 @@ def askew_torque(turn, theta, direction):
     return np.array([pin.computeGeneralizedGravity(model, data, np.array(pose)) for pose in theta])
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("with_imu", "askew"), [(True, 1.5), (False, 1.0)])  # degrees; 1 is assumed
-def test_the_band_contains_what_axes_leave_that_are_askew(with_imu, askew):
-    leans = (LEANING, Tilt.of("right", -0.1, 0.25).direction) if with_imu else (UPRIGHT,)
-    model = PapersMoments(DEFAULT_LINKS, keeps_tilt=with_imu)
+def off_device(seed, model, leans, askew, zero):
+    """Return what a tour of Pinocchio's arm leaves in new poses, (200, 4) Nm, its result, and the largest torque in Nm.
+
+    Its axes are up to `askew` degrees askew, its zeros up to `zero` degrees off.
+    """
+    rng, tour = np.random.default_rng(seed), []
+    angle = rng.uniform(0.0, 2.0 * np.pi, 4)
+    turn = np.radians(askew) * rng.uniform(size=(4, 1)) * np.column_stack((np.cos(angle), np.sin(angle)))
+    off = np.radians(zero) * rng.uniform(-1.0, 1.0, 4)
+    for down in leans:
+        for theta in best(down, 16 // len(leans)):
+            effort = askew_torque(turn, [theta - off], down)[0] + rng.normal(0.0, CODE / 2.0, 4)
+            spread = np.full(4, CODE / 2.0)
+            tour.append(Observation(theta, np.array(down), effort, spread, spread))
+    found = identify(tour, model)
     new = np.random.default_rng(9).uniform((-0.8, 0.3, -0.2, 0.2), (0.8, 1.3, 1.2, 1.4), (200, 4))
-    within, wide = [], []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        angle = rng.uniform(0.0, 2.0 * np.pi, 4)
-        turn, tour = np.radians(askew) * np.column_stack((np.cos(angle), np.sin(angle))), []
-        for down in leans:
-            for theta in best(down, 16 // len(leans)):
-                effort = askew_torque(turn, [theta], down)[0] + rng.normal(0.0, CODE / 2.0, 4)
-                spread = np.full(4, CODE / 2.0)
-                tour.append(Observation(theta, np.array(down), effort, spread, spread))
-        found = identify(tour, model)
-        mounted = np.array(UPRIGHT) + with_imu * np.cross(found.tilt, UPRIGHT)
-        springs = found.stiffness * (new - found.rest)
-        moments = np.where(np.isfinite(found.error), found.moments, model.moments)
-        law = (regressor(new, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.scale
-        left_out = np.sqrt(np.nanmean(found.held_out**2, axis=0) + found.left_offset**2)
-        wrong = np.abs(law - askew_torque(turn, new, UPRIGHT))
-        within.append([wrong < COVER * error for error in (np.hypot(left_out, found.of_axes), left_out)])
-        wide.append(found.of_axes)
-        assert np.all(identify(tour, model, 0.0).of_axes < 1e-5)
-    covered, without = np.mean(within, axis=(0, 2))
-    assert covered.min() > 0.93 and without.min() < 0.6
-    assert np.max(wide) < 0.1  # Nm
+    mounted = np.array(UPRIGHT) + model.keeps_tilt * np.cross(found.tilt, UPRIGHT)
+    springs = found.stiffness * (new + off - found.rest)
+    moments = np.where(np.isfinite(found.error), found.in_file, model.moments)
+    joints = new + off + found.turn[:, 0]  # as the new zeros show them
+    law = (regressor(joints, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.scale
+    true = askew_torque(turn, new, UPRIGHT)
+    return np.abs(law - true), found, float(np.abs(true).max())
+
+
+TWO_LEANS = LEANING, Tilt.of("right", -0.1, 0.25).direction
+
+
+def test_zeros_and_axes_that_are_off_leave_little_of_the_torque():
+    for seed in (0, 1):
+        wrong, found, peak = off_device(seed, PapersMoments(DEFAULT_LINKS), TWO_LEANS, 1.5, 1.5)
+        assert wrong.max() < 0.02 * peak  # 0.8 and 1.5 %; with zeros and axes held 1.1 and 2.9 %
+        assert np.max(found.torque_error) < 0.03 * peak / COVER
+
+
+def test_zeros_of_a_jig_are_kept():
+    found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
+    assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[1, 0])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("with_imu", "askew"), [(True, 1.5), (False, 1.5)])  # degrees
+def test_the_band_contains_what_axes_leave_that_are_askew(with_imu, askew):
+    model = PapersMoments(DEFAULT_LINKS, keeps_tilt=with_imu)
+    devices = [off_device(seed, model, TWO_LEANS if with_imu else (UPRIGHT,), askew, 0.0) for seed in range(6)]
+    covered = np.mean([wrong < COVER * found.torque_error for wrong, found, _ in devices], axis=(0, 1))
+    assert covered.min() > 0.9  # of six devices
+    assert np.max([found.torque_error for _, found, _ in devices]) < 0.1  # Nm
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
