@@ -359,7 +359,7 @@ class Tracker:
         root = np.sqrt(frequency)
         stiff = frequency * (matrix @ (frequency * self.error))
         push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)), frequency)
-        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        weakest = float(np.linalg.eigvals(matrix).real.min())
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + self._push_off + push + integral
