@@ -123,14 +123,14 @@ class Station(NamedTuple):
 class Line:
     """The motion from `start` to `end`, (n,) rad; the joint with the longest way turns at `speed` rad/s at most.
 
-    duration: s.
+    duration: s. way: (n,), in which each joint turns, -1, 0 or 1.
     """
 
     def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MOTION.speed) -> None:
         self._start = np.asarray(start, dtype=float)
         way = np.asarray(end, dtype=float) - self._start
         self._length = float(np.abs(way).max())
-        self._heading = way / self._length if self._length else way
+        self._heading, self.way = way / self._length if self._length else way, np.sign(way)
         self._speed = min(speed, MOTION.speed, math.sqrt(self._length * MOTION.acceleration))
         self._ramp = self._speed / MOTION.acceleration
         self.duration = self._length / self._speed + self._ramp if self._length else 0.0
@@ -276,7 +276,8 @@ class Tracker:
             self._line, self._time = next(self.lines), -MOTION.lead
         goal, heading = self._line.at(self._time)
         self.error = goal - position
-        behind = float(np.abs(self.error).max())
+        # The path does not wait for a joint that is ahead: it would not come back against its friction.
+        behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
