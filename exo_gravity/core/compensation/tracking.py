@@ -224,6 +224,7 @@ class Tracker:
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
     speed: (n,) rad/s of the joints, without vibration.
+    lowered: how often gains were lowered because motors vibrated.
     vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
     """
 
@@ -234,6 +235,7 @@ class Tracker:
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
         self.sticks = np.zeros(count, bool)
+        self.lowered = 0
         self.vibrations = np.zeros(count)
         self._vibration = Vibration(count)
         self._rigid = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s, of a rigid arm
@@ -316,6 +318,7 @@ class Tracker:
             return
         if not self._is_soft.any():
             vibrates |= True  # the others are about to
+        self.lowered += 1
         least, present = _least_frequencies(inertia), self._frequencies(inertia)
         self.vibrations += vibrates & (present <= least)
         softer = np.minimum(TRACKER.softer * present, np.sqrt(TRACKER.soft_stiffness / inertia))

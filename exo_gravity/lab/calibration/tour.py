@@ -194,7 +194,12 @@ class Tour:
         """Yield each sweep until enough were good, or a joint sticks too often; keep what they show."""
         failures, sweeps = 0, list[Sweep]()
         while len(sweeps) < 2 * station.cycles:
+            lowered = self._tracker.lowered
             pair = yield from self._tracker.sweep(station)
+            if self._tracker.lowered != lowered:
+                # Sweep again: neither friction nor gravity shows while motors vibrate.
+                sweeps = []
+                continue
             sweeps += pair
             share, was_known = followed(pair, station), bool(np.any(self._friction))
             sticks = bool(np.min(share) < MOTION.followed)

@@ -181,6 +181,22 @@ def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_rea
     assert tour.trouble == "the next pose could not be chosen: LinAlgError: Singular matrix"
 
 
+def test_a_pose_is_swept_again_if_motors_vibrated_in_it(monkeypatch):
+    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    tour, frictions, way = Tour(LIMITS, guess, fixed([POSE]), 100.0), [0.2, 0.9, 0.2, 0.2], np.linspace(-0.03, 0.03, 20)
+    position, down = np.array(POSE.theta) + way[:, None], np.tile((0.0, 0.0, 1.0), (20, 1))
+
+    def sweep(station):
+        yield from ()
+        friction = np.full((20, 4), frictions.pop(0))
+        tour._tracker.lowered += len(frictions) == 2  # in the second pair
+        return [Sweep(position, friction, down), Sweep(position[::-1], -friction, down)]
+
+    monkeypatch.setattr(tour._tracker, "sweep", sweep)
+    assert list(tour._sweeps(POSE)) == []
+    np.testing.assert_allclose(tour.measured[0].friction, 0.2)
+
+
 def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs():
     guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
     tour, step = Tour(LIMITS, guess, fixed([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
