@@ -1,10 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench.calibration.effects [--devices 20]: what `calibrate` leaves of what the moments do not explain.
 
-Random simulated devices in MuJoCo, with tours in virtual time as `calibrate scale` makes them: without and with a
-weight, the stand leant otherwise. Half of the devices, at random, have cables across their joints; half have motors
-that are weaker when warm; half have elastic joints, encoders whose zeros are off, axes askew. On warm motors
-`calibrate gravity` follows, with `--earlier` the cold record.
+Random simulated devices in MuJoCo, with tours in virtual time as `calibrate scale` makes them: without a weight, the
+stand leant back, and with one, leant forward. Half of the devices, at random, have cables across their joints; half
+have motors that are weaker when warm; half have elastic joints, encoders whose zeros are off, axes askew. On warm
+motors `calibrate gravity` follows, with `--earlier` the cold record.
 
 Judged by the torque that holds MuJoCo's arm in 300 poses that no tour visited, on a trunk that leans: the largest
 error of any joint, as a share of the largest torque, and the share of the poses within the 95 % band that
@@ -58,7 +58,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 from ..device_study import Row, as_markdown, options_of
 from ..parts import play
 from ..resting import resting_torque
-from .device import COULOMB, LARGEST_OFFSET, LEANT, SPREAD, STAND, VISCOUS
+from .device import COULOMB, LARGEST_OFFSET, SPREAD, VISCOUS
 from .tour import Player, let_hang
 
 RATE = 100.0  # Hz
@@ -69,6 +69,9 @@ WEAKER = 0.03  # share of its torque that a warm motor lacks at most
 CABLES = 0.15  # Nm/rad at most
 JOINTS = (600.0, 3000.0)  # Nm/rad
 OFF = ASKEW = np.radians(1.5)  # rad, the largest error of a zero, and of the direction of an axis
+# rad by which the stand leans back, and with the weight forward; and to the side. Joint 1 follows the lean: with more
+# forward it hangs over 0.5 rad from home, where no start begins; with more to the side joint 2 over 0.34.
+LEAN, SIDEWAYS = (0.05, 0.09), (0.19, 0.22)
 REST = (-0.3, 0.8)  # rad, where a cable is slack
 STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
 POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
@@ -134,9 +137,8 @@ class Device:
         ]
         way, far = rng.uniform(0.0, 2.0 * np.pi, count), size["axes askew"] * rng.uniform(0.0, ASKEW, count)
         self.turn = np.column_stack((far * np.cos(way), far * np.sin(way)))  # rad, about x and y of each joint
-        pitch = float(rng.uniform(*STAND[0]))
-        self.stand = pitch, float(rng.uniform(*STAND[1]))
-        self.leant = pitch - float(np.copysign(rng.uniform(*LEANT), pitch)), float(rng.uniform(*STAND[1]))
+        (back, ahead), sideways = rng.uniform(*LEAN, 2).tolist(), rng.uniform(*SIDEWAYS, 2).tolist()
+        self.stand, self.leant = (-back, sideways[0]), (ahead, sideways[1])
         self.measured = stiffness * (1.0 + STIFFNESS_ERROR * rng.standard_normal(count))  # Nm/rad
 
     def arm(self, **worn: Any) -> SimulatedArm:

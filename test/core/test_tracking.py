@@ -71,6 +71,17 @@ def test_a_heavy_joint_that_sticks_is_moved_by_the_controller_alone() -> None:
     assert shares(True, HEAVY) == shares(False, HEAVY)
 
 
+def test_a_path_comes_to_a_joint_that_sticks_ahead_of_it() -> None:
+    """It waited for the elbow, which needed 1 Nm to come back: 'a hand is on the arm'."""
+    tracker, matrix = Tracker(RATE, (9.0,)), np.array([[LIGHT]])
+    tracker.lines = iter([Line(np.zeros(1), np.ones(1))])
+    for _ in range(100):
+        tracker.step(1.0 / RATE, (0.09,), (0.0,), (0.0,), (0.0, 0.0, 1.0), matrix)
+        if tracker.error[0] > 0.0:
+            return
+    pytest.fail(f"the joint is {tracker.error[0]:.2f} rad off")
+
+
 def vibrates(speeds: list[float], rate: float) -> bool:
     """Return whether these speeds of a motor in rad/s, at `rate` Hz, are a vibration."""
     vibration = Vibration(1)

@@ -76,11 +76,12 @@ def test_a_motor_with_a_torque_scale_below_1_gives_less_than_it_reports():
     assert reply.torque == pytest.approx(2.0, abs=TORQUE_CODE)
 
 
+@pytest.mark.parametrize("scale", [0.75, 1.0, 1.2])
 @pytest.mark.parametrize("commanded", [15.0, -15.0])
-def test_torque_is_limited_to_the_motors_peak(commanded):
-    motor = entered()
+def test_torque_is_limited_to_the_motors_peak(commanded, scale):
+    motor = entered(torque_scale=scale)
     reply = reply_to(motor, command(torque=commanded))
-    assert abs(motor.torque(0.0, 0.0)) == SPEC.peak_torque
+    assert abs(motor.torque(0.0, 0.0)) == pytest.approx(motor.joint.peak_effort)
     assert abs(reply.torque) == pytest.approx(SPEC.peak_torque, abs=TORQUE_CODE)
 
 

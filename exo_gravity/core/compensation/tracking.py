@@ -123,14 +123,14 @@ class Station(NamedTuple):
 class Line:
     """The motion from `start` to `end`, (n,) rad; the joint with the longest way turns at `speed` rad/s at most.
 
-    duration: s.
+    duration: s. way: (n,), in which each joint turns, -1, 0 or 1.
     """
 
     def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MOTION.speed) -> None:
         self._start = np.asarray(start, dtype=float)
         way = np.asarray(end, dtype=float) - self._start
         self._length = float(np.abs(way).max())
-        self._heading = way / self._length if self._length else way
+        self._heading, self.way = way / self._length if self._length else way, np.sign(way)
         self._speed = min(speed, MOTION.speed, math.sqrt(self._length * MOTION.acceleration))
         self._ramp = self._speed / MOTION.acceleration
         self.duration = self._length / self._speed + self._ramp if self._length else 0.0
@@ -224,6 +224,7 @@ class Tracker:
     error: (n,) rad by which the arm is behind its path.
     correction: (n,) Nm, what the controller added to gravity and friction in the last step.
     speed: (n,) rad/s of the joints, without vibration.
+    lowered: how often gains were lowered because motors vibrated.
     vibrations: (n,) how often each joint's motor has vibrated under the lowest gains.
     """
 
@@ -234,6 +235,7 @@ class Tracker:
         self.error = np.zeros(count)
         self.correction = np.zeros(count)
         self.sticks = np.zeros(count, bool)
+        self.lowered = 0
         self.vibrations = np.zeros(count)
         self._vibration = Vibration(count)
         self._rigid = min(TRACKER.max_frequency, TRACKER.frequency_per_rate * rate)  # rad/s, of a rigid arm
@@ -276,7 +278,8 @@ class Tracker:
             self._line, self._time = next(self.lines), -MOTION.lead
         goal, heading = self._line.at(self._time)
         self.error = goal - position
-        behind = float(np.abs(self.error).max())
+        # The path does not wait for a joint that is ahead: it would not come back against its friction.
+        behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
@@ -315,6 +318,7 @@ class Tracker:
             return
         if not self._is_soft.any():
             vibrates |= True  # the others are about to
+        self.lowered += 1
         least, present = _least_frequencies(inertia), self._frequencies(inertia)
         self.vibrations += vibrates & (present <= least)
         softer = np.minimum(TRACKER.softer * present, np.sqrt(TRACKER.soft_stiffness / inertia))
@@ -359,7 +363,7 @@ class Tracker:
         root = np.sqrt(frequency)
         stiff = frequency * (matrix @ (frequency * self.error))
         push = self._filtered(dt, stiff + 2.0 * root * (matrix @ (root * speed_error)), frequency)
-        weakest = float(np.linalg.eigvalsh(matrix)[0])
+        weakest = float(np.linalg.eigvals(matrix).real.min())
         floor = TRACKER.floor * weakest * self.error * frequency**2
         integral = self._integral + TRACKER.integral_share * frequency * dt * (stiff + floor)
         torque = expected + self._slide + self._push_off + push + integral

@@ -67,8 +67,8 @@ SAME_TILT = math.radians(3.0)  # between accelerometer and `imu` at rest: what `
 LARGEST_ERROR = math.radians(0.5)  # of the two directions in which gravity can be off
 LARGEST_HEADING_ERROR = math.radians(1.0)
 NO_HEADING = (
-    "The IMU's heading does not show from one lean of the stand: `calibrate scale` shows it if the stand is leant "
-    "forward or back by about 10 degrees when the weight is hung."
+    "The IMU's heading does not show from one lean of the stand: `calibrate scale` shows it if the stand leans about "
+    "5 degrees back without the weight, and 5 degrees forward with it."
 )
 
 

@@ -37,7 +37,10 @@ from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
-LEAN = "Lean the stand forward or back by about 10 degrees (12 at most from upright): this shows the IMU's heading"
+LEAN = (
+    "Lean the stand about 5 degrees forward if it leant back before, or else back, and as far to the side as before: "
+    "this shows the IMU's heading"
+)
 MOST_OFF = 5.0  # deg, standard error of a zero or an axis that can be assumed
 LEAST_MOMENT = 0.03  # kg m: a lighter weight is lost in the torque's resolution
 

@@ -264,8 +264,8 @@ class SimulatedMotor:
     def torque(self, position: float, velocity: float) -> float:
         """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.
 
-        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, times `torque_scale` and `strength`, clamped to the peak
-        torque.
+        The motor's kp (p_des - p) + kd (v_des - v) + t_ff, clamped to the peak torque, as its board limits the current,
+        times `torque_scale` and `strength`.
         """
         if self._is_unplugged:
             self._forget()  # also what another thread was just changing when the power went
@@ -275,12 +275,11 @@ class SimulatedMotor:
         torque = command.torque + command.kd * (command.velocity - joint.direction * velocity)
         if command.kp:
             torque += command.kp * (command.position - joint.motor_position(position))
-        peak = joint.spec.peak_torque
-        return joint.direction * clamp(torque * self._scale, peak) * self.strength
+        return joint.direction * clamp(torque, joint.spec.peak_torque) * self._scale * self.strength
 
     def damps_at_once(self, torque: float) -> bool:
         """Return whether its `torque` in Nm follows the joint's velocity without delay: not at its peak."""
-        return abs(torque) < self.joint.spec.peak_torque * self.strength
+        return abs(torque) < self.joint.spec.peak_torque * self._scale * self.strength
 
     def _state(self, position: float, velocity: float) -> bytes:
         """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
