@@ -64,7 +64,7 @@ def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_n
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_motor_drives_no_joint_beyond_the_barrier_and_below_it_brakes_none(sign):
-    effort = (sign * 3.0, sign * 9.0, sign * 0.5, 0.0)
+    effort = (sign * 3.0, sign * 9.0, sign * 0.5, sign * 5.0)  # the last one beyond `max_effort`, as a let-down may be
     for speed in np.arange(-4.0, 4.0, 0.1):
         damping = barrier().damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING)
         power = [speed * (abs(tau) - kd * speed) for tau, kd in zip(effort, damping, strict=True)]

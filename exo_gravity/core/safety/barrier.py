@@ -15,8 +15,9 @@ true speed: one wrong speed in a reply moves nothing. A light arm passes F withi
 by its change over BARRIER.lead. An empty forearm under 3 Nm still reaches 2.7 rad/s at 250 Hz, and 6.4 at 100 Hz. A
 wearer who lifts their arm feels nothing up to V; at F they lift it without support.
 
-Damping is bounded, too: kd times the newest speed stays within `max_effort`, so that neither a wearer's jerk nor a fall
-makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule with others.
+Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
+wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
+with others.
 """
 
 import math
@@ -130,10 +131,10 @@ class Barrier:
         damping: what is asked for, (n,) Nm s/rad.
         """
         brakes = self.brake(dt, joints, effort)
-        columns = zip(joints, silent, damping, brakes, self._peak, self._limits.max_effort, strict=True)
+        columns = zip(joints, silent, effort, damping, brakes, self._peak, self._limits.max_effort, strict=True)
         bounded = []
-        for joint, is_silent, asked, brake, peak, most in columns:
-            speed = 0.0 if is_silent else abs(joint.velocity)
+        for joint, is_silent, tau, asked, brake, peak, limit in columns:
+            speed, most = 0.0 if is_silent else abs(joint.velocity), max(limit, abs(tau))
             wanted = min(peak, asked if is_silent else max(asked, brake))
             bounded.append(most / speed if wanted * speed > most else wanted)
         return tuple(bounded)
