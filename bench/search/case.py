@@ -64,6 +64,7 @@ class Bound(NamedTuple):
 
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
+POWER_LOST = Bound(2.2)
 TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
 
@@ -157,7 +158,7 @@ KINDS = {
     "support": Kind("operator", one_of(support=(0.0, 0.3, 0.7))),
     "max_effort": Kind("operator", one_of(share=(0.2, 0.5)), CLAMPED),
     "body_mass": Kind("operator", one_of(mass=(50.0, 100.0))),
-    "supply_cut": Kind("hardware", some_motors(0.02, 5.0)),
+    "supply_cut": Kind("hardware", some_motors(0.02, 5.0), POWER_LOST),
     "commands_lost": Kind("hardware", some_motors(0.05, 5.0)),
     "replies_lost": Kind("hardware", some_motors(0.05, 5.0), REPLIES_LOST),
     "bus_silent": Kind("hardware", lasting(0.05, 5.0), REPLIES_LOST),
