@@ -101,7 +101,7 @@ def show(rows: dict[int, Row], console: Console) -> None:
     """Print the cases that use most of their bounds."""
     table = Table("seed", "share", "rad/s", "bound", "J", "bound", "W", "damping", "joint", "events", box=None)
     for row in sorted(rows.values(), key=lambda row: -row["share"])[:SHOWN]:
-        done, (speed, energy) = row["driven"], row["bound"]
+        done, (speed, energy, *_) = row["driven"], row["bound"]
         figures = (row["share"], done["speed"], speed, done["energy"], energy, done["power"], done["damping"])
         became = row["error"] or row["fault"] or "no fault"
         text = f"{row['begin']}{', worn' * row['worn']}: {text_of(row['events'])} | {became}"

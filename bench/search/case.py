@@ -13,6 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from exo_gravity.core.safety.descent import DESCENT
+from exo_gravity.sim.judge import SLOW
+
 from ..arms import ARMS, PlayedArm, Pose
 
 RATES = (100.0, 250.0)  # Hz
@@ -56,14 +59,21 @@ class Case:
 
 
 class Bound(NamedTuple):
-    """What a motor may do to an arm: rad/s, and J in one stretch."""
+    """What a motor may do to an arm: rad/s, and J in one stretch that are given faster than `slow` rad/s."""
 
     speed: float = 0.6
     energy: float = 0.3
+    slow: float = SLOW
 
 
+# The operator asks for another load, and gets it as a guided motion, whoever is in the arm. It lifts an arm that is
+# lighter than they say: in an elbow with the arm of 75 kg, told 100, the motor gives 6.1 J, of which 0.03 do not become
+# height. No faster than arms are let down, a hand 0.7 m from the shoulder stays below 0.25 m/s, the reduced speed of
+# ISO 10218-1, at which people can withdraw: only what is given faster counts as energy.
+ASKED = Bound(slow=DESCENT.speed)
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
+LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
 POWER_LOST = Bound(2.2)
 TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
@@ -154,10 +164,10 @@ KINDS = {
     "clear": Kind("operator"),
     "resume": Kind("operator"),
     "toggle": Kind("operator", lasting(0.1, 4.0)),
-    "mode": Kind("operator"),
-    "support": Kind("operator", one_of(support=(0.0, 0.3, 0.7))),
+    "mode": Kind("operator", bound=ASKED),
+    "support": Kind("operator", one_of(support=(0.0, 0.3, 0.7)), ASKED),
     "max_effort": Kind("operator", one_of(share=(0.2, 0.5)), CLAMPED),
-    "body_mass": Kind("operator", one_of(mass=(50.0, 100.0))),
+    "body_mass": Kind("operator", one_of(mass=(50.0, 100.0)), ASKED),
     "supply_cut": Kind("hardware", some_motors(0.02, 5.0), POWER_LOST),
     "commands_lost": Kind("hardware", some_motors(0.05, 5.0)),
     "replies_lost": Kind("hardware", some_motors(0.05, 5.0), REPLIES_LOST),
@@ -177,7 +187,7 @@ KINDS = {
     "resist": Kind("wearer", lasting(1.0, 5.0)),
     "spasm": Kind("wearer", one_of(size=(1.0, 2.0))),
     "push": Kind("wearer", push),
-    "payload_taken": Kind("wearer", one_of(mass=(0.2, 1.0), told=(0.0, 1.0, 2.0))),
+    "payload_taken": Kind("wearer", one_of(mass=(0.2, 1.0), told=(0.0, 1.0, 2.0)), ASKED),
     "payload_dropped": Kind("wearer", bound=LOAD_LOST),
     "payload_flicked": Kind("wearer", bound=LOAD_LOST),
     "out_of_cuff": Kind("wearer", bound=LOAD_LOST),
@@ -248,5 +258,29 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     clamped: whether the compensator or the bridge had to clamp a torque.
     """
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
-    bounds += [TILT_CREPT for event in case.events if event.name == "imu_wrong" and event.values["duration"] > SLOWLY]
-    return Bound(max(bound.speed for bound in bounds), max(bound.energy for bound in bounds))
+    for event in case.events:
+        is_moved, is_tilt = is_moved_after(case, event), KINDS[event.name].bound is TILT_JUMPED
+        if is_tilt and (is_moved or event.values["duration"] > SLOWLY):
+            bounds.append(TILT_CREPT)
+        if is_moved and tells_too_much(case, event):
+            bounds.append(LOAD_LOST)
+    bounds += [LOST_AT_100_HZ] * (case.rate == min(RATES) and any(bound is LOAD_LOST for bound in bounds))
+    return Bound(*map(max, zip(*bounds, strict=True)))
+
+
+def is_moved_after(case: Case, event: Event) -> bool:
+    """Return whether a wearer may move the arm after this event.
+
+    Once a wrong load or a wrong tilt is carried, nothing shows it while the arm stands. What moves the arm then, moves
+    it as if a load of that mass had been lost, or into a pose in which the wrong tilt drives it.
+    """
+    return any(KINDS[later.name].group == "wearer" for later in case.events if later.time > event.time)
+
+
+def tells_too_much(case: Case, event: Event) -> bool:
+    """Return whether the operator has more mass carried from this event on than there is, so far as it alone says."""
+    if event.name == "mode":
+        return not case.worn and ARMS[case.arm].worn is not None  # to Zero-G: the wearer's arm is not there
+    if event.name == "body_mass":
+        return case.worn and float(event.values["mass"]) > BODY_MASS
+    return event.name == "payload_taken" and float(event.values["told"]) > 1.0

@@ -53,11 +53,11 @@ def play_case(case: Case) -> tuple[Played, np.ndarray]:
         error = f"{type(caught).__name__}: {caught}"
     stage.arm.bus.close()
     records = stage.truth.records
-    was_clamped = stage.controller.was_clamped
+    bound = bound_of(case, stage.controller.was_clamped)
     config = stage.device.arm.config
     stops = config.position_min, config.position_max
-    done = driven(records, [motor.joint.spec for motor in stage.motors], stops)
-    return Played(case, done, bound_of(case, was_clamped), tuple(stage.states), begin, error), records
+    done = driven(records, [motor.joint.spec for motor in stage.motors], stops, bound.slow)
+    return Played(case, done, bound, tuple(stage.states), begin, error), records
 
 
 def _play(stage: Stage, case: Case) -> float:

@@ -280,6 +280,7 @@ class SimulatedArm:
         # The same arm on a base that can turn: its torques for a given motion of the base.
         self.model, self._turning_model = self.config.models(payload)
         self.data = mujoco.MjData(self.model)
+        self._still, self._held = mujoco.MjData(self.model), np.zeros(self.model.nv)  # for `weight`
         self._turning_data = mujoco.MjData(self._turning_model)
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         count = len(self.config.joint_stiffness)
@@ -317,6 +318,17 @@ class SimulatedArm:
     def motor_velocities(self) -> list[float]:
         """Velocities of the joints' motors (n,) in rad/s."""
         return list(self.data.qvel[self._motors].tolist()) if self.is_elastic else self.velocities
+
+    @property
+    def weight(self) -> list[float]:
+        """Torques (n,) in Nm that hold the joints against what the base feels as gravity, without friction."""
+        model, still = self.model, self._still
+        still.qpos[:] = self.data.qpos
+        mujoco.mj_kinematics(model, still)
+        mujoco.mj_comPos(model, still)
+        mujoco.mj_rne(model, still, 0, self._held)
+        weight: list[float] = self._held[: len(self._theta)].tolist()
+        return weight
 
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""

@@ -44,7 +44,8 @@ class Driven:
     In a stretch a joint moves faster than SLOW in the direction of its motor's whole torque, that of damping included;
     gaps of up to COAST belong to it. A WEAK torque drives nothing.
 
-    speed: rad/s gained within a stretch; 0 in one of LITTLE energy.
+    speed: rad/s gained within a stretch; 0 where the motor gave LITTLE energy beyond what lifts the joint's weight: a
+    joint that a falling forearm swings upwards is not thrown by a motor that carries less than its weight.
     energy: J in one stretch.
     power: W in a stretch.
     damping: torque of damping alone as a multiple of the motor's rated torque, also while a hand is on the arm.
@@ -68,21 +69,26 @@ def driven(
     records: np.ndarray,
     motors: Sequence[MotorSpec] = USUAL,
     stops: tuple[Sequence[float], Sequence[float]] | None = None,
+    slow: float = SLOW,
 ) -> Driven:
     """Return what the motors did in these records (sim/truth.py); at least one.
 
     motors: of the joints (n,), by default those of the paper's arm.
     stops: the lower and upper mechanical stops, (n,) rad each; None if none is hit.
+    slow: rad/s up to which no energy counts.
     """
     is_free, _, gained = _gained(records, stops)
-    power = np.maximum(0.0, records["torque"] * records["velocity"]) * is_free[:, None]
-    power[np.abs(records["torque"]) < WEAK] = 0.0
+    torque, velocity = records["torque"], records["velocity"]
+    power = np.maximum(0.0, torque * velocity) * is_free[:, None]
+    power[np.abs(torque) < WEAK] = 0.0
     is_moved = (power > 0.0) & (gained > SLOW)
     time = records["time"][:, None]
     in_stretch = time - np.maximum.accumulate(np.where(is_moved, time, -np.inf), axis=0) <= COAST
-    done = np.cumsum(np.where(is_moved, power, 0.0) * _lasting(records)[:, None], axis=0)
-    energy = done - np.maximum.accumulate(np.where(in_stretch, 0.0, done), axis=0)
-    speed = np.where(energy > LITTLE, _gained_in(in_stretch, gained), 0.0)
+    lasting = _lasting(records)[:, None]
+    energy = _sum_in(in_stretch, np.where(is_moved & (gained > slow), power, 0.0) * lasting)
+    beyond_weight = np.clip((torque - records["weight"]) * velocity, 0.0, power)
+    threw = _sum_in(in_stretch, np.where(is_moved, beyond_weight, 0.0) * lasting) > LITTLE
+    speed = np.where(threw, _gained_in(in_stretch, gained), 0.0)
     when, joint = np.unravel_index(np.argmax(speed), speed.shape)
     rated = [motor.rated_torque for motor in motors]
     return Driven(
@@ -93,6 +99,12 @@ def driven(
         joint=int(joint) + 1,
         time=float(records["time"][when]),
     )
+
+
+def _sum_in(in_stretch: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sum (n, joints) of the values since the begin of each joint's stretch."""
+    total = np.cumsum(values, axis=0)
+    return np.asarray(total - np.maximum.accumulate(np.where(in_stretch, 0.0, total), axis=0))
 
 
 def _gained_in(in_stretch: np.ndarray, speed: np.ndarray) -> np.ndarray:

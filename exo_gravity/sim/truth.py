@@ -16,9 +16,9 @@ from exo_gravity.core.numbers import JOINT_COUNT
 
 
 # time: wall clock in s. position, velocity: of the joints, rad and rad/s. torque: of the motors on the joints, Nm.
-# damping: Nm s/rad, the part of that torque that is proportional to the velocity. wearer: Nm of the wearer on the
-# joints. frames: received by each motor so far. step: of the wearer's script, -1 before it. on: whether each motor is
-# on.
+# damping: Nm s/rad, the part of that torque that is proportional to the velocity. weight: Nm that would hold the joints
+# against gravity. wearer: Nm of the wearer on the joints. frames: received by each motor so far. step: of the wearer's
+# script, -1 before it. on: whether each motor is on.
 def record_of(count: int) -> np.dtype:
     """Return the type of a record of an arm with `count` joints."""
     return np.dtype(
@@ -28,6 +28,7 @@ def record_of(count: int) -> np.dtype:
             ("velocity", "<f4", (count,)),
             ("torque", "<f4", (count,)),
             ("damping", "<f4", (count,)),
+            ("weight", "<f4", (count,)),
             ("wearer", "<f4", (count,)),
             ("frames", "<u4", (count,)),
             ("step", "<i4"),

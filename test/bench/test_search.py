@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -17,7 +18,7 @@ POSE = (0.0, 0.5, 0.1, 0.3)
 
 
 def case_of(*events: Event, begin: str = "carried") -> Case:
-    return Case("paper", 0, 100.0, False, 0.0, 0.2, POSE, begin, events)
+    return Case("paper", 0, 250.0, False, 0.0, 0.2, POSE, begin, events)
 
 
 def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happen():
@@ -31,6 +32,30 @@ def test_an_unseen_cause_has_a_bound_of_its_own():
     dropped = Event(1.0, "payload_dropped", {})
     assert bound_of(case_of(Event(0.0, "disable", {})), clamped=False) == Bound(0.6, 0.3)
     assert bound_of(case_of(dropped), clamped=True).speed == 2.9
+    assert bound_of(replace(case_of(dropped), rate=100.0), clamped=True).speed == 4.3
+
+
+def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_as_a_lost_load():
+    zero_g, push = Event(1.0, "mode", {}), Event(2.0, "push", {"torque": [0.0] * 4, "duration": 0.3})
+    earlier = push._replace(time=0.5)
+    asked = bound_of(case_of(zero_g), clamped=False)
+    assert asked == bound_of(case_of(earlier, zero_g), clamped=False) == Bound(0.6, 0.3, slow=0.35)
+    assert bound_of(case_of(zero_g, push), clamped=False).speed == 2.9
+    heavier = Event(1.0, "body_mass", {"mass": 100.0})
+    assert bound_of(case_of(heavier, push), clamped=False) == asked  # One-G carries no wearer
+    assert bound_of(replace(case_of(heavier, push), worn=True), clamped=False).speed == 2.9
+    assert bound_of(replace(case_of(zero_g, push), worn=True), clamped=False) == asked  # to One-G
+    for told, speed in ((1.0, 0.6), (2.0, 2.9)):
+        taken = Event(1.0, "payload_taken", {"mass": 0.2, "told": told})
+        assert bound_of(case_of(taken, push), clamped=False).speed == speed
+
+
+def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_slowly():
+    wrong = Event(1.0, "imu_creeps", {"pitch": 1.0, "roll": 0.0, "duration": 0.2})
+    reach = Event(8.0, "reach", {})
+    assert bound_of(case_of(wrong), clamped=False).speed == 1.0
+    assert bound_of(case_of(reach._replace(time=0.5), wrong), clamped=False).speed == 1.0
+    assert bound_of(case_of(wrong, reach), clamped=False).speed == 2.9
 
 
 def test_an_arm_that_is_disabled_comes_down_within_its_bound():

@@ -100,6 +100,15 @@ def test_an_arm_that_speeds_up_fast_is_braked_before_it_is_fast():
     assert slow == NOTHING and min(sudden) > 0.3
 
 
+@pytest.mark.parametrize("rate", [50.0, 100.0, 250.0, 500.0])
+def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
+    arm, acceleration, dt = barrier(), 10.0, 1.0 / rate  # rad/s^2, s
+    for speed in np.arange(0.0, 2.0, acceleration * dt):
+        brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NOTHING, is_late=False)[0]
+    led = speed + acceleration * BARRIER.lead - LIMITS.driven_speed
+    assert brake == pytest.approx(3.0 / FULL * led / BARRIER.span, rel=1e-3)
+
+
 def test_damping_times_speed_stays_within_max_effort_in_every_drive():
     for state in ("carried", "let down"):
         arm = SafetyRun().until_active()

@@ -40,6 +40,8 @@ def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt(side):
         arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
         arm.reset(theta)
         np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(links, theta, direction), atol=1e-12)
+        arm.data.qvel[:] = 3.0  # a moving arm weighs no more
+        np.testing.assert_allclose(arm.weight, arm.data.qfrc_bias, atol=1e-12)
 
 
 def test_the_static_torque_of_a_worn_arm_includes_the_wearers_arm():

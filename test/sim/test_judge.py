@@ -178,6 +178,29 @@ def test_of_a_joint_that_falls_the_motor_gave_only_what_it_adds(records):
     assert driven(records).speed == pytest.approx(1.5, abs=0.01)
 
 
+def test_a_motor_that_carries_less_than_the_weight_does_not_throw_what_others_swing_up(records):
+    swung = (records["time"] >= FAULT + 1.0) & (records["time"] < FAULT + 1.2)
+    records["velocity"][swung, 2], records["torque"][swung, 2] = 0.9, 0.5
+    assert driven(records).speed == pytest.approx(0.9)
+    records["weight"][:, 2] = 0.6
+    assert driven(records).speed < 0.1
+    records["weight"][:, 2] = 0.4  # what it gives beyond that throws it
+    assert driven(records).speed == pytest.approx(0.9)
+    records["weight"][:, 2] = -0.6  # gravity helps; the motor pushes, too
+    assert driven(records).speed == pytest.approx(0.9)
+
+
+def test_energy_counts_from_a_speed_on(records):
+    since = records["time"] - FAULT
+    lifted = (since >= 1.0) & (since < 2.0)
+    records["velocity"][lifted, 2], records["torque"][lifted, 2] = 0.3, 2.0
+    assert driven(records).energy == pytest.approx(0.6, abs=0.01)
+    assert driven(records, slow=0.35).energy < 0.001
+    assert driven(records, slow=0.35).speed == pytest.approx(0.3)
+    records["velocity"][lifted & (since >= 1.5), 2] = 0.4
+    assert driven(records, slow=0.35).energy == pytest.approx(0.4, abs=0.01)
+
+
 def test_a_stop_that_an_arm_falls_into_gives_speed_and_a_motor_that_threw_it_there_is_blamed(records):
     since = records["time"] - FAULT
     stops = (-1.0,) * 4, (1.0,) * 4

@@ -57,6 +57,7 @@ def test_every_physics_step_is_logged_with_wall_time_motion_torque_damping_and_m
     effort = records["torque"][:, 1] + records["damping"][:, 1] * records["velocity"][:, 1]
     np.testing.assert_allclose(effort, 2.0, atol=0.02)
     np.testing.assert_allclose(np.gradient(records["position"][:, 1], 0.001), records["velocity"][:, 1], atol=0.05)
+    np.testing.assert_allclose(records["weight"][-1], device.arm.weight, atol=0.02)
 
 
 def test_a_reader_sees_the_newest_state_while_the_file_grows(device, tmp_path):
