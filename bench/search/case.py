@@ -73,6 +73,7 @@ class Bound(NamedTuple):
 ASKED = Bound(slow=DESCENT.speed)
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
+UNHEARD = Bound(math.inf, math.inf)  # no command reaches the motors, and what they carry changes meanwhile
 LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
 POWER_LOST = Bound(2.2)
 TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
@@ -203,6 +204,7 @@ KINDS = {
 }
 NEEDS_IMU = ("imu_wrong", "imu_creeps", "imu_frozen", "imu_silent", "trunk_falls", "lean")
 NEEDS_WEARER = ("body_mass",)
+DEAF = ("commands_lost", "bus_silent")  # motors hold the last torque that they heard
 AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
 
 
@@ -264,17 +266,19 @@ def bound_of(case: Case, clamped: bool) -> Bound:
             bounds.append(TILT_CREPT)
         if is_moved and tells_too_much(case, event):
             bounds.append(LOAD_LOST)
+        if event.name in DEAF and is_moved_after(case, event, event.values["duration"]):
+            bounds.append(UNHEARD)
     bounds += [LOST_AT_100_HZ] * (case.rate == min(RATES) and any(bound is LOAD_LOST for bound in bounds))
     return Bound(*map(max, zip(*bounds, strict=True)))
 
 
-def is_moved_after(case: Case, event: Event) -> bool:
-    """Return whether a wearer may move the arm after this event.
+def is_moved_after(case: Case, event: Event, within: float = math.inf) -> bool:
+    """Return whether a wearer may move the arm after this event, within so many s.
 
     Once a wrong load or a wrong tilt is carried, nothing shows it while the arm stands. What moves the arm then, moves
     it as if a load of that mass had been lost, or into a pose in which the wrong tilt drives it.
     """
-    return any(KINDS[later.name].group == "wearer" for later in case.events if later.time > event.time)
+    return any(KINDS[later.name].group == "wearer" for later in case.events if 0.0 < later.time - event.time < within)
 
 
 def tells_too_much(case: Case, event: Event) -> bool:

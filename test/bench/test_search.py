@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import pytest
@@ -56,6 +57,12 @@ def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_sl
     assert bound_of(case_of(wrong), clamped=False).speed == 1.0
     assert bound_of(case_of(reach._replace(time=0.5), wrong), clamped=False).speed == 1.0
     assert bound_of(case_of(wrong, reach), clamped=False).speed == 2.9
+
+
+def test_motors_that_hear_nothing_are_judged_unless_what_they_carry_changes_meanwhile():
+    deaf = Event(1.0, "commands_lost", {"motors": [0], "duration": 2.0})
+    for time, speed in ((0.5, 2.9), (1.5, math.inf), (3.5, 2.9)):
+        assert bound_of(case_of(deaf, Event(time, "payload_flicked", {})), clamped=False).speed == speed
 
 
 def test_an_arm_that_is_disabled_comes_down_within_its_bound():
