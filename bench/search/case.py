@@ -76,7 +76,8 @@ CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), B
 UNHEARD = Bound(math.inf, math.inf)  # no command reaches the motors, and what they carry changes meanwhile
 LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
 POWER_LOST = Bound(2.2)
-TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
+TILT_JUMPED, TILT_TURNED = Bound(1.0, math.inf), Bound(1.2, math.inf)
+TILT_CREPT = Bound(2.9, math.inf)  # so slowly that nothing is noticed; or the arm is moved once it is no longer new
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
 
 
@@ -262,8 +263,10 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
     for event in case.events:
         is_moved, is_tilt = is_moved_after(case, event), KINDS[event.name].bound is TILT_JUMPED
-        if is_tilt and (is_moved or event.values["duration"] > SLOWLY):
+        if is_tilt and is_moved:
             bounds.append(TILT_CREPT)
+        if is_tilt and event.values["duration"] > SLOWLY:
+            bounds.append(TILT_TURNED)
         if is_moved and tells_too_much(case, event):
             bounds.append(LOAD_LOST)
         if event.name in DEAF and is_moved_after(case, event, event.values["duration"]):

@@ -54,6 +54,8 @@ def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_a
 def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_slowly():
     wrong = Event(1.0, "imu_creeps", {"pitch": 1.0, "roll": 0.0, "duration": 0.2})
     reach = Event(8.0, "reach", {})
+    slowly = wrong._replace(values={**wrong.values, "duration": 2.0})
+    assert bound_of(case_of(slowly), clamped=False).speed == 1.2
     assert bound_of(case_of(wrong), clamped=False).speed == 1.0
     assert bound_of(case_of(reach._replace(time=0.5), wrong), clamped=False).speed == 1.0
     assert bound_of(case_of(wrong, reach), clamped=False).speed == 2.9
@@ -72,6 +74,12 @@ def test_an_arm_that_is_disabled_comes_down_within_its_bound():
     assert not played.error and played.share < 1.0
     assert records["position"][:, 1].max() == pytest.approx(POSE[1], abs=0.05)
     assert not records["on"][-1].any()
+
+
+def test_a_tilt_that_is_wrong_no_faster_than_people_turn_drives_no_joint_beyond_a_sudden_one():
+    wrong = Event(0.1, "imu_wrong", {"pitch": -0.6, "roll": 0.0, "duration": 1.0})
+    played, _ = play_case(replace(case_of(wrong), worn=True, friction=0.05))
+    assert not played.error and 0.2 < played.driven.speed < 1.0
 
 
 def test_a_run_goes_on_with_the_cases_that_are_not_kept_also_after_a_line_was_cut_off(tmp_path):
