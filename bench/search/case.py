@@ -75,7 +75,6 @@ ASKED = Bound(slow=DESCENT.speed)
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
 UNHEARD = Bound(math.inf, math.inf)  # no command reaches the motors, and what they carry changes meanwhile
 LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
-POWER_LOST = Bound(2.2)
 TILT_JUMPED, TILT_TURNED = Bound(1.0, math.inf), Bound(1.2, math.inf)
 TILT_CREPT = Bound(2.9, math.inf)  # so slowly that nothing is noticed; or the arm is moved once it is no longer new
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
@@ -170,7 +169,7 @@ KINDS = {
     "support": Kind("operator", one_of(support=(0.0, 0.3, 0.7)), ASKED),
     "max_effort": Kind("operator", one_of(share=(0.2, 0.5)), CLAMPED),
     "body_mass": Kind("operator", one_of(mass=(50.0, 100.0)), ASKED),
-    "supply_cut": Kind("hardware", some_motors(0.02, 5.0), POWER_LOST),
+    "supply_cut": Kind("hardware", some_motors(0.02, 5.0)),
     "commands_lost": Kind("hardware", some_motors(0.05, 5.0)),
     "replies_lost": Kind("hardware", some_motors(0.05, 5.0), REPLIES_LOST),
     "bus_silent": Kind("hardware", lasting(0.05, 5.0), REPLIES_LOST),

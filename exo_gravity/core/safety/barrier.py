@@ -19,7 +19,7 @@ Two things show that torque which held the arm may no longer balance it. A motor
 lost its power: its joint falls, and the torque of the others, which answers the pose before, drives them. And gravity
 that has just turned (MotionMonitor.has_turned) may be an IMU that comes loose. Then V is BARRIER.calm and F is
 BARRIER.still for all joints. This brake ends with its cause. With 3 % of the frames lost each way at 250 Hz, a wearer
-who bends their elbow at 1.7 to 2.7 rad/s feels 1.1 Nm for a moment; their torque is 0.06 Nm RMS more.
+who bends their elbow at 2.7 rad/s feels 0.9 Nm more for a moment; their torque is 0.04 Nm RMS more.
 
 Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
 wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
