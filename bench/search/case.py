@@ -73,7 +73,9 @@ class Bound(NamedTuple):
 ASKED = Bound(slow=DESCENT.speed)
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
-TILT_JUMPED, TILT_CREPT = Bound(1.0, math.inf), Bound(2.9, math.inf)
+LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
+TILT_JUMPED = Bound(1.0, math.inf)
+TILT_CREPT = Bound(2.9, math.inf)  # no faster than people turn; or the arm is moved once it is no longer new
 # A motor that no command reaches keeps its torque: only its own time-out ends what a lost load leaves (invariant 11).
 UNREACHED, LOST_UNREACHED = ("commands_lost", "bus_silent"), Bound(math.inf, math.inf)
 SLOWLY = 1.0  # s, from which on a wrong tilt turns no faster than people do
@@ -203,6 +205,7 @@ KINDS = {
 }
 NEEDS_IMU = ("imu_wrong", "imu_creeps", "imu_frozen", "imu_silent", "trunk_falls", "lean")
 NEEDS_WEARER = ("body_mass",)
+DEAF = ("commands_lost", "bus_silent")  # motors hold the last torque that they heard
 AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
 
 
@@ -258,20 +261,24 @@ def bound_of(case: Case, clamped: bool) -> Bound:
     clamped: whether the compensator or the bridge had to clamp a torque.
     """
     bounds = [KINDS[event.name].bound for event in case.events] + [CLAMPED] * clamped + [Bound()]
-    bounds += [TILT_CREPT for event in case.events if event.name == "imu_wrong" and event.values["duration"] > SLOWLY]
-    bounds += [LOAD_LOST] * is_pushed_with_too_much(case)
+    for event in case.events:
+        is_moved, is_tilt = is_moved_after(case, event), KINDS[event.name].bound is TILT_JUMPED
+        if is_tilt and (is_moved or event.values["duration"] > SLOWLY):
+            bounds.append(TILT_CREPT)
+        if is_moved and tells_too_much(case, event):
+            bounds.append(LOAD_LOST)
     bounds += [LOST_UNREACHED] * is_lost_unreached(case)
+    bounds += [LOST_AT_100_HZ] * (case.rate == min(RATES) and any(bound is LOAD_LOST for bound in bounds))
     return Bound(*map(max, zip(*bounds, strict=True)))
 
 
-def is_pushed_with_too_much(case: Case) -> bool:
-    """Return whether a wearer may move an arm after the operator has told it of masses that are not there.
+def is_moved_after(case: Case, event: Event, within: float = math.inf) -> bool:
+    """Return whether a wearer may move the arm after this event, within so many s.
 
-    Once such a load is carried, nothing shows it while the arm stands. What moves the arm then, moves it as if a load
-    of that mass had been lost.
+    Once a wrong load or a wrong tilt is carried, nothing shows it while the arm stands. What moves the arm then, moves
+    it as if a load of that mass had been lost, or into a pose in which the wrong tilt drives it.
     """
-    told = min([event.time for event in case.events if tells_too_much(case, event)], default=math.inf)
-    return any(KINDS[event.name].group == "wearer" for event in case.events if event.time > told)
+    return any(KINDS[later.name].group == "wearer" for later in case.events if 0.0 < later.time - event.time < within)
 
 
 def is_lost_unreached(case: Case) -> bool:

@@ -19,7 +19,7 @@ POSE = (0.0, 0.5, 0.1, 0.3)
 
 
 def case_of(*events: Event, begin: str = "carried") -> Case:
-    return Case("paper", 0, 100.0, False, 0.0, 0.2, POSE, begin, events)
+    return Case("paper", 0, 250.0, False, 0.0, 0.2, POSE, begin, events)
 
 
 def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happen():
@@ -33,6 +33,7 @@ def test_an_unseen_cause_has_a_bound_of_its_own():
     dropped = Event(1.0, "payload_dropped", {})
     assert bound_of(case_of(Event(0.0, "disable", {})), clamped=False) == Bound(0.6, 0.3)
     assert bound_of(case_of(dropped), clamped=True).speed == 2.9
+    assert bound_of(replace(case_of(dropped), rate=100.0), clamped=True).speed == 4.3
 
 
 def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_as_a_lost_load():
@@ -56,6 +57,14 @@ def test_nothing_bounds_what_a_lost_load_leaves_while_no_command_reaches_the_mot
     assert bound_of(case_of(silent, dropped._replace(time=1.6)), clamped=False).speed == 2.9
 
 
+def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_slowly():
+    wrong = Event(1.0, "imu_creeps", {"pitch": 1.0, "roll": 0.0, "duration": 0.2})
+    reach = Event(8.0, "reach", {})
+    assert bound_of(case_of(wrong), clamped=False).speed == 1.0
+    assert bound_of(case_of(reach._replace(time=0.5), wrong), clamped=False).speed == 1.0
+    assert bound_of(case_of(wrong, reach), clamped=False).speed == 2.9
+
+
 def test_an_arm_that_is_disabled_comes_down_within_its_bound():
     played, records = play_case(case_of(Event(0.1, "disable", {})))
     states = [state for _, state, _ in played.states]
@@ -63,6 +72,12 @@ def test_an_arm_that_is_disabled_comes_down_within_its_bound():
     assert not played.error and played.share < 1.0
     assert records["position"][:, 1].max() == pytest.approx(POSE[1], abs=0.05)
     assert not records["on"][-1].any()
+
+
+def test_a_tilt_that_is_wrong_no_faster_than_people_turn_drives_no_joint_beyond_a_sudden_one():
+    wrong = Event(0.1, "imu_wrong", {"pitch": -0.6, "roll": 0.0, "duration": 1.0})
+    played, _ = play_case(replace(case_of(wrong), worn=True, friction=0.05))
+    assert not played.error and 0.2 < played.driven.speed < 1.0
 
 
 def test_a_run_goes_on_with_the_cases_that_are_not_kept_also_after_a_line_was_cut_off(tmp_path):

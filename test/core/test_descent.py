@@ -70,3 +70,18 @@ def test_damping_returns_when_a_joint_without_torque_moves_too_fast():
     run(joint, 3.0 * DESCENT.speed, 0.25)
     assert joint.damping == DAMPING
     assert joint.effort == 0.0
+
+
+@pytest.mark.parametrize("speed", [-2.2, 2.2])
+def test_what_a_motor_that_replies_again_brakes_with_drives_nothing_and_does_not_step(speed):
+    joint = JointDescent(-0.13, 0.0, 3.0)
+    braking = -3.0 * speed  # Nm, of damping on its way to DAMPING
+    joint.resume(braking, speed)
+    assert joint.effort == pytest.approx(-0.13)
+    assert joint.effort - joint.damping * speed == pytest.approx(braking)
+
+
+def test_what_a_motor_that_replies_again_holds_at_rest_is_its_torque():
+    joint = JointDescent(1.0, 0.0, 9.0)
+    joint.resume(3.7, 0.02)
+    assert (joint.effort, joint.damping) == (3.7, 0.0)

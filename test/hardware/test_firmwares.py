@@ -17,7 +17,7 @@ from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
 
 from ..support.copies import prepared
 from ..support.thorough import quick
-from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, REAL_RATE, UNKNOWN_LOSS, CarriedArm
+from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, REAL_RATE, UNKNOWN_LOSS, CarriedArm, cut
 
 PEAK = (9.0, 18.0, 9.0, 9.0)  # Nm
 REPLYING = [name for name in FIRMWARES if name != "v3_query"]
@@ -100,6 +100,14 @@ def test_whatever_the_firmware_drops_the_motors_drive_no_joint(name: str, event:
     dips = sum(motor.dips for motor in arm.device.motors)
     assert state is State.ACTIVE or arm.safety.fault
     assert not dips or arm.safety.fault, "torque was lost without a word"
+
+
+@pytest.mark.parametrize("motor", [1, 2])
+def test_while_a_motor_that_has_lost_its_power_is_late_the_others_stop_driving_their_joints(motor: int) -> None:
+    arm = raised_arm("ak")
+    cut((motor,), 1.0)(arm)
+    arm.see_out()
+    assert arm.caused.energy < ENERGY, arm.caused
 
 
 def test_a_board_in_query_reply_mode_is_not_started_and_the_reason_is_told() -> None:

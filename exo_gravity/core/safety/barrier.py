@@ -15,8 +15,15 @@ true speed: one wrong speed in a reply moves nothing. A light arm passes F withi
 by its change over BARRIER.lead, at any rate of the loop. An empty forearm under 3 Nm still reaches 2.7 rad/s at 250 Hz,
 and 6.4 at 100 Hz. A wearer who lifts their arm feels nothing up to V; at F they lift it without support.
 
-Damping is bounded, too: kd times the newest speed stays within `max_effort`, so that neither a wearer's jerk nor a fall
-makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule with others.
+Two things show that torque which held the arm may no longer balance it. A motor that is late with its replies may have
+lost its power: its joint falls, and the torque of the others, which answers the pose before, drives them. And gravity
+that has just turned (MotionMonitor.has_turned) may be an IMU that comes loose. Then V is BARRIER.calm and F is
+BARRIER.still for all joints. This brake ends with its cause. With 3 % of the frames lost each way at 250 Hz, a wearer
+who bends their elbow at 2.7 rad/s feels 0.9 Nm more for a moment; their torque is 0.04 Nm RMS more.
+
+Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
+wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
+with others.
 """
 
 import math
@@ -42,6 +49,8 @@ class BarrierTuning:
     #: s, time constant with which the brake falls. It rises at once; if it fell so, a light arm would be thrown and
     #: caught by turns, one cycle each
     hold: float = 0.05
+    calm: float = 0.25  #: rad/s, `driven_speed` of an arm that may no longer be balanced: that of a guided motion
+    still: float = 0.75  #: rad/s, from which on a motor then drives no joint; 1.25 lets seven joints reach 0.78 (0.58)
 
 
 BARRIER = BarrierTuning()
@@ -121,6 +130,7 @@ class Barrier:
         silent: Sequence[bool],
         effort: Sequence[float],
         damping: Sequence[float],
+        is_unsure: bool,
     ) -> tuple[float, ...]:
         """Return the damping (n,) in Nm s/rad of a drive that is to apply `effort` (n,) Nm.
 
@@ -128,19 +138,22 @@ class Barrier:
         joints: the newest readings (n,).
         silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.
         damping: what is asked for, (n,) Nm s/rad.
+        is_unsure: whether a motor is late with its replies, or gravity has just turned.
         """
         brakes = self.brake(dt, joints, effort)
-        columns = zip(joints, silent, damping, brakes, self._peak, self._limits.max_effort, strict=True)
+        columns = zip(joints, silent, effort, damping, brakes, self._peak, self._limits.max_effort, strict=True)
         bounded = []
-        for joint, is_silent, asked, brake, peak, most in columns:
-            speed = 0.0 if is_silent else abs(joint.velocity)
-            wanted = min(peak, asked if is_silent else max(asked, brake))
+        for joint, is_silent, tau, asked, brake, peak, limit in columns:
+            speed, most = 0.0 if is_silent else abs(joint.velocity), max(limit, abs(tau))
+            along = math.copysign(speed, tau * joint.velocity)
+            needed = max(brake, _rising(tau, along, BARRIER.calm, BARRIER.still)) if is_unsure else brake
+            wanted = min(peak, asked if is_silent else max(asked, needed))
             bounded.append(most / speed if wanted * speed > most else wanted)
         return tuple(bounded)
 
     def brake(self, dt: float, joints: Sequence[JointSample], effort: Sequence[float]) -> Sequence[float]:
         """Return the damping (n,) in Nm s/rad that joints need which `effort` (n,) Nm drives; see the module."""
-        first, span = self._limits.driven_speed, BARRIER.span
+        first, last = self._limits.driven_speed, self._limits.driven_speed + BARRIER.span
         share, kept = min(1.0, dt / BARRIER.lead), max(0.0, 1.0 - dt / BARRIER.hold)
         ahead = BARRIER.lead / max(BARRIER.lead, dt)
         for i, (joint, tau) in enumerate(zip(joints, effort, strict=True)):
@@ -149,8 +162,7 @@ class Barrier:
             self._slow[i] += share * change
             sign = math.copysign(1.0, tau)
             driven = sign * velocity + max(0.0, ahead * sign * change)
-            needed = abs(tau) / (first + span) * max(0.0, min(1.0, (driven - first) / span))
-            self._brake[i] = max(needed, kept * self._brake[i])
+            self._brake[i] = max(_rising(tau, driven, first, last), kept * self._brake[i])
         return tuple(self._brake)
 
     def _wall(self, i: int, joint: JointSample) -> tuple[float, float]:
@@ -167,3 +179,11 @@ class Barrier:
         """Return the torque in Nm that a joint's motor may apply at its temperature."""
         colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
         return self._limits.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
+
+
+def _rising(torque: float, speed: float, first: float, last: float) -> float:
+    """Return the damping in Nm s/rad of a joint that `torque` (Nm) drives at `speed`; none up to `first` rad/s.
+
+    last: rad/s, from which on it takes as much out of the joint as the torque gives.
+    """
+    return abs(torque) / last * max(0.0, min(1.0, (speed - first) / (last - first)))

@@ -21,7 +21,10 @@ something.
 
 A motor that does not reply is taken to obey: k rises, and s stays for `blind_hold`, then fades slowly and blindly. If
 it was cut off it applies its last torque instead, and drops what has faded when it hears its commands again, under full
-damping. When it replies and has received these, s and k go on; else s continues from the torque that it reports.
+damping. When it replies and has received these, s and k go on; else both continue from the torque t that it reports. No
+reply says how much of t is damping: k is the one, from 0 to DAMPING, that leaves in s = t + k v least that s did not
+have. Taken for a feed-forward, the damping of a light joint that a hand had thrown (7 Nm on 0.002 kg m²) drove it at 38
+rad/s.
 """
 
 import math
@@ -92,8 +95,15 @@ class JointDescent:
         """Whether neither torque nor damping holds the joint."""
         return self.effort == 0.0 and self.damping <= DESCENT.free_damping
 
+    def resume(self, torque: float, velocity: float) -> None:
+        """Continue from the whole `torque` (Nm) of a motor that replies again, at its joint's `velocity` (rad/s)."""
+        damping = 0.0
+        if abs(velocity) > DESCENT.swing_speed:
+            damping = max(0.0, min(DAMPING, (self.effort - torque) / velocity))
+        self.restart(torque + damping * velocity, damping)
+
     def restart(self, effort: float, damping: float = 0.0) -> None:
-        """Continue from `effort` (Nm), which the motor is found to apply after a silence, without damping."""
+        """Continue from `effort` (Nm) and `damping` (Nm s/rad), which rises to DAMPING."""
         self.effort, self.damping = effort, damping
         self._carried = max(self._carried, effort, key=abs)
         self._most = max(self._most, abs(effort))
@@ -185,7 +195,7 @@ class ArmDescent:
             expected = joint.effort - joint.damping * sample.velocity
             is_obeying = DELIVERY.excess(sample.effort, expected) <= 0.0
             if was_silent and not is_silent and not is_obeying:
-                joint.restart(sample.effort)
+                joint.resume(sample.effort, sample.velocity)
             elif is_silent:
                 joint.step_blind(0.0 if is_unsent else dt)
             else:

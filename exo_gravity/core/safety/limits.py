@@ -64,6 +64,8 @@ class ReadingLimits:
 
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
     missed: int = 7  #: cycles without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
+    #: cycles without a reply, after which a motor is late; with 3 % lost each way, one of four once in 80 s at 250 Hz
+    late: int = 4
     reply_timeout: float = 0.05  #: s, and `missed` cycles at least; an ordinary computer is late by 0.02 s
 
 

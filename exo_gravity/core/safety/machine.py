@@ -279,7 +279,9 @@ class SafetyMachine:
     def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
         """Return a drive of motors that may be on, within the barrier."""
         readings, torque = self._readings, tuple(effort)
-        bounded = self.barrier.damping(self._dt, readings.joints, readings.silent, torque, tuple(damping))
+        known = readings.joints, readings.silent
+        is_unsure = readings.is_late or (self.state in CARRIED and self.motion.has_turned)
+        bounded = self.barrier.damping(self._dt, *known, torque, tuple(damping), is_unsure)
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, effort: Sequence[float] | None) -> None:

@@ -110,6 +110,11 @@ class Readings:
         self._slips = [NO_SLIP] * count
         self._now = -math.inf  # s, of the last cycle
 
+    @property
+    def is_late(self) -> bool:
+        """Whether a motor has not replied for some cycles."""
+        return max(self._missed) >= READING.late
+
     def prove(self) -> None:
         """Note that zeros and signs have just been proven."""
         self.trusted = True
