@@ -205,7 +205,6 @@ KINDS = {
 }
 NEEDS_IMU = ("imu_wrong", "imu_creeps", "imu_frozen", "imu_silent", "trunk_falls", "lean")
 NEEDS_WEARER = ("body_mass",)
-DEAF = ("commands_lost", "bus_silent")  # motors hold the last torque that they heard
 AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
 
 

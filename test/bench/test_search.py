@@ -74,12 +74,6 @@ def test_an_arm_that_is_disabled_comes_down_within_its_bound():
     assert not records["on"][-1].any()
 
 
-def test_a_tilt_that_is_wrong_no_faster_than_people_turn_drives_no_joint_beyond_a_sudden_one():
-    wrong = Event(0.1, "imu_wrong", {"pitch": -0.6, "roll": 0.0, "duration": 1.0})
-    played, _ = play_case(replace(case_of(wrong), worn=True, friction=0.05))
-    assert not played.error and 0.2 < played.driven.speed < 1.0
-
-
 def test_a_run_goes_on_with_the_cases_that_are_not_kept_also_after_a_line_was_cut_off(tmp_path):
     path = tmp_path / "search.jsonl"
     assert kept(path) == {}

@@ -66,7 +66,7 @@ def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_n
 def test_a_motor_drives_no_joint_beyond_the_barrier_and_below_it_brakes_none(sign):
     effort = (sign * 3.0, sign * 9.0, sign * 0.5, sign * 5.0)  # the last one beyond `max_effort`, as a let-down may be
     for speed in np.arange(-4.0, 4.0, 0.1):
-        damping = barrier().damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_unsure=False)
+        damping = barrier().damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_late=False)
         power = [speed * (abs(tau) - kd * speed) for tau, kd in zip(effort, damping, strict=True)]
         assert damping == NOTHING or speed > LIMITS.driven_speed
         assert max(power) <= 1e-9 or speed < FULL
@@ -76,16 +76,16 @@ def test_a_motor_drives_no_joint_beyond_the_barrier_and_below_it_brakes_none(sig
 def test_while_a_motor_is_late_no_other_drives_its_joint_and_the_brake_ends_with_it(sign):
     arm, effort = barrier(), (sign * 2.0,) * 4
     for speed, power in ((BARRIER.calm, 0.5), (BARRIER.still, 0.0), (-1.0, -2.0)):
-        damping = arm.damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_unsure=True)
+        damping = arm.damping(1.0, joints(velocity=sign * speed), HEARD, effort, NOTHING, is_late=True)
         assert [speed * (2.0 - kd * speed) for kd in damping] == pytest.approx([power] * 4, abs=1e-9)
-    assert arm.damping(1.0, joints(velocity=sign), HEARD, effort, NOTHING, is_unsure=False) == NOTHING
+    assert arm.damping(1.0, joints(velocity=sign), HEARD, effort, NOTHING, is_late=False) == NOTHING
 
 
 def test_the_brake_grows_without_a_step_and_falls_slowly():
     arm, effort, brakes = barrier(), (3.0, 9.0, 3.0, 3.0), []
     rising = np.arange(0.0, 3.0, 0.01)
     for speed in (*rising, *rising[::-1]):
-        brakes.append(arm.damping(PERIOD, joints(velocity=float(speed)), HEARD, effort, NOTHING, is_unsure=False)[1])
+        brakes.append(arm.damping(PERIOD, joints(velocity=float(speed)), HEARD, effort, NOTHING, is_late=False)[1])
     assert max(brakes) > 3.0
     assert np.abs(np.diff(brakes)).max() < 0.35
     assert brakes[len(rising) + 155] > 0.01  # 1.44 rad/s on the way down, below `driven_speed`
@@ -95,8 +95,8 @@ def test_an_arm_that_speeds_up_fast_is_braked_before_it_is_fast():
     slowly, suddenly = barrier(), barrier()
     effort = (3.0,) * 4
     for speed in (0.0, 0.4, 0.8, 1.2):
-        slow = slowly.damping(0.1, joints(velocity=speed), HEARD, effort, NOTHING, is_unsure=False)
-        sudden = suddenly.damping(0.002, joints(velocity=speed), HEARD, effort, NOTHING, is_unsure=False)
+        slow = slowly.damping(0.1, joints(velocity=speed), HEARD, effort, NOTHING, is_late=False)
+        sudden = suddenly.damping(0.002, joints(velocity=speed), HEARD, effort, NOTHING, is_late=False)
     assert slow == NOTHING and min(sudden) > 0.3
 
 
@@ -104,7 +104,7 @@ def test_an_arm_that_speeds_up_fast_is_braked_before_it_is_fast():
 def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
     arm, acceleration, dt = barrier(), 10.0, 1.0 / rate  # rad/s^2, s
     for speed in np.arange(0.0, 2.0, acceleration * dt):
-        brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NOTHING, is_unsure=False)[0]
+        brake = arm.damping(dt, joints(velocity=float(speed)), HEARD, (3.0,) * 4, NOTHING, is_late=False)[0]
     led = speed + acceleration * BARRIER.lead - LIMITS.driven_speed
     assert brake == pytest.approx(3.0 / FULL * led / BARRIER.span, rel=1e-3)
 
@@ -126,8 +126,8 @@ def test_damping_times_speed_stays_within_max_effort_in_every_drive():
 def test_the_speed_of_a_motor_that_does_not_reply_bounds_nothing():
     asked = (DAMPING,) * 4
     mute, bounded = (False, False, True, True), (1.0, 3.0, DAMPING, DAMPING)
-    assert barrier().damping(1.0, joints(velocity=3.0), mute, NOTHING, asked, is_unsure=False) == bounded
-    assert barrier().damping(1.0, [UNKNOWN] * 4, (True,) * 4, (1.0,) * 4, asked, is_unsure=False) == asked
+    assert barrier().damping(1.0, joints(velocity=3.0), mute, NOTHING, asked, is_late=False) == bounded
+    assert barrier().damping(1.0, [UNKNOWN] * 4, (True,) * 4, (1.0,) * 4, asked, is_late=False) == asked
 
 
 def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
@@ -171,7 +171,7 @@ def test_the_soft_wall_never_throws_a_joint_back_faster_than_it_came(rate, inert
         read = joints(position=position, velocity=round(velocity / 0.022) * 0.022)
         limited = arm.shape(period, read, NOTHING, WHOLE, (torque,) * 4, NOTHING)
         torque, *_ = limited.effort
-        damping, *_ = arm.damping(period, read, HEARD, limited.effort, limited.damping, is_unsure=False)
+        damping, *_ = arm.damping(period, read, HEARD, limited.effort, limited.damping, is_late=False)
         end = torque / damping if damping else math.inf  # rad/s, where the damping balances the torque
         if damping:
             decay = math.exp(-damping / inertia * period)

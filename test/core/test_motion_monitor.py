@@ -96,21 +96,6 @@ def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some
         assert fault_after <= now + PERIOD < fault_after + 0.2
 
 
-@pytest.mark.parametrize(("speed", "after"), [(0.02, None), (0.3, 0.26), (5.0, 0.02)])
-def test_gravity_that_turns_faster_than_it_settles_has_turned_for_some_seconds(speed, after) -> None:
-    monitor = MotionMonitor(Limits(LIMITS.joint_names))
-    turned = []
-    for k in range(round(4.0 / PERIOD)):
-        monitor.follow(Tilt.of("left", min(0.3, speed * k * PERIOD)), None)
-        monitor.step(PERIOD, joints(HANGING), NO_TORQUE)
-        turned.append(monitor.has_turned)
-    first = turned.index(True) * PERIOD if any(turned) else None
-    assert first == (after and pytest.approx(after, abs=0.03))
-    assert not after or all(turned[round(after / PERIOD) + 8 :])
-    monitor.reset()
-    assert not monitor.has_turned
-
-
 def test_an_impossible_torque_is_passed_on_to_the_check_that_names_it() -> None:
     for torque in (math.nan, math.inf, 41.0):
         assert MotionMonitor(LIMITS).step(PERIOD, joints(RAISED), (0.0, torque, 0.0, 0.0))[1] is None

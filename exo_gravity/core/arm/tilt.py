@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.rotation import Floats3, rotated, unit_quaternion
+from exo_gravity.core.arm.rotation import rotated, unit_quaternion
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector, one_float
 
@@ -105,12 +105,3 @@ def rotation_matrix(quaternion: Vector | None, name: str = "quaternion") -> np.n
 
 #: gravity along each axis of the base frame, for the exact law
 AXES = tuple(Tilt.of("left")._replace(direction=axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-
-
-def followed(reference: Floats3, direction: Floats3, reach: float) -> tuple[Floats3, float]:
-    """Return `reference` turned towards `direction` by `reach` rad at most, both (3,), and the rad that are left."""
-    way = angle_between(direction, reference)
-    share = 1.0 if way <= reach else reach / way
-    x, y, z = (old + share * (new - old) for new, old in zip(direction, reference, strict=True))
-    norm = math.hypot(x, y, z) or 1.0
-    return (x / norm, y / norm, z / norm), (1.0 - share) * way

@@ -15,11 +15,10 @@ true speed: one wrong speed in a reply moves nothing. A light arm passes F withi
 by its change over BARRIER.lead, at any rate of the loop. An empty forearm under 3 Nm still reaches 2.7 rad/s at 250 Hz,
 and 6.4 at 100 Hz. A wearer who lifts their arm feels nothing up to V; at F they lift it without support.
 
-Two things show that torque which held the arm may no longer balance it. A motor that is late with its replies may have
-lost its power: its joint falls, and the torque of the others, which answers the pose before, drives them. And gravity
-that has just turned (MotionMonitor.has_turned) may be an IMU that comes loose. Then V is BARRIER.calm and F is
-BARRIER.still for all joints. This brake ends with its cause. With 3 % of the frames lost each way at 250 Hz, a wearer
-who bends their elbow at 2.7 rad/s feels 0.9 Nm more for a moment; their torque is 0.04 Nm RMS more.
+A motor that is late with its replies may have lost its power. Its joint falls, and the torque of the others, which
+answers the pose before, drives them. Meanwhile V is BARRIER.calm and F is BARRIER.still for all joints. This brake ends
+with the lateness. With 3 % of the frames lost each way at 250 Hz, a wearer who bends their elbow at 2.7 rad/s feels 0.9
+Nm more for a moment; their torque is 0.04 Nm RMS more.
 
 Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
 wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
@@ -49,7 +48,7 @@ class BarrierTuning:
     #: s, time constant with which the brake falls. It rises at once; if it fell so, a light arm would be thrown and
     #: caught by turns, one cycle each
     hold: float = 0.05
-    calm: float = 0.25  #: rad/s, `driven_speed` of an arm that may no longer be balanced: that of a guided motion
+    calm: float = 0.25  #: rad/s, `driven_speed` while a motor is late: that of a guided motion
     still: float = 0.75  #: rad/s, from which on a motor then drives no joint; 1.25 lets seven joints reach 0.78 (0.58)
 
 
@@ -130,7 +129,7 @@ class Barrier:
         silent: Sequence[bool],
         effort: Sequence[float],
         damping: Sequence[float],
-        is_unsure: bool,
+        is_late: bool,
     ) -> tuple[float, ...]:
         """Return the damping (n,) in Nm s/rad of a drive that is to apply `effort` (n,) Nm.
 
@@ -138,7 +137,7 @@ class Barrier:
         joints: the newest readings (n,).
         silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.
         damping: what is asked for, (n,) Nm s/rad.
-        is_unsure: whether a motor is late with its replies, or gravity has just turned.
+        is_late: whether a motor is late with its replies.
         """
         brakes = self.brake(dt, joints, effort)
         columns = zip(joints, silent, effort, damping, brakes, self._peak, self._limits.max_effort, strict=True)
@@ -146,7 +145,7 @@ class Barrier:
         for joint, is_silent, tau, asked, brake, peak, limit in columns:
             speed, most = 0.0 if is_silent else abs(joint.velocity), max(limit, abs(tau))
             along = math.copysign(speed, tau * joint.velocity)
-            needed = max(brake, _rising(tau, along, BARRIER.calm, BARRIER.still)) if is_unsure else brake
+            needed = max(brake, _rising(tau, along, BARRIER.calm, BARRIER.still)) if is_late else brake
             wanted = min(peak, asked if is_silent else max(asked, needed))
             bounded.append(most / speed if wanted * speed > most else wanted)
         return tuple(bounded)

@@ -280,8 +280,7 @@ class SafetyMachine:
         """Return a drive of motors that may be on, within the barrier."""
         readings, torque = self._readings, tuple(effort)
         known = readings.joints, readings.silent
-        is_unsure = readings.is_late or (self.state in CARRIED and self.motion.has_turned)
-        bounded = self.barrier.damping(self._dt, *known, torque, tuple(damping), is_unsure)
+        bounded = self.barrier.damping(self._dt, *known, torque, tuple(damping), readings.is_late)
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, effort: Sequence[float] | None) -> None:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 
 from exo_gravity.core.arm.rotation import Floats3, Quaternion, cross, dot, product, rotated
-from exo_gravity.core.arm.tilt import SIDES, Tilt, followed
+from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
@@ -42,11 +42,6 @@ class MotionLimits:
     patience: float = 0.012  #: s of the full load
     memory: float = 1.0  #: s, time constant
     guided: float = 5.0  #: s for which the torque may still be on its way to a tilt that came suddenly
-    #: rad/s of a direction that follows gravity's. With 0.1, and 0.1 rad and 2 s below, 9 of 24 random tilts that are
-    #: wrong drive an arm faster than 1 rad/s, up to 2.4; with these 2, up to 1.2
-    settling: float = 0.03
-    turn: float = 0.07  #: rad between the two, from which on gravity has turned; the simulated trunk walks with less
-    turned: float = 3.0  #: s for which it then counts as turned: an arm leaves its balance slowly
 
 
 MOTION = MotionLimits()
@@ -57,7 +52,6 @@ class MotionMonitor:
 
     limits.largest_moment: (n,) kg m; zeros switch the monitor off.
     impulse: (n,) Nm s. full: (n,) Nm, the largest load.
-    has_turned: whether gravity has just turned in the trunk: the wearer bows, or the IMU comes loose.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -80,15 +74,9 @@ class MotionMonitor:
             self._overtaken = self._overtaken if self._guided else self._down(overtaken)
             self._guided = MOTION.guided
 
-    @property
-    def has_turned(self) -> bool:
-        """See the class."""
-        return self._turned > 0.0
-
     def reset(self) -> None:
         """Forget the past."""
         self.impulse = [0.0] * len(self.full)
-        self._settled, self._turned = self._gravity, 0.0  # (3,), a direction that follows; s for which it has turned
         self._slow: list[float] = []  # the torque, low-passed, (n,) Nm
 
     def step(
@@ -98,8 +86,6 @@ class MotionMonitor:
 
         age: s since the pose that the effort answers. An impossible effort is returned as it is.
         """
-        self._settled, ahead = followed(self._settled, self._gravity, MOTION.settling * dt)
-        self._turned = MOTION.turned if ahead > MOTION.turn else max(0.0, self._turned - dt)
         asked = zip(effort, self._limits.max_command, strict=True)
         if not self._is_on or not all(abs(torque) <= most for torque, most in asked):
             return effort, None

@@ -21,7 +21,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, three_floats
-from exo_gravity.core.arm.tilt import Tilt, followed, gravity_in_trunk
+from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
@@ -158,12 +158,12 @@ class TiltInput:
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.
         elapsed = max(0.0, measured - self._time)
-        reference, way = followed(self._reference, tilt.direction, TILT.speed * elapsed)
+        reference, way = _followed(self._reference, tilt.direction, TILT.speed * elapsed)
         if way > TILT.jump:
             expected = f"within {TILT.jump:g} rad plus {TILT.speed:g} rad/s of the last ones"
             raise ParameterError("trunk tilt", [tilt.pitch, tilt.roll], expected)
         self._reference = reference
-        self._usual, ahead = followed(self._usual, tilt.direction, TILT.usual * elapsed)
+        self._usual, ahead = _followed(self._usual, tilt.direction, TILT.usual * elapsed)
         is_sudden = ahead > TILT.sudden
         self.overtaken = Tilt.of_gravity(self._side, self._in_trunk(self._usual)) if is_sudden else None
         self._tilt, self._angular_velocity = tilt, angular_velocity
@@ -175,6 +175,15 @@ class TiltInput:
         """Return in the trunk's axes what is in the arm's base frame, whose right one is mirrored."""
         b, a, c = direction
         return a, b if self._side == "left" else -b, -c
+
+
+def _followed(reference: Floats3, direction: Floats3, reach: float) -> tuple[Floats3, float]:
+    """Return `reference` turned towards `direction` by `reach` rad at most, both (3,), and the rad that are left."""
+    way = angle_between(direction, reference)
+    share = 1.0 if way <= reach else reach / way
+    x, y, z = (old + share * (new - old) for new, old in zip(direction, reference, strict=True))
+    norm = math.hypot(x, y, z) or 1.0
+    return (x / norm, y / norm, z / norm), (1.0 - share) * way
 
 
 @dataclass(frozen=True)
