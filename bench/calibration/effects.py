@@ -30,7 +30,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.arm import STANDARD_GRAVITY, ArmModel
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
@@ -71,7 +72,7 @@ JOINTS = (600.0, 3000.0)  # Nm/rad
 OFF = ASKEW = np.radians(1.5)  # rad, the largest error of a zero, and of the direction of an axis
 # rad by which the stand leans back, and with the weight forward; and to the side. Joint 1 follows the lean: with more
 # forward it hangs over 0.5 rad from home, where no start begins; with more to the side joint 2 over 0.34.
-LEAN, SIDEWAYS = (0.05, 0.09), (0.19, 0.22)
+BACK_AND_FORTH, SIDEWAYS = (0.05, 0.09), (0.19, 0.22)
 REST = (-0.3, 0.8)  # rad, where a cable is slack
 STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
 POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
@@ -137,7 +138,7 @@ class Device:
         ]
         way, far = rng.uniform(0.0, 2.0 * np.pi, count), size["axes askew"] * rng.uniform(0.0, ASKEW, count)
         self.turn = np.column_stack((far * np.cos(way), far * np.sin(way)))  # rad, about x and y of each joint
-        (back, ahead), sideways = rng.uniform(*LEAN, 2).tolist(), rng.uniform(*SIDEWAYS, 2).tolist()
+        (back, ahead), sideways = rng.uniform(*BACK_AND_FORTH, 2).tolist(), rng.uniform(*SIDEWAYS, 2).tolist()
         self.stand, self.leant = (-back, sideways[0]), (ahead, sideways[1])
         self.measured = stiffness * (1.0 + STIFFNESS_ERROR * rng.standard_normal(count))  # Nm/rad
 

@@ -28,7 +28,7 @@ LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
 NORMAL = np.array([NormalDist().inv_cdf((number + 0.5) / 40.0) for number in range(40)])  # in place of random numbers
 
 
-class Held(NamedTuple):
+class InFile(NamedTuple):
     """The file of a fit of n joints and k moments."""
 
     unknowns: np.ndarray  #: (count,) as the file has them, with its moments
@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 def held(
     model: MomentModel, rows: Rows, unknowns: np.ndarray, covariance: np.ndarray, known: np.ndarray, misfit: np.ndarray
-) -> Held:
+) -> InFile:
     """Return what the file holds of a fit, and how well.
 
     rows: that were fitted. unknowns, covariance: (count,) and (count, count), of the fit.
@@ -73,7 +73,7 @@ def held(
     jacobian = scale[:, None] * new.jacobian(unknowns)
     variance = np.einsum("qnt,tu,qnu->qn", jacobian, covariance, jacobian, optimize=True)
     errors = left + np.sqrt(variance + (scale * misfit) ** 2) * NORMAL[:, None, None]
-    return Held(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
+    return InFile(kept, np.quantile(np.abs(errors), 0.95, axis=(0, 1)) / COVER)
 
 
 def _new_poses(model: MomentModel, start: np.ndarray) -> Rows:

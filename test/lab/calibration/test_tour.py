@@ -188,7 +188,7 @@ def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_rea
 
 
 def test_a_pose_is_swept_again_if_motors_vibrated_in_it(monkeypatch):
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), moments_of(DEFAULT_LINKS), Tilt.of("right"))
     tour, frictions, way = Tour(LIMITS, guess, fixed([POSE]), 100.0), [0.2, 0.9, 0.2, 0.2], np.linspace(-0.03, 0.03, 20)
     position, down = np.array(POSE.theta) + way[:, None], np.tile((0.0, 0.0, 1.0), (20, 1))
 
@@ -251,19 +251,15 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 
 def test_the_mass_matrix_of_an_arm_under_a_weight_is_in_the_torque_that_each_motor_is_commanded():
     """A joint whose inertia was taken for a tenth of the true one went 0.12 rad off its path."""
-    guess, scales = (
-        TorqueGuess(PapersMoments(DEFAULT_LINKS), WEIGHED, Tilt.of("right", 0.07, 0.2)),
-        (0.7, 1.1, 1.3, 0.8),
-    )
+    model, scales = PapersMoments(DEFAULT_LINKS, keeps_tilt=True), (0.7, 1.1, 1.3, 0.8)
+    guess = TorqueGuess(model, WEIGHED, Tilt.of("right", 0.07, 0.2))
     poses = candidates(LIMITS, guess.model)
     rows = guess.model.rows(poses[:6], guess.tilt.direction)
     for theta, effort in zip(poses[:6], rows @ WEIGHED / scales, strict=True):
         guess.learn(theta, effort, (0.003,) * 4)
     for theta in poses[100:120]:
-        true = LinkInertia.of_moments(DEFAULT_LINKS.length, WEIGHED[:4], WEIGHT).matrix(theta) / np.reshape(
-            scales, (4, 1)
-        )
-        np.testing.assert_allclose(guess.matrix(theta, WEIGHT), true, rtol=0.12, atol=1e-9)
+        true = LinkInertia.of_moments(DEFAULT_LINKS.length, WEIGHED[:4], WEIGHT).matrix(theta)
+        np.testing.assert_allclose(guess.matrix(theta, WEIGHT), true / np.reshape(scales, (4, 1)), rtol=0.12, atol=1e-9)
 
 
 def test_an_arm_hangs_on_until_it_is_carried_though_its_motors_are_stronger_than_the_file_says():
