@@ -12,7 +12,7 @@ from exo_gravity.core.safety.drive import Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
 
-from ..support.safety_run import EFFORT, PERIOD, SafetyRun, reading
+from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun, reading
 from ..support.simulated_device import OFF
 
 
@@ -232,6 +232,16 @@ def test_a_motor_with_an_error_is_not_switched_on_again():
     sent = [arm.cycle().drive.send[1] for _ in range(2500)]
     assert Send.ENTER not in sent
     assert arm.fault_code == "motor_error"
+
+
+def test_a_start_is_refused_in_time_while_a_motor_is_not_off_whose_error_is_to_be_cleared():
+    arm = SafetyRun().until_active()
+    arm.silent.add(1)
+    arm.cycle(30.0)
+    assert arm.machine.state is State.FAULT and arm.machine.clear(arm.now)
+    arm.enable()
+    arm.cycle(LIMITS.enable_timeout + 1.0)
+    assert arm.machine.state is State.DISABLED and arm.machine.refusal
 
 
 def test_a_motor_that_does_not_switch_on_is_refused_at_every_start():

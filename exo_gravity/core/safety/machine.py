@@ -279,8 +279,9 @@ class SafetyMachine:
     def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
         """Return a drive of motors that may be on, within the barrier."""
         readings, torque = self._readings, tuple(effort)
-        known = readings.joints, readings.silent
-        bounded = self.barrier.damping(self._dt, *known, torque, tuple(damping), readings.is_late)
+        bounded = self.barrier.damping(
+            self._dt, readings.joints, readings.silent, torque, tuple(damping), readings.is_late
+        )
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, effort: Sequence[float] | None) -> None:
@@ -289,12 +290,12 @@ class SafetyMachine:
         effort: (n,) Nm, what is asked for, None if that is not known.
         """
         readings, limits = self._readings, self.limits
-        if any(power.is_clearing for power in self.power):
-            return
         missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
         if isinstance(missing, Fault):
-            self._trip(missing)
-            return
+            if not any(power.is_clearing for power in self.power):
+                self._trip(missing)
+                return
+            missing = Reason(missing.code, missing.reason)
         missing = self.hindrance or missing
         if not missing and effort is None:
             missing = Reason(Wait.EFFORTS, "effort commands")
