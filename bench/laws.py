@@ -93,7 +93,7 @@ def measure_laws(quick: bool) -> Iterator[Row]:
 def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     """Yield the rows of the arm from a URDF that a file in config describes.
 
-    One pose as the loop asks for it, and as a calibration's does, which has moments of its own for each joint.
+    Single poses are timed as the control loop computes them, and as a calibration tour does, with moments per joint.
     """
     import pinocchio as pin
 

@@ -284,10 +284,10 @@ class UrdfArm(UrdfShape):
         return self._rows(theta, self.gravity * np.reshape(direction, (-1, 3)), self._base_moments)
 
     def by_moments(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
-        """Return a function of theta (n,) rad and tilt: the torque (n,) in Nm with moments of its own for each joint.
+        """Return a function that computes the torque (n,) in Nm from theta (n,) rad and tilt, with moments per joint.
 
-        moments: (n, k) kg m of `base`. Gains do not count. For one pose Pinocchio's regressor takes a third of the time
-        of `regressor`; the function has its own data, so that it may be called on any one thread.
+        moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. For one pose, Pinocchio's regressor
+        takes a third of the time of `regressor`. The function has data of its own; use it on one thread at a time.
         """
         model, compute, moves = self._model.copy(), self._pin.computeJointTorqueRegressor, self._moves
         data, still = model.createData(), np.zeros(model.nv)

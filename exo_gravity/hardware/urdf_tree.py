@@ -41,7 +41,7 @@ class Frames(NamedTuple):
 
 
 class LinkMoments(NamedTuple):
-    """First moments of links, each along a way of its own."""
+    """First moments of links, each in its own direction."""
 
     links: np.ndarray  #: (k,) numbers of the joints whose links have them
     ways: np.ndarray  #: (k, 3, 1) unit vectors along them, in these joints' own frames

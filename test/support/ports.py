@@ -40,8 +40,8 @@ def own_domain() -> int:
 def own_ports() -> Iterator[int]:
     """Return every second port of this process's block, again and again; the ones between are free too.
 
-    A port on which a process that has ended left its motors on is passed over: whoever takes that bus lets an arm down
-    first, and a watchdog without its simulated motors waits there for them.
+    Ports with notes of motors that may be on are skipped. Whoever takes such a bus first lets an arm down, and a
+    watchdog whose simulated motors are gone may still wait for them there.
     """
     first = FIRST_PORT + BLOCK * _claim("ports", BLOCKS)[0]
     return filter(_is_free, itertools.cycle(range(first, first + BLOCK, 2)))

@@ -32,8 +32,8 @@ from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments,
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
 from exo_gravity.lab.controllers import SampleController
 
-# Of the expected torque, that a hanging arm gets until it is carried. With more than its weight it tips over: with 1 kg
-# and motors 17 % stronger than the file says it swung out to 0.9 rad before the tour began.
+# Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it
+# tips over: with 1 kg, and motors 17 % stronger than the file says, it swung out to 0.9 rad before the tour began.
 WAITING_SHARE = 0.5
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
 MAX_SKIPPED = 2  # poses in which a joint may stick
@@ -103,13 +103,14 @@ class Tour:
         """
         if self.trouble:
             return None
-        waiting, expected = self.wait(position, tilt), self._guess.torque(position)
+        self._guess.tilt = tilt
+        expected = self._guess.torque(position)
         if self.done:  # the bridge lets the arm down: it is no longer watched
             return tuple(np.clip(expected + self._tracker.correction, -self._most, self._most).tolist())
         if self._now == -math.inf:
             self._first_tilt, self._now, self._position = tilt, now, np.array(position)
             self._tracker.lines = self._lines()
-            self._tracker.shift(np.subtract(expected, waiting))
+            self._tracker.shift((1.0 - WAITING_SHARE) * np.array(expected))
         dt, self._now = now - self._now, now
         self.elapsed += dt
         self._undecided = self._undecided + dt if self._awaits_plan else 0.0
