@@ -239,7 +239,7 @@ class ControlLoop:
         except BusError as error:
             self.safety.trip(FaultCode.BUS_ERROR, str(error), now)
             complete = False
-        self.safety.unsent = self.bus.unsent
+        self.safety.unsent, self.safety.held_back = self.bus.unsent, self.bus.held_back
         if (late := self.bus.late_replies) and self.safety.state in CARRYING:
             self.safety.trip(FaultCode.REPLIES_LATE, late, self._now())
         if self.bus.foreign_commands > self._foreign_commands:

@@ -25,21 +25,23 @@ class Run:
         self.now = 10.0
         self.faults: list[str] = []
         self._joints = [UNKNOWN] * 4
+        self._held_back = (False,) * 4
         self.run(2)
         self.faults.clear()  # silent before the first replies
 
-    def cycle(self, late: float = 0.0, lost: bool = False, **changes: Any) -> None:
+    def cycle(self, late: float = 0.0, lost: bool = False, held_back: bool = False, **changes: Any) -> None:
         """One cycle, in which the loop stands still for `late` s before it takes the replies.
 
-        lost: the second motor's reply does not come. changes: of the second motor's reading.
+        lost: the second motor's reply does not come. held_back: that motor is sent nothing. changes: of its reading.
         """
-        self.readings.step(self.now, tuple(self._joints))
+        self.readings.step(self.now, tuple(self._joints), self._held_back)
+        self._held_back = (False, held_back, False, False)
         if self.readings.fault:
             self.faults.append(str(self.readings.fault.code))
         angle = self.speed * (self.now - 10.0)  # when the motors reply
         self.now += PERIOD + late
         for i in range(4):
-            if not (lost and i == 1):
+            if not ((lost or held_back) and i == 1):
                 given = changes if i == 1 else {}
                 self._joints[i] = reading(
                     **{"position": angle, "velocity": self.speed, "time": self.now - 0.009, **given}
@@ -99,8 +101,18 @@ def test_a_loop_that_stood_still_has_not_asked():
     assert not run.faults
 
 
+def test_a_motor_that_is_held_back_owes_no_reply():
+    run = Run()
+    run.run(5)
+    run.run(6, held_back=True)
+    run.run(3, lost=True)
+    assert not run.faults and not run.readings.is_late
+    run.run(5, lost=True)
+    assert run.faults[0] == "motor_silent" and run.readings.is_late
+
+
 @pytest.mark.parametrize(("misses", "is_silent"), [(6, False), (8, True)])
-def test_a_motor_is_silent_after_seven_cycles_without_a_reply(misses, is_silent):
+def test_a_motor_is_silent_after_seven_commands_without_a_reply(misses, is_silent):
     run = Run()
     run.run(5)
     run.run(misses, lost=True)

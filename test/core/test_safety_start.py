@@ -61,6 +61,16 @@ def test_the_checks_require_a_whole_second_without_trouble():
     assert arm.machine.state is State.CHECKING
 
 
+def test_efforts_may_be_late_for_a_moment_in_the_checks_as_while_the_arm_is_carried():
+    arm = SafetyRun().enable()
+    for _ in range(6):
+        arm.effort_age = 0.06
+        arm.cycle(0.02)
+        arm.effort_age = 0.002
+        arm.cycle(0.23)
+    assert arm.machine.state is not State.CHECKING
+
+
 @pytest.mark.parametrize(("change", "code"), [({"error": 5}, "motor_error"), ({"temperature": 95}, "over_temperature")])
 def test_a_fault_during_the_checks_is_latched(change, code):
     arm = SafetyRun()

@@ -70,7 +70,7 @@ class Motion:
             self._pass(late)  # the loop stands still before it takes the reply
             given = reading(time=self.now, position=position, velocity=velocity)
             self._joints = [given if n == 1 else reading(time=self.now) for n in range(4)]
-        self.readings.step(self.now, self._joints)
+        self.readings.step(self.now, self._joints, (False,) * 4)
         if self.readings.fault:
             self.faults.add(self.readings.fault.code)
 

@@ -146,7 +146,7 @@ def test_a_forged_reply_with_random_values_is_nearly_always_a_fault(length, most
         sample = JOINTS[joint].sample(bytes((joint + 1,)) + rng.randbytes(length - 1), 1.004)
         readings = Readings(LIMITS)
         for time in (0.996, 1.0):
-            readings.step(time, [known._replace(time=time) for known in before])
-        readings.step(1.004, [sample if n == joint else known for n, known in enumerate(before)])
+            readings.step(time, [known._replace(time=time) for known in before], (False,) * 4)
+        readings.step(1.004, [sample if n == joint else known for n, known in enumerate(before)], (False,) * 4)
         unseen += readings.joints[joint] is sample
     assert unseen / count <= most

@@ -91,7 +91,7 @@ class FaultCode(str, Enum):
         return str(self.value)
 
     # The motors
-    MOTOR_SILENT = "motor_silent", "a motor has not replied for 0.05 s, nor in 7 cycles", RESUME
+    MOTOR_SILENT = "motor_silent", "a motor has not replied for 0.05 s, nor to 7 commands", RESUME
     MOTOR_ERROR = "motor_error", "a motor reports an error"
     OVER_TEMPERATURE = "over_temperature", "a motor is hotter than 80 degC"
     TORQUE_NOT_DELIVERED = "torque_not_delivered", "a motor's reply shows another torque than commanded", RECHECK

@@ -63,10 +63,10 @@ class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
-    missed: int = 7  #: cycles without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
-    #: cycles without a reply, after which a motor is late; with 3 % lost each way, one of four once in 80 s at 250 Hz
+    missed: int = 7  #: commands without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
+    #: commands without a reply, after which a motor is late; with 3 % lost each way, one of four once in 80 s at 250 Hz
     late: int = 4
-    reply_timeout: float = 0.05  #: s, and `missed` cycles at least; an ordinary computer is late by 0.02 s
+    reply_timeout: float = 0.05  #: s, and `missed` commands at least; an ordinary computer is late by 0.02 s
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,7 @@ class SafetyMachine:
         self.waiting_for = self.refusal = NO_REASON
         self.acted: dict[str, float] = {}
         self.ride = RideThrough(limits.command_timeout)
+        self._ride_while_checking = RideThrough(limits.command_timeout)
         self._period = period
         count = len(limits.joint_names)
         self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
@@ -97,6 +98,8 @@ class SafetyMachine:
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
         self.unsent: Sequence[bool] = (False,) * len(self.power)
+        #: Whether each motor (n,) was sent nothing in the last cycle on purpose, set from outside: it owes no reply.
+        self.held_back: Sequence[bool] = (False,) * len(self.power)
         #: What else CHECKING waits for, set from outside.
         self.hindrance = NO_REASON
 
@@ -202,9 +205,8 @@ class SafetyMachine:
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         self._now, self._dt = now, min(now - self._now, self._period)
         self._read(joints)
-        is_fresh = efforts.effort is not None and now - efforts.answered <= self.limits.command_timeout
         if self.state is State.CHECKING:
-            self._check(efforts.effort if is_fresh else None)
+            self._check(efforts)
         elif self.state in CARRYING:
             self._trip(self._carried_fault(efforts))
         self._watch_stalls()
@@ -220,7 +222,7 @@ class SafetyMachine:
     def _read(self, joints: Sequence[JointSample]) -> None:
         """Take the newest samples: readings, rest, and what they show of the motors' power."""
         readings = self._readings
-        readings.step(self._now, joints, self._sent.powered)
+        readings.step(self._now, joints, self.held_back, self._sent.powered)
         self._rest.step(self._now, readings.joints, readings.silent)
         for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
             power.step(self._dt, joint, is_silent)
@@ -284,12 +286,13 @@ class SafetyMachine:
         )
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
-    def _check(self, effort: Sequence[float] | None) -> None:
+    def _check(self, efforts: Efforts) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
 
-        effort: (n,) Nm, what is asked for, None if that is not known.
+        Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
-        readings, limits = self._readings, self.limits
+        readings, limits, effort, ride = self._readings, self.limits, efforts.effort, self._ride_while_checking
+        are_late = ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
         missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
         if isinstance(missing, Fault):
             if not any(power.is_clearing for power in self.power):
@@ -297,7 +300,7 @@ class SafetyMachine:
                 return
             missing = Reason(missing.code, missing.reason)
         missing = self.hindrance or missing
-        if not missing and effort is None:
+        if not missing and (effort is None or are_late):
             missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:
             missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
@@ -310,7 +313,7 @@ class SafetyMachine:
         self.waiting_for = missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         if missing:
             self._calm_since = self._now
-        if effort is not None and self._now - self._calm_since >= START_GATE.calm:
+        if effort is not None and not ride.is_riding and self._now - self._calm_since >= START_GATE.calm:
             fault = None if readings.trusted else torque_while_hanging(limits, effort)
             if fault:
                 self._trip(fault)

@@ -90,9 +90,9 @@ class RideThrough:
             return None
         self.rides += not self.is_riding
         self.is_riding, self.ended = True, now
-        self._left -= dt
+        self._left = max(0.0, self._left - dt)
         self.why = f"efforts {1000.0 * age:.0f} ms old" + (", of a tilt that is late" if held else "")
-        if self._left >= 0.0 and age <= RIDE.longest_age:
+        if self._left > 0.0 and age <= RIDE.longest_age:
             return None
         self.is_riding = False
         limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * RIDE.longest:.0f} ms more for a moment"

@@ -90,8 +90,8 @@ class Readings:
     """Follows the readings of an arm's motors, cycle by cycle.
 
     joints: (n,) the newest ones. One that shows a fault is left out until the next one shows a fault too.
-    silent: (n,) whether a motor is silent: no reply for `reply_timeout`, nor in `missed` cycles. A loop that stood
-        still has not asked.
+    silent: (n,) whether a motor is silent: no reply for `reply_timeout`, nor to `missed` commands. A loop that stood
+        still has sent none.
     fault: what the newest readings show, or None.
     trusted: whether zeros and signs were proven, and the angles have been continuous since.
     """
@@ -112,7 +112,7 @@ class Readings:
 
     @property
     def is_late(self) -> bool:
-        """Whether a motor has not replied for some cycles."""
+        """Whether a motor has not replied to some commands."""
         return max(self._missed) >= READING.late
 
     def prove(self) -> None:
@@ -123,11 +123,14 @@ class Readings:
         """Note that the angles may no longer be continuous, for a reason that no reading shows."""
         self.trusted = False
 
-    def step(self, now: float, joints: Sequence[JointSample], powered: bool = True) -> None:
+    def step(
+        self, now: float, joints: Sequence[JointSample], held_back: Sequence[bool], powered: bool = True
+    ) -> None:
         """Take the newest readings of a cycle.
 
         now: s.
         joints: (n,) the newest readings.
+        held_back: (n,) whether the motor was sent nothing in the last cycle on purpose.
         powered: whether the motors are on.
         """
         restart = CONTINUITY.restart if powered else CONTINUITY.restart_off
@@ -135,7 +138,7 @@ class Readings:
         found: list[Fault] = []
         for i, joint in enumerate(joints):
             if joint.time <= self._newest[i]:
-                self._missed[i] += 1
+                self._missed[i] += not held_back[i]
                 self.trusted &= self._missed[i] < READING.missed or now - joint.time <= restart
                 continue
             faults = self._faults(i, joint, restart)

@@ -107,6 +107,8 @@ class MotorBus:
         self._aliased: set[int] = set()  # IDs of motors whose board obeys other IDs, too
         #: Whether the last drive did not leave for each motor (n,), because its bus failed.
         self.unsent: Sequence[bool] = (False,) * len(motors)
+        #: Whether each motor (n,) was sent nothing in the last cycle, to learn how old its replies are.
+        self.held_back: Sequence[bool] = (False,) * len(motors)
         self._drive = Drive.off(count)  # last sent
         self._has_sent = False  # anything: another owner's motors are left alone
         self._corrected = [-math.inf] * count  # s
@@ -161,11 +163,13 @@ class MotorBus:
         self._drive, self._has_sent = drive, True
         now = self._now()
         frames: dict[CanPort | None, list[Frame]] = {port: [] for port in self._ports}
+        held_back = [False] * len(self._ports)
         for joint, own in enumerate(self._ports):
             due = self._frames(joint, now)
             if due and self.replies[joint]:
-                is_held_back = not self._requests[joint].may_send(now, deadline - now)
-                if is_held_back and drive.send[joint] in (Send.COMMAND, Send.POLL):
+                is_paused = not self._requests[joint].may_send(now, deadline - now)
+                held_back[joint] = is_paused and drive.send[joint] in (Send.COMMAND, Send.POLL)
+                if held_back[joint]:
                     continue
                 self._requests[joint].sent(now, len(due))
             frames[own] += due
@@ -174,6 +178,7 @@ class MotorBus:
         for own, all_due in frames.items():
             self._send(own, *all_due, may_be_lost=True)
         self.unsent = tuple([port in self._failed for port in self._ports])
+        self.held_back = tuple(held_back)
         self._answered.clear()
         count = len(self._joints)
         self.receive_until(deadline, lambda: len(self._answered) == count)
