@@ -123,9 +123,7 @@ class Readings:
         """Note that the angles may no longer be continuous, for a reason that no reading shows."""
         self.trusted = False
 
-    def step(
-        self, now: float, joints: Sequence[JointSample], held_back: Sequence[bool], powered: bool = True
-    ) -> None:
+    def step(self, now: float, joints: Sequence[JointSample], held_back: Sequence[bool], powered: bool = True) -> None:
         """Take the newest readings of a cycle.
 
         now: s.
