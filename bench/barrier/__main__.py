@@ -8,21 +8,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import NamedTuple
 
 from ..parts import play as part_by_part
-from .cases import INNOCENT, WRONG, Motion, felt, play
+from .cases import INNOCENT, WRONG, CaseUnderRule, Motion, felt, play
 from .rules import RULES
 
 CASES = {case.name: case for case in (*WRONG, *INNOCENT)}
-
-
-class CaseUnderRule(NamedTuple):
-    """A case under a rule. rate: of the loop, Hz."""
-
-    case: str
-    rule: str
-    rate: float
 
 
 def played(part: CaseUnderRule) -> tuple[CaseUnderRule, Motion]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -154,6 +155,14 @@ class Motion:
         times, torque = np.array(self.time), np.array(self.torque)
         later = np.minimum(np.searchsorted(times, times + WINDOW), len(times) - 1)
         return float((np.abs(torque[later] - torque).max(axis=1) / np.maximum(WINDOW, times[later] - times)).max())
+
+
+class CaseUnderRule(NamedTuple):
+    """A case under a rule. rate: of the loop, Hz."""
+
+    case: str
+    rule: str
+    rate: float
 
 
 @dataclass(frozen=True)

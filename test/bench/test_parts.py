@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,3 +52,10 @@ def test_what_other_code_has_played_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr(parts, "_state", lambda files: "changed")
     assert parts.play("squares", work, items, str, workers=1) == [1, 4]
     assert (tmp_path / "1.played").read_text() == "xx"
+
+
+def test_a_study_is_played_in_other_processes_as_its_command_starts_it():
+    """What a package's `__main__` defines cannot be sent to them."""
+    words = ("-m", "bench.barrier", "--rule", "the barrier", "--case", "a wrong speed")
+    done = subprocess.run([sys.executable, *words], cwd=parts.ROOT, capture_output=True, text=True, timeout=60.0)
+    assert done.returncode == 0 and "| a wrong speed of 3 rad/s, once | the barrier |" in done.stdout, done.stderr
