@@ -17,8 +17,8 @@ and 6.4 at 100 Hz. A wearer who lifts their arm feels nothing up to V; at F they
 
 A motor that is late with its replies may have lost its power. Its joint falls, and the torque of the others, which
 answers the pose before, drives them. Meanwhile V is BARRIER.calm and F is BARRIER.still for all joints. This brake ends
-with the lateness. Lost frames alone hardly make a motor late (READING.late): with 3 % lost each way at 250 Hz, neither of
-two reaches at 3 rad/s was braked.
+with the lateness. Lost frames alone hardly make a motor late (READING.late): with 3 % of them lost each way at 250 Hz,
+neither of two reaches at 3 rad/s was braked.
 
 Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
 wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
