@@ -59,11 +59,15 @@ class Case:
 
 
 class Bound(NamedTuple):
-    """What a motor may do to an arm: rad/s, and J in one stretch that are given faster than `slow` rad/s."""
+    """What a motor may do to an arm: rad/s, and J in one stretch that are given faster than `slow` rad/s.
+
+    turning: whether the trunk turns under the arm, so that what lifts it does not count.
+    """
 
     speed: float = 0.6
     energy: float = 0.3
     slow: float = SLOW
+    turning: bool = False
 
 
 # A change of load that the operator asks for is a guided motion, whoever wears the arm. An arm that is lighter than
@@ -71,6 +75,7 @@ class Bound(NamedTuple):
 # motor, all but 0.03 J of it to gain height. Below the speed at which arms are let down, a hand 0.7 m from the shoulder
 # moves at less than 0.25 m/s, the reduced speed of ISO 10218-1. Only energy that is given above that speed counts.
 ASKED = Bound(slow=DESCENT.speed)
+TURNING = Bound(turning=True)
 # Faults that cannot be detected at once have bounds of their own; docs/safety_case.md gives the reasons.
 CLAMPED, REPLIES_LOST, LOAD_LOST = Bound(1.9, math.inf), Bound(1.5, math.inf), Bound(2.9, math.inf)
 LOST_AT_100_HZ = Bound(4.3, math.inf)  # a forearm gains 2 rad/s a cycle
@@ -199,12 +204,13 @@ KINDS = {
     "imu_creeps": Kind("imu", one_of(pitch=(-3.1, 1.0, 3.1), roll=(0.0,), duration=(0.2, 0.6)), TILT_JUMPED),
     "imu_frozen": Kind("imu", lasting(0.1, 5.0)),
     "imu_silent": Kind("imu", lasting(0.05, 2.0)),
-    "trunk_falls": Kind("wearer", one_of(bow=(-0.6, 0.8, 1.4), duration=(0.4, 0.8))),
-    "lean": Kind("wearer", one_of(lean=(-0.5, 0.5), duration=(0.5, 1.0))),
+    "trunk_falls": Kind("wearer", one_of(bow=(-0.6, 0.8, 1.4), duration=(0.4, 0.8)), TURNING),
+    "lean": Kind("wearer", one_of(lean=(-0.5, 0.5), duration=(0.5, 1.0)), TURNING),
     REARM: Kind("operator", lasting(0.1, 1.0)),
 }
 NEEDS_IMU = ("imu_wrong", "imu_creeps", "imu_frozen", "imu_silent", "trunk_falls", "lean")
 NEEDS_WEARER = ("body_mass",)
+STARTS = ("enable", "toggle", REARM)
 AT_POWER_UP = ("torque_reversed",)  # wired so: they are there before the arm is enabled
 
 
@@ -266,6 +272,8 @@ def bound_of(case: Case, clamped: bool) -> Bound:
             bounds.append(TILT_CREPT)
         if is_moved and tells_too_much(case, event):
             bounds.append(LOAD_LOST)
+        if event.name == "encoder_slip" and is_started_after(case, event):
+            bounds.append(ASKED)
     bounds += [LOST_UNREACHED] * is_lost_unreached(case)
     bounds += [LOST_AT_100_HZ] * (case.rate == min(RATES) and any(bound is LOAD_LOST for bound in bounds))
     return Bound(*map(max, zip(*bounds, strict=True)))
@@ -278,6 +286,15 @@ def is_moved_after(case: Case, event: Event) -> bool:
     it as if a load of that mass had been lost, or into a pose in which the wrong tilt drives it.
     """
     return any(KINDS[later.name].group == "wearer" for later in case.events if later.time > event.time)
+
+
+def is_started_after(case: Case, event: Event) -> bool:
+    """Return whether the operator enables the arm after this event.
+
+    They vouch then that it hangs as its angles say. If these are wrong by less than `home_tolerance`, the arm rises as
+    one that is lighter than they say.
+    """
+    return any(later.name in STARTS for later in case.events if later.time > event.time)
 
 
 def is_lost_unreached(case: Case) -> bool:

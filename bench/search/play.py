@@ -56,7 +56,8 @@ def play_case(case: Case) -> tuple[Played, np.ndarray]:
     bound = bound_of(case, stage.controller.was_clamped)
     config = stage.device.arm.config
     stops = config.position_min, config.position_max
-    done = driven(records, [motor.joint.spec for motor in stage.motors], stops, bound.slow)
+    specs = [motor.joint.spec for motor in stage.motors]
+    done = driven(records, specs, stops, bound.slow, bound.turning)
     return Played(case, done, bound, tuple(stage.states), begin, error), records
 
 

@@ -51,6 +51,14 @@ def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_a
         assert bound_of(case_of(taken, push), clamped=False).speed == speed
 
 
+def test_an_arm_that_is_enabled_with_a_wrong_zero_may_rise_slowly_and_one_on_a_trunk_that_turns_in_its_frame():
+    slip, rearm = Event(1.0, "encoder_slip", {"joint": 0, "error": 0.3}), Event(9.0, "rearm", {"duration": 0.3})
+    assert bound_of(case_of(slip), clamped=False) == bound_of(case_of(rearm, slip._replace(time=10.0)), clamped=False)
+    assert bound_of(case_of(slip, rearm), clamped=False) == Bound(slow=0.35)
+    lean = Event(1.0, "lean", {"lean": 0.5, "duration": 1.0})
+    assert bound_of(case_of(lean, rearm), clamped=False) == Bound(turning=True)
+
+
 def test_nothing_bounds_what_a_lost_load_leaves_while_no_command_reaches_the_motor():
     silent, dropped = Event(1.0, "bus_silent", {"duration": 0.5}), Event(1.4, "payload_dropped", {})
     assert bound_of(case_of(silent, dropped), clamped=False).speed == math.inf

@@ -11,7 +11,8 @@ import pytest
 from bench.barrier.cases import INNOCENT, WRONG, Case, play
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
-from exo_gravity.core.safety.barrier import BARRIER, Barrier, Shaped
+from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier, Shaped
+from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
@@ -70,6 +71,55 @@ def test_a_motor_drives_no_joint_beyond_the_barrier_and_below_it_brakes_none(sig
         power = [speed * (abs(tau) - kd * speed) for tau, kd in zip(effort, damping, strict=True)]
         assert damping == NOTHING or speed > LIMITS.driven_speed
         assert max(power) <= 1e-9 or speed < FULL
+
+
+def damped(rate: float, lag: float, inertia: float = 0.0036) -> np.ndarray:
+    """Return the speeds (n,) in rad/s of a joint whose damping rises, from 0.5 rad/s on, 4,000 a second for 3 s.
+
+    rate: Hz of the loop. lag: s, of its motor's current loop; the velocity is filtered by 0.02 s. inertia: kg m^2.
+    """
+    arm, dt, friction = barrier(), 2.5e-4, 0.05
+    speed = filtered = 0.5
+    torque, speeds = 0.0, []
+    for cycle in range(round(3.0 * rate)):
+        asked = (min(DAMPING, DESCENT.damping_rate * cycle / rate),) * 4
+        damping = arm.damping(1.0 / rate, joints(velocity=filtered), HEARD, NOTHING, asked, is_late=False)
+        for _ in range(round(1.0 / (rate * dt))):
+            filtered += (speed - filtered) * dt / 0.02
+            torque += (max(-9.0, min(9.0, -damping[3] * filtered)) - torque) * dt / lag
+            speed += (torque - friction * math.tanh(100.0 * speed)) / inertia * dt
+            speeds.append(speed)
+    return np.abs(speeds)
+
+
+@pytest.mark.parametrize("rate", [100.0, 250.0])
+def test_a_light_joint_behind_a_slow_motor_does_not_go_on_vibrating_under_its_damping(rate):
+    speeds = damped(rate, lag=0.008)
+    assert speeds.max() < 6.0
+    assert speeds[-4000:].max() < 0.1
+
+
+@pytest.mark.parametrize(("frequency", "least"), [(1.0, DAMPING), (6.0, DAMPING), (10.0, VIBRATION.least)])
+def test_only_what_turns_faster_than_people_shake_gets_less_damping(frequency, least):
+    arm = barrier()
+    for cycle in range(100):
+        speed = 0.5 * math.sin(2.0 * math.pi * frequency * 0.01 * cycle)
+        damping = arm.damping(0.01, joints(velocity=speed), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
+    assert min(damping) == pytest.approx(least, abs=0.05)
+    later = arm.damping(10.0, joints(velocity=0.0), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
+    assert later == (DAMPING,) * 4
+
+
+def test_what_vibrates_without_damping_keeps_its_own_and_the_brake_of_a_driven_joint_stays():
+    arm, tau = barrier(), (3.0,) * 4
+    for cycle in range(100):
+        arm.damping(0.01, joints(velocity=0.5 * (-1.0) ** (cycle // 4)), HEARD, NOTHING, NOTHING, is_late=False)
+    assert arm.damping(0.01, joints(velocity=0.0), HEARD, NOTHING, (DAMPING,) * 4, is_late=False) == (DAMPING,) * 4
+    for cycle in range(100):
+        way = (-1.0) ** (cycle // 4)
+        arm.damping(0.01, joints(velocity=0.5 * way), HEARD, NOTHING, (DAMPING,) * 4, is_late=False)
+    driven = arm.damping(0.1, joints(velocity=FULL), HEARD, tau, (DAMPING,) * 4, is_late=False)
+    assert min(driven) >= 3.0 / FULL - 1e-9
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

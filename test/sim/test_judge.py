@@ -201,6 +201,14 @@ def test_energy_counts_from_a_speed_on(records):
     assert driven(records, slow=0.35).energy == pytest.approx(0.4, abs=0.01)
 
 
+def test_on_a_trunk_that_turns_only_energy_beyond_the_weight_counts(records):
+    since = records["time"] - FAULT
+    lifted = (since >= 1.0) & (since < 2.0)
+    records["velocity"][lifted, 2], records["torque"][lifted, 2], records["weight"][lifted, 2] = 0.3, 2.0, 1.9
+    assert driven(records).energy == pytest.approx(0.6, abs=0.01)
+    assert driven(records, turning=True).energy == pytest.approx(0.03, abs=0.01)
+
+
 def test_a_stop_that_an_arm_falls_into_gives_speed_and_a_motor_that_threw_it_there_is_blamed(records):
     since = records["time"] - FAULT
     stops = (-1.0,) * 4, (1.0,) * 4
