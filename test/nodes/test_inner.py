@@ -128,6 +128,25 @@ def test_an_exception_of_this_package_in_a_standard_service_still_ends_the_node(
         wait_until(lambda: False, served.spin)
 
 
+def test_a_value_that_the_check_cannot_use_is_refused_and_leaves_the_node_and_its_value_as_they_were(served):
+    def read(values: dict[str, int]) -> dict[str, int]:
+        if values["some"] > 2:
+            raise OverflowError("too large for a float")
+        return values
+
+    applied: list[object] = []
+    served.node.declare_parameter("some", 1)
+    accept_changes(served.node, (Param("some", 1, "a number"),), read, lambda values, _names: applied.append(values))
+    results = []
+    for value in (3, 2):
+        some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=value))
+        answer = served.answer(served.send(SetParameters, "set_parameters", SetParameters.Request(parameters=[some])))
+        results += answer.results
+    refused, done = results
+    assert not refused.successful and refused.reason == "some: cannot be used: OverflowError: too large for a float"
+    assert done.successful and applied == [{"some": 2}]
+
+
 def test_a_request_is_as_old_as_it_has_waited_while_the_executor_stood_still(served):
     ages = []
     served.node.create_service(

@@ -4,6 +4,7 @@
 It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from a file or from `robot_description`.
 """
 
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -176,7 +177,11 @@ def _description(node: Node, values: dict[str, Any]) -> str:
 
 
 def _text(path: str) -> str:
-    return Path(path).expanduser().read_text(encoding="utf-8")
+    """Return the text of a file. Raises OSError for what is no regular file: reading a device or a pipe may not end."""
+    file = Path(os.path.expanduser(path))
+    if not file.is_file():
+        raise OSError("it is no regular file")
+    return file.read_text(encoding="utf-8")
 
 
 class JointStateInterface:

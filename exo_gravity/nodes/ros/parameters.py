@@ -65,7 +65,8 @@ def accept_changes(
 ) -> None:
     """Let the table's parameters be changed live.
 
-    read(values): what `apply` needs of all values by name; its ParameterError refuses the change.
+    read(values): what `apply` needs of all values by name; any exception of it refuses the change, which has had no
+    effect yet.
     apply(what `read` returned, names): called after a change of the parameters `names`.
     """
     accepted: list[T] = []
@@ -77,6 +78,11 @@ def accept_changes(
             accepted[:] = [read(values_of(table, {name: plain(value) for name, value in values.items()}))]
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            names = ", ".join(change.name for change in changes)
+            reason = f"{names}: cannot be used: {type(error).__name__}: {error}"
+            node.get_logger().error(reason, once=True)
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
