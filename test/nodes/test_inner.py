@@ -34,7 +34,7 @@ from exo_gravity.nodes.can_bridge.operation import BridgeServices
 from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, age_of_request, prepare_transitions
 from exo_gravity.nodes.ros.parameters import accept_changes
-from exo_gravity.nodes.ros.subscriptions import PolledSubscription
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PolledSubscription
 
 from ..support.waiting import wait_until
 from .test_bridge_operation import standing
@@ -173,6 +173,22 @@ def test_an_enable_that_has_waited_is_refused_and_a_let_down_is_not(served, monk
     response = served.answer(future)
     assert response.success is not data and loop.safety.state == "disabled"
     assert ("s old" in response.message) is data
+
+
+def test_a_let_down_is_not_pushed_out_by_a_hundred_other_requests(served, monkeypatch):
+    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.0)  # those are refused
+    loop = standing()
+    loop.safety.enable(1.0)
+    services = BridgeServices(served.node, lambda: loop, (), lambda: "")
+    answered: list[tuple[str, str]] = []
+    other = served.client.create_client(SetBool, "served/enable", qos_profile=MANY_REQUESTS)
+    wait_until(other.service_is_ready)
+    let_down = served.send(SetBool, "enable", SetBool.Request(data=False))
+    others = [other.call_async(SetBool.Request(data=True)) for _ in range(100)]
+    time.sleep(0.1)
+    wait_until(others[-1].done, lambda: served.spin() or answered.append(services.last))
+    assert loop.safety.state == "disabled" and ("let_down", "done") in answered
+    assert let_down.done() and let_down.result().success
 
 
 def test_a_let_down_does_not_wait_behind_enables_which_then_never_run(served):

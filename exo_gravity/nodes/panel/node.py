@@ -38,7 +38,7 @@ from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, Latest
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW, Latest
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of
@@ -85,7 +85,10 @@ class ArmClient:
     """The services of one arm, in the namespace `/name`, its joint states, and who controls it."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
+        self.services = {
+            kind: node.create_client(srv, f"/{name}/{leaf}", qos_profile=MANY_REQUESTS)
+            for kind, (srv, leaf, _) in ASKED.items()
+        }
         self.settings = node.create_client(GetParameters, f"/{name}/{COMPENSATOR}/get_parameters")
         self._lifecycle = node.create_client(GetState, f"/{name}/{BRIDGE}/get_state")
         self._transitions = node.create_client(ChangeState, f"/{name}/{BRIDGE}/change_state")
