@@ -53,7 +53,8 @@ REFUSALS = [
     ({"": 1.0}, "must be one of "),
     ({"law": "anfis"}, "anfis_file"),
     ({"anfis_file": "~nobody_here/model.json"}, "anfis_file = '~nobody_here/model.json': must be a file"),
-    ({"anfis_file": "/dev/zero"}, "it is no regular file"),
+    ({"anfis_file": "/dev/zero"}, "it must be a regular file"),
+    ({"anfis_file": "/proc/kmsg"}, "it must be a regular file"),
 ]
 
 
