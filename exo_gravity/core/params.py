@@ -6,6 +6,7 @@ parameter that a frozen dataclass uses is declared there (`owned`), with the rul
 takes it from there (`param_of`).
 """
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -75,7 +76,7 @@ class Param:
         items: list[Any] = list(value) if is_list else [value]
         kind, count = self._kind_and_count
         if kind is float:
-            items = [float(x) if isinstance(x, int | float) and type(x) is not bool else x for x in items]
+            items = [_float(x) for x in items]
         if self.required and (not items or "" in items):
             raise ParameterError(self.name, value, f"set to {self.expected}")
         fits = is_list == isinstance(self.default, list) and count in (None, len(items))
@@ -112,6 +113,16 @@ class Param:
         if isinstance(self.default, list):
             text = f"{count or 'a list of'} {KINDS[kind]}{'' if count == 1 else 's'}"
         return f"{text}{', ' if self.choices else ' '}{self.range}".rstrip()
+
+
+def _float(value: Any) -> Any:
+    """Return a number as a float, infinite if it is too large for one; anything else as it is."""
+    if not isinstance(value, int | float) or type(value) is bool:
+        return value
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def owned(

@@ -164,6 +164,20 @@ def planned(
     return nodes, names, asking
 
 
+def _copy(content: str, name: str) -> Path:
+    """Return a new file of this content and name, in a new temporary folder. Raises ParameterError."""
+    folder = None
+    try:
+        folder = tempfile.mkdtemp(prefix="exo_gravity_")
+        Path(folder, name).write_text(content, encoding="utf-8")
+    except OSError as error:
+        if folder:
+            shutil.rmtree(folder, ignore_errors=True)
+        expected = f"a folder with room for a copy of the parameters ({error.strerror or error})"
+        raise ParameterError("TMPDIR", os.environ.get("TMPDIR", "/tmp"), expected) from None
+    return Path(folder, name)
+
+
 class Launcher:
     """The processes of one parameter file.
 
@@ -186,9 +200,9 @@ class Launcher:
         nodes, names, asking = planned(params, only, more)
         self._namespace, self._log_level = namespace, log_level
         #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
-        self.params = Path(tempfile.mkdtemp(prefix="exo_gravity_"), Path(params).name)
-        content = text_of({f"{namespace}{node}": values for node, values in nodes.items()})
-        self.params.write_text(content, encoding="utf-8")
+        self.params = _copy(
+            text_of({f"{namespace}{node}": values for node, values in nodes.items()}), Path(params).name
+        )
         pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
         # The compensator that shares the process of its can_bridge
         self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}

@@ -68,7 +68,7 @@ def parse(body: Any, arms: Collection[str], trials: Collection[str]) -> dict[str
     arm, name = body.get("arm", ""), body.get("name", "")
     if "arm" in KEYS[kind] and arm not in arms and (kind != "let_down" or arm != ""):
         raise ParameterError("arm", arm, f"one of {', '.join(sorted(arms)) or 'none: no arm is present'}")
-    if kind == "trial" and name not in trials:
+    if kind == "trial" and (not isinstance(name, str) or name not in trials):
         raise ParameterError("trial", name, f"one of {', '.join(sorted(trials))}")
     if kind != "set":
         return dict(body)

@@ -229,8 +229,10 @@ class Recordings:
 
     def report(self, name: str) -> Path | None:
         """Return the report in the folder `name` below `output`; None without one."""
-        path = (self._output / name / REPORT).resolve()
-        return path if path.is_relative_to(self._output) and path.is_file() else None
+        with contextlib.suppress(OSError, ValueError):  # no file can have that name
+            path = (self._output / name / REPORT).resolve()
+            return path if path.is_relative_to(self._output) and path.is_file() else None
+        return None
 
     def _key(self, folder: Path) -> str:
         """Return the `name` of the report in this folder, '' without one."""

@@ -126,7 +126,7 @@ class PanelServer:
     async def _on_live(self, connection: WebSocket) -> None:
         """Send to a page and receive its confirmations until it closes."""
         await connection.accept()
-        with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError):
+        with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError, RecursionError):
             hello = await asyncio.wait_for(connection.receive_json(), SERVING.hello_timeout)
             page = self._control.open(_given(hello, "page", str), address_of(connection))
             if page is None:
@@ -164,7 +164,7 @@ class PanelServer:
     async def _on_action(self, request: Request) -> Response:
         try:
             content = await request.json()
-        except ValueError:
+        except (ValueError, RecursionError):  # the latter of brackets in brackets
             return JSONResponse({"error": "the request is not JSON"}, 400)
         secret = request.headers.get("x-panel-page", "")
         status, text = await self._control.perform(content, secret, address_of(request))

@@ -114,7 +114,8 @@ def difference(before: Values, load: Values) -> dict[str, Any] | None:
 def _arm_setup(bridge: Values, compensator: Values) -> dict[str, Any]:
     efforts = [values["max_effort"] for values in (bridge, compensator) if values.get("max_effort")]
     # With a URDF, 0 of the compensator stands for the limit in it.
-    given = [[limit for limit in column if limit > 0.0] for column in zip(*efforts, strict=True)]
+    # Nodes of arms with different joints, which do not work together, may be in one namespace.
+    given = [[limit for limit in column if limit > 0.0] for column in zip(*efforts, strict=False)]
     return {
         "max_effort": [min(column, default=None) for column in given] if given else None,
         "settings": {name: compensator.get(name) for name in SETTABLE},

@@ -23,9 +23,13 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def print_line(node: str, line: str) -> None:
-    """Print one line of a node's log, with the time of day and the node's name."""
-    clock = datetime.now().time().isoformat("milliseconds")
-    print(f"{clock} {node.lstrip('/'):<18} {line}", flush=True)
+    """Print one line of a node's log, with the time of day and the node's name.
+
+    A terminal may lack a character of it: a name of who holds control, say.
+    """
+    clock, encoding = datetime.now().time().isoformat("milliseconds"), sys.stdout.encoding or "utf-8"
+    text = f"{clock} {node.lstrip('/'):<18} {line}"
+    print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:

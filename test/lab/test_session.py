@@ -24,7 +24,10 @@ def test_without_a_subject_there_is_no_folder():
     assert Session(protocol="pilot").folder(date(2026, 3, 14)) == ""
 
 
-@pytest.mark.parametrize("wrong", [{"note": "x" * 1001}, {"protocol": 1}, {"subject": None}])
-def test_a_text_that_is_too_long_or_no_text_is_refused(wrong):
+HALF = ({"note": "calm \ud83d"}, {"protocol": "a\0"})  # an emoji cut by a field's maxlength; a C string ends there
+
+
+@pytest.mark.parametrize("wrong", [{"note": "x" * 1001}, {"protocol": 1}, {"subject": None}, *HALF])
+def test_a_text_that_is_too_long_or_no_whole_text_is_refused(wrong):
     with pytest.raises(ParameterError, match=next(iter(wrong))):
         Session(**wrong)

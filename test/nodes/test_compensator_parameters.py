@@ -52,6 +52,9 @@ REFUSALS = [
     ({"robot.mass": None}, "robot.mass"),
     ({"": 1.0}, "must be one of "),
     ({"law": "anfis"}, "anfis_file"),
+    ({"anfis_file": "~nobody_here/model.json"}, "anfis_file = '~nobody_here/model.json': must be a file"),
+    ({"anfis_file": "/dev/zero"}, "it must be a regular file"),
+    ({"anfis_file": "/proc/kmsg"}, "it must be a regular file"),
 ]
 
 

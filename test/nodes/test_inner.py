@@ -34,7 +34,7 @@ from exo_gravity.nodes.can_bridge.operation import BridgeServices
 from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, age_of_request, prepare_transitions
 from exo_gravity.nodes.ros.parameters import accept_changes
-from exo_gravity.nodes.ros.subscriptions import PolledSubscription
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PolledSubscription
 
 from ..support.waiting import wait_until
 from .test_bridge_operation import standing
@@ -128,6 +128,25 @@ def test_an_exception_of_this_package_in_a_standard_service_still_ends_the_node(
         wait_until(lambda: False, served.spin)
 
 
+def test_a_value_that_the_check_cannot_use_is_refused_and_leaves_the_node_and_its_value_as_they_were(served):
+    def read(values: dict[str, int]) -> dict[str, int]:
+        if values["some"] > 2:
+            raise OverflowError("too large for a float")
+        return values
+
+    applied: list[object] = []
+    served.node.declare_parameter("some", 1)
+    accept_changes(served.node, (Param("some", 1, "a number"),), read, lambda values, _names: applied.append(values))
+    results = []
+    for value in (3, 2):
+        some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=value))
+        answer = served.answer(served.send(SetParameters, "set_parameters", SetParameters.Request(parameters=[some])))
+        results += answer.results
+    refused, done = results
+    assert not refused.successful and refused.reason == "some: cannot be used: OverflowError: too large for a float"
+    assert done.successful and applied == [{"some": 2}]
+
+
 def test_a_request_is_as_old_as_it_has_waited_while_the_executor_stood_still(served):
     ages = []
     served.node.create_service(
@@ -154,6 +173,22 @@ def test_an_enable_that_has_waited_is_refused_and_a_let_down_is_not(served, monk
     response = served.answer(future)
     assert response.success is not data and loop.safety.state == "disabled"
     assert ("s old" in response.message) is data
+
+
+def test_a_let_down_is_not_pushed_out_by_a_hundred_other_requests(served, monkeypatch):
+    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.0)  # those are refused
+    loop = standing()
+    loop.safety.enable(1.0)
+    services = BridgeServices(served.node, lambda: loop, (), lambda: "")
+    answered: list[tuple[str, str]] = []
+    other = served.client.create_client(SetBool, "served/enable", qos_profile=MANY_REQUESTS)
+    wait_until(other.service_is_ready)
+    let_down = served.send(SetBool, "enable", SetBool.Request(data=False))
+    others = [other.call_async(SetBool.Request(data=True)) for _ in range(100)]
+    time.sleep(0.1)
+    wait_until(others[-1].done, lambda: served.spin() or answered.append(services.last))
+    assert loop.safety.state == "disabled" and ("let_down", "done") in answered
+    assert let_down.done() and let_down.result().success
 
 
 def test_a_let_down_does_not_wait_behind_enables_which_then_never_run(served):

@@ -140,3 +140,10 @@ def test_a_node_whose_clock_nobody_publishes_says_so_until_it_is_published(waiti
         watch.look()
     spin()
     assert len(heard) == 2
+    node.destroy_publisher(publisher)
+    wait_until(lambda: not node.count_publishers("/clock"), spin)
+    for now[0] in (30.0, 32.1):
+        watch.look()
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    watch.look()
+    wait_until(lambda: heard[-1].message.startswith("use_sim_time is false"), spin)

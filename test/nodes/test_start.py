@@ -36,6 +36,14 @@ def test_a_bad_parameter_ends_the_launcher_with_one_sentence_and_no_motor_is_ena
     assert ENTER not in [frame.data for frame in listener.frames]
 
 
+def test_motors_that_were_left_on_are_let_down_where_no_log_file_can_be_opened(prepare):
+    """Here no motor was left on: the recovery ends well."""
+    given = {**os.environ, "EXO_GRAVITY_RECOVER": "2", "ROS_LOG_DIR": "/proc/none"}
+    options = ["--ros-args", "-r", "__ns:=/right", "--params-file", str(prepare().path)]
+    done = subprocess.run([executable("can_bridge"), *options], env=given, timeout=PATIENCE)
+    assert done.returncode == 0
+
+
 def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_states(probe):
     process = subprocess.Popen([executable("compensator"), "--ros-args", "-r", "__ns:=/right"])
     try:

@@ -12,6 +12,8 @@ from functools import partial
 
 import numpy as np
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -20,13 +22,17 @@ from std_srvs.srv import Trigger
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
+from exo_gravity.nodes.wearer.node import WearerNode
 
 from ..support.joint_state_feeder import PARTS, POSE
 from ..support.launched_nodes import NO_IMU
 from ..support.urdf_oracle import MujocoArm
+from ..support.waiting import wait_until
 
 OTHER_NODES = ("can_bridge", "simulator", "imu")
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
@@ -125,6 +131,30 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_th
     assert len(found[""]) == told
     os.kill(nodes.pid("compensator"), signal.SIGCONT)
     probe.wait_until(lambda: torques() == NONE and len(found[""]) > told)
+
+
+def test_a_node_of_another_program_with_the_compensators_name_does_not_end_the_node_and_is_refused():
+    keep_to_this_machine()
+    rclpy.init()
+    wearer, other, executor, told = WearerNode(), rclpy.create_node("compensator"), NodeExecutor(), []
+    publisher = other.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    values = [KeyValue(key="answers", value="many")]
+    other.create_timer(
+        0.05, lambda: publisher.publish(DiagnosticArray(status=[DiagnosticStatus(name="compensator", values=values)]))
+    )
+    other.create_subscription(DiagnosticArray, "/diagnostics", lambda message: told.extend(message.status), 10)
+    try:
+        for node in (wearer, other):
+            executor.add_node(node)
+        refusal = "the compensator has no parameter 'law'"
+        wait_until(lambda: refusal in {status.message for status in told}, lambda: executor.spin_once(0.05))
+        assert wearer.failure is None
+    finally:
+        wearer.close()
+        executor.shutdown()
+        for node in (wearer, other):
+            node.destroy_node()
+        rclpy.try_shutdown()
 
 
 @pytest.mark.thorough

@@ -77,6 +77,7 @@ WRONG = [
     {"do": "take", "arm": "right"},
     {"do": "trial", "name": "../../etc/passwd"},
     {"do": "trial"},
+    {"do": "trial", "name": ["demo"]},
     {"do": "set", "arm": "right"},
     *(
         {"do": "set", "arm": "right", "values": values}
@@ -88,6 +89,7 @@ WRONG = [
             {"support": 1.01},
             {"support": -0.01},
             {"support": float("nan")},
+            {"support": 10**400},
             {"support": True},
             {"support": "1"},
             {"mode": "two_g"},
@@ -109,7 +111,7 @@ def test_a_right_request_is_understood_and_a_whole_number_has_the_parameters_typ
 @pytest.mark.parametrize("body", WRONG)
 def test_a_wrong_request_is_refused(body):
     with pytest.raises(ParameterError):
-        parse(body, ("right", "left"), ("demo",))
+        parse(body, ("right", "left"), {"demo"})
 
 
 def test_log_and_refusals_name_the_client_and_never_the_wearers_data(panel):

@@ -23,7 +23,7 @@ from ..support.launched_nodes import executable
 from ..support.node_thread import NodeThread
 from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
-from ..support.waiting import PATIENCE
+from ..support.waiting import PATIENCE, wait_until
 
 TOKEN = "a token for this test"
 NAMES = [f"joint_{n}" for n in range(4)]
@@ -115,6 +115,16 @@ class PlayedArm:
 
 
 @pytest.fixture
+def stranger() -> Iterator[str]:
+    """The name of a node of another program, which is called can_bridge too."""
+    thread = NodeThread("can_bridge", namespace="truck")
+    thread.nodes[0].declare_parameter("max_effort", "much")
+    thread.start()
+    yield "/truck/can_bridge"
+    thread.close()
+
+
+@pytest.fixture
 def panel(tmp_path: Path) -> Iterator[PanelProcess]:
     """A panel on loopback whose page holds the arms' control."""
     panel = PanelProcess(tmp_path, dead_man=True)
@@ -136,7 +146,7 @@ def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
     return bool(arm) and arm["max_effort"] == MAX_EFFORT and arm["settings"]["support"] == support
 
 
-def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
+def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_another_program(panel, stranger):
     origin = panel.url.rstrip("/")
     with connect(panel.url.replace("http", "ws") + "live", origin=origin) as connection:
         connection.send(json.dumps({"page": ""}))
@@ -147,6 +157,7 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes(panel):
             answer = httpx.post(panel.url + "action", json=body, headers=headers, verify=False)
             return answer.status_code, answer.json()["error"]
 
+        wait_until(lambda: stranger in httpx.get(panel.url + "parameters", verify=False).json())
         assert ask(do="let_down") == (409, "no arm is present")
         arm = PlayedArm()
         try:

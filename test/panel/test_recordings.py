@@ -2,6 +2,7 @@
 """Where recordings and saved parameters go, how a trial is followed, and what is kept of a subject."""
 
 import asyncio
+import json
 import sys
 from pathlib import Path
 
@@ -193,3 +194,14 @@ def test_a_wrong_wearers_file_is_refused(panel, text):
 def test_a_marker_without_a_text_is_called_marker(panel):
     assert panel.ask("marker", text="") == "" and panel.device.marked == "marker"
     assert panel.ask("marker", text=["a"]).startswith("text ")
+
+
+def test_half_of_a_character_is_refused_and_reaches_no_page(panel):
+    assert panel.ask("marker", text="calm \ud83d").startswith("text must be")
+    assert panel.begin("P01", note="calm \ud83d").startswith("note must be")
+    json.dumps(panel.state(), ensure_ascii=False).encode()
+
+
+@pytest.mark.parametrize("name", ["\0", "a" * 3000, "../etc"])
+def test_a_name_that_no_report_has_finds_none(panel, name):
+    assert panel.report(name) is None

@@ -239,7 +239,15 @@ def test_a_live_connection_with_nonsense_ends_without_harm(stage, hello):
 
 
 LET_DOWN = b'{"do": "let_down"}'
-BODIES = [(b"", 400), (b"{", 400), (b"[1", 400), (b"\xff", 400), (LET_DOWN, 200), (LET_DOWN + b" " * 5000, 413)]
+BODIES = [
+    (b"", 400),
+    (b"{", 400),
+    (b"[1", 400),
+    (b"\xff", 400),
+    (b"[" * 4000, 400),
+    (LET_DOWN, 200),
+    (LET_DOWN + b" " * 5000, 413),
+]
 
 
 @pytest.mark.parametrize(("content", "status"), BODIES)

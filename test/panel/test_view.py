@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.panel.view import NEWS_DELAY, LoadChanges, setup_of
 
 
@@ -100,3 +102,14 @@ def test_the_limit_of_a_joint_is_the_smaller_one_and_a_compensator_without_a_lim
     )
     compensator = values_of(COMPENSATOR, {}) | {"max_effort": [0.0, 5.0, 0.0, 12.0]}
     assert setup_of({"right": (bridge, compensator)})["arms"]["right"]["max_effort"] == [3.0, 5.0, 3.0, 3.0]
+
+
+def test_nodes_of_other_programs_and_of_other_arms_that_have_an_arms_names_leave_the_page_its_setup():
+    bridge = fitting("/right/can_bridge", {"max_effort": "much", "can.channel": ["vcan0"], "rate": math.nan, "own": 1})
+    assert bridge == {"own": 1}
+    compensator = fitting("/right/compensator", {"max_effort": 3.0, "support": 0.5, "payload.mass": math.inf})
+    assert compensator == {"support": 0.5}
+    shown = setup_of({"right": (bridge, compensator)})["arms"]["right"]
+    assert shown["max_effort"] is None and shown["settings"]["support"] == 0.5
+    others = {"right": ({"max_effort": [3.0, 9.0, 3.0]}, {"max_effort": [2.0] * 4})}
+    assert setup_of(others)["arms"]["right"]["max_effort"] == [2.0] * 3

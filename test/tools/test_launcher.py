@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Sequence
 from pathlib import Path
@@ -313,3 +314,18 @@ def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launch
     commands, _ = launched("--namespace", "lab/", "--log-level", "warn")
     words = commands["/lab/right/compensator"]
     assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", "warn"} <= set(words)
+
+
+def test_a_line_with_characters_that_the_terminal_lacks_is_printed(monkeypatch):
+    """One that raises ends the reader, and a node whose log is not read stands still."""
+    written = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    launcher.print_line("/right/can_bridge", "Jos\xe9 holds control")
+    assert written.getvalue().endswith(b"right/can_bridge   Jos\\xe9 holds control\n")
+
+
+def test_a_full_or_missing_temporary_folder_is_named(monkeypatch, refused, tmp_path):
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    error = refused({})
+    assert error.startswith("launcher: TMPDIR = ") and "none" in error and "must be a folder with room" in error

@@ -6,6 +6,7 @@ unknown parameter is an error here too. Errors name node and parameter: `/right/
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -203,7 +204,28 @@ def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dic
         return {}
     recorded = recorded_parameters(parameters[node], node)
     given = {new: plain for name, value in recorded.items() for new, plain in in_force(name, value).items()}
+    return {param.name: param.default for param in _table_of(executable, given)} | given
+
+
+def fitting(node: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a running node; of an arm's compensator or can_bridge without those that it cannot have.
+
+    Another program may have a node of that name, with parameters of the same names and of other types.
+
+    node: its full name.
+    """
+    executable = node.rpartition("/")[2]
+    if executable not in ("compensator", "can_bridge"):
+        return values
+    params = {param.name: param for param in _table_of(executable, values)}
+    fit: dict[str, Any] = {}
+    for name, value in values.items():
+        with suppress(ParameterError):
+            fit[name] = params[name].check(value) if name in params else value
+    return fit
+
+
+def _table_of(executable: str, given: Mapping[str, Any]) -> Sequence[Param]:
+    """Return the table of a compensator or can_bridge that has the parameters `given`."""
     table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
-    if given.get("law") == URDF_LAW:
-        table = urdf_table(given)
-    return {param.name: param.default for param in table_for(table, given)} | given
+    return table_for(urdf_table(given) if given.get("law") == URDF_LAW else table, given)

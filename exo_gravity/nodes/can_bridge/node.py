@@ -10,6 +10,7 @@ left with its motors on.
 
 import contextlib
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -57,6 +58,7 @@ DEACTIVATE = ("deactivate", Transition.TRANSITION_DEACTIVATE)
 SHUTDOWN = ("shutdown", "active_shutdown", Transition.TRANSITION_ACTIVE_SHUTDOWN)
 # Set by launcher and launch file: the time in s for the watchdog of the dead bridge to let the arm down.
 RECOVER = "EXO_GRAVITY_RECOVER"
+WITHOUT_LOG_FILE = ("--ros-args", "--disable-external-lib-logs")
 
 
 def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
@@ -262,7 +264,8 @@ def main(make_node: Callable[[], CanBridge] = CanBridge) -> None:
     if not (patience := os.environ.get(RECOVER)):
         raise SystemExit(run(make_node, priority=20))
     keep_to_this_machine()
-    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    # The launcher shows the log. A log file cannot be opened on a full disk, which must not leave the motors on.
+    rclpy.init(args=[*sys.argv, *WITHOUT_LOG_FILE], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("can_bridge", automatically_declare_parameters_from_overrides=True)
     try:
         take_over(_declared(node)[1], _owner(node), node.get_logger().error, float(patience)).release()

@@ -54,7 +54,7 @@ from exo_gravity.nodes.ros.messages import (
     milliseconds,
     row,
 )
-from exo_gravity.nodes.ros.subscriptions import PolledSubscription
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PolledSubscription
 
 RECENT = 2.0  # s for which a limit that acted is still shown
 SLOW = 0.9  # share of the set rate below which the loop is slow
@@ -119,9 +119,9 @@ class BridgeServices:
         self._hindrance = hindrance
         self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._motors = tuple(motors)
-        node.create_service(SetBool, "~/enable", partial(self.answer, self.enable))
-        for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
-            node.create_service(Trigger, f"~/{function.__name__}", partial(self.answer, function))
+        for function in (self.enable, self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
+            kind, answer = SetBool if function == self.enable else Trigger, partial(self.answer, function)
+            node.create_service(kind, f"~/{function.__name__}", answer, qos_profile=MANY_REQUESTS)
 
     def enable(self, loop: ControlLoop, request: SetBool.Request) -> str:
         """Enable the arm, or let it down and disable it."""

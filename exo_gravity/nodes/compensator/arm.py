@@ -4,6 +4,7 @@
 It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from a file or from `robot_description`.
 """
 
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -35,6 +36,9 @@ from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 TICK = 0.01  # s between two messages of a fade
+# Bytes of an ANFIS model, which is read while the arm is carried: no tilt is taken meanwhile. train_anfis writes
+# 20,000; a million take 14 ms.
+LARGEST_FILE = 1_000_000
 
 JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
 Read = Callable[[dict[str, Any]], Settings]
@@ -176,7 +180,11 @@ def _description(node: Node, values: dict[str, Any]) -> str:
 
 
 def _text(path: str) -> str:
-    return Path(path).expanduser().read_text(encoding="utf-8")
+    """Return the text of a file. Raises OSError for a device or a pipe, and what else may not end soon."""
+    file = Path(os.path.expanduser(path))
+    if not (file.is_file() and 0 < file.stat().st_size <= LARGEST_FILE):  # the files of /proc tell no size
+        raise OSError(f"it must be a regular file of 1 to {LARGEST_FILE} bytes")
+    return file.read_text(encoding="utf-8")
 
 
 class JointStateInterface:

@@ -32,12 +32,13 @@ from std_srvs.srv import SetBool, Trigger
 from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.lab.bag.content import MARKERS
+from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.packages import missing
 from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
 from exo_gravity.nodes.ros.run import run
-from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, Latest
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW, Latest
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of
@@ -84,7 +85,10 @@ class ArmClient:
     """The services of one arm, in the namespace `/name`, its joint states, and who controls it."""
 
     def __init__(self, node: Node, name: str) -> None:
-        self.services = {kind: node.create_client(srv, f"/{name}/{leaf}") for kind, (srv, leaf, _) in ASKED.items()}
+        self.services = {
+            kind: node.create_client(srv, f"/{name}/{leaf}", qos_profile=MANY_REQUESTS)
+            for kind, (srv, leaf, _) in ASKED.items()
+        }
         self.settings = node.create_client(GetParameters, f"/{name}/{COMPENSATOR}/get_parameters")
         self._lifecycle = node.create_client(GetState, f"/{name}/{BRIDGE}/get_state")
         self._transitions = node.create_client(ChangeState, f"/{name}/{BRIDGE}/change_state")
@@ -109,15 +113,17 @@ class ArmClient:
 class Arms:
     """All arms, by name: 'right', 'left', or the namespace that a parameter file gives them; and all other nodes.
 
-    An arm stays in the list when its nodes end: it shows that they do not answer. has_lease: whether a page that holds
-    control holds it at the arms too.
+    An arm is what has a can_bridge with the service `enable`: other programs may have a node of that name. It stays in
+    the list when its nodes end: it shows that they do not answer. has_lease: whether a page that holds control holds it
+    at the arms too.
     """
 
     def __init__(self, node: Node, has_lease: bool) -> None:
         self.clients: dict[str, ArmClient] = {}
+        self._candidates: dict[str, ArmClient] = {}  # the same, and those whose services were never seen
         self._node = node
         self._lessee = f"panel {os.getpid()}, " if has_lease else ""
-        self._others = OtherNodes(node)
+        self._others = OtherNodes(node, fitting=fitting)
         self._statuses = Statuses(node)
         self._markers = node.create_publisher(String, MARKERS, 10)
         node.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 50)
@@ -132,8 +138,11 @@ class Arms:
         self._others.update()
         for name in self._others.found:
             arm, _, leaf = name.strip("/").rpartition("/")
-            if leaf == BRIDGE and arm and arm not in self.clients:
-                self.clients[arm] = ArmClient(self._node, arm)
+            if leaf == BRIDGE and arm and arm not in self._candidates:
+                self._candidates[arm] = ArmClient(self._node, arm)
+        for arm, client in self._candidates.items():
+            if arm not in self.clients and client.services["let_down"].service_is_ready():
+                self.clients[arm] = client
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows of each arm; None in the place of what is old."""

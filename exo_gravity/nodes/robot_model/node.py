@@ -24,6 +24,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
 from exo_gravity.lab.view.urdf import ROBOT_MODEL, ROOT, Described, described, joint_names, urdf
 from exo_gravity.lab.vocabulary import NodeState
@@ -59,7 +60,7 @@ class RobotModel(Node):
         super().__init__("robot_model", automatically_declare_parameters_from_overrides=True)
         values = declare(self, ROBOT_MODEL)
         self._meshes = values["meshes"]
-        self._others = OtherNodes(self, (COMPENSATOR, BRIDGE))
+        self._others = OtherNodes(self, (COMPENSATOR, BRIDGE), fitting=fitting)
         self._statuses = Statuses(self)
         self._arms: dict[str, ViewedArm] = {}  # by namespace
         self._views: list[tuple[ViewedArm, ArmView]] = []

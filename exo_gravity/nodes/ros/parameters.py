@@ -65,7 +65,8 @@ def accept_changes(
 ) -> None:
     """Let the table's parameters be changed live.
 
-    read(values): what `apply` needs of all values by name; its ParameterError refuses the change.
+    read(values): what `apply` needs of all values by name; any exception of it refuses the change, which has had no
+    effect yet.
     apply(what `read` returned, names): called after a change of the parameters `names`.
     """
     accepted: list[T] = []
@@ -77,6 +78,11 @@ def accept_changes(
             accepted[:] = [read(values_of(table, {name: plain(value) for name, value in values.items()}))]
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            names = ", ".join(change.name for change in changes)
+            reason = f"{names}: cannot be used: {type(error).__name__}: {error}"
+            node.get_logger().error(reason, once=True)
+            return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
@@ -117,6 +123,7 @@ class NodeParameters:
     name: its full name, or its name in `node`'s namespace.
     on_read(name, values): called on the executor's thread each time that they were read.
     once: whether they are read only once; the executor then no longer waits for the clients.
+    fitting(name, values): what is kept of them.
 
     values: by name; {} until they are known.
     is_present: whether the node has its services. One that has died can stay in ROS's list of names.
@@ -128,11 +135,12 @@ class NodeParameters:
         name: str,
         on_read: Callable[[str, dict[str, Any]], object] = lambda name, values: None,
         once: bool = False,
+        fitting: Callable[[str, dict[str, Any]], dict[str, Any]] = lambda name, values: values,
     ) -> None:
         self.values: dict[str, Any] = {}
         self.is_present = False
         self._node, self._name = node, name
-        self._on_read, self._once = on_read, once
+        self._on_read, self._once, self._fitting = on_read, once, fitting
         self._get = node.create_client(GetParameters, f"{name}/get_parameters")
         self._list = node.create_client(ListParameters, f"{name}/list_parameters")
         self._due = -math.inf  # s, when to ask; infinite while the values are known
@@ -166,7 +174,8 @@ class NodeParameters:
         if math.isfinite(self._due):  # else they have changed since
             self._due = math.inf
         values = map(parameter_value_to_python, asked.result().values)
-        self.values = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        known = {name: plain(value) for name, value in zip(names, values, strict=False) if value is not None}
+        self.values = self._fitting(self._name, known)
         if self._once:
             self._is_done = True
             self._node.destroy_client(self._get)

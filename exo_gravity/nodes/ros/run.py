@@ -22,7 +22,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from exo_gravity.core.errors import ExoGravityError
-from exo_gravity.core.vocabulary import UNKNOWN, ClockState
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, ClockState
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.nodes.ros.inner import NodeExecutor
@@ -115,14 +115,16 @@ class ClockWatch:
         if seen is None or seen != self._seen:
             self._seen, self._since = seen, now
             if self._diagnostics:
-                self._diagnostics.report(OK, "/clock is published", _clock(ClockState.PUBLISHED))
+                is_published = seen is not None
+                message = "/clock is published" if is_published else "use_sim_time is false"
+                self._diagnostics.report(OK, message, _clock(ClockState.PUBLISHED if is_published else NONE))
                 self._diagnostics = None
         elif now - self._since > NO_CLOCK_TIMEOUT and not self._node.count_publishers("/clock"):
             self._diagnostics = self._diagnostics or Diagnostics(self._node)
             self._diagnostics.report(ERROR, NO_CLOCK, _clock(ClockState.MISSING))
 
 
-def _clock(state: ClockState) -> dict[str, object]:
+def _clock(state: str) -> dict[str, object]:
     """Return what programs read of the clock; what else the node does it says itself, once it has one."""
     return {"state": UNKNOWN, "clock": state}
 

@@ -19,6 +19,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Reason
 from exo_gravity.lab.budget import USUAL_TILT, budget_worn, largest_support, motor_torques, overload, workspace
+from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.vocabulary import Budget
 from exo_gravity.nodes.ros.parameters import NodeParameters
 
@@ -42,7 +43,7 @@ class BudgetWatch:
         #: share 0..1 of the wearer's arm within rated torque everywhere, 0 if none is, 'none' without a wearer
         self.largest_support = UNKNOWN
         self._logger = node.get_logger()
-        self._bridge = NodeParameters(node, "can_bridge", once=True)
+        self._bridge = NodeParameters(node, "can_bridge", once=True, fitting=fitting)
         self._request: Request | None = None
         self._job: Future[tuple[Reason, str]] | None = None
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")

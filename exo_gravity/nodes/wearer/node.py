@@ -15,6 +15,7 @@ An arm from a URDF (`law: urdf`) is read from the compensator's own file or topi
 import math
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
@@ -33,6 +34,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, NONE, Reason
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
+from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
 from exo_gravity.lab.vocabulary import Adapts, NoEstimate, WearerState
@@ -92,7 +94,7 @@ class WearerNode(Node):
         super().__init__("wearer", automatically_declare_parameters_from_overrides=True)
         declare(self, ())
         name = f"{self.get_namespace().rstrip('/')}/{COMPENSATOR}"
-        self._compensator = NodeParameters(self, name, self._on_parameters)
+        self._compensator = NodeParameters(self, name, self._on_parameters, fitting=fitting)
         self._status_name = name.lstrip("/")
         self._answers = 0  # of the compensator, since its start
         self._statuses = Statuses(self)
@@ -138,7 +140,9 @@ class WearerNode(Node):
 
     def _follow_compensator(self) -> None:
         """Read the compensator's parameters if they may have changed."""
-        answers = int(self._statuses.within(COMPENSATOR_SILENCE, self._status_name).get("answers", 0))
+        answers = 0
+        with suppress(ValueError):  # of a status by another program
+            answers = int(self._statuses.within(COMPENSATOR_SILENCE, self._status_name).get("answers", "0"))
         if answers < self._answers:  # silent, or restarted: it may have other parameters
             self._compensator.refresh()
         self._answers = answers
@@ -154,9 +158,12 @@ class WearerNode(Node):
         """Use the compensator's parameters, or note why they cannot be used."""
         try:
             settings = self._read(values)
-        except ParameterError as error:
+        except (ParameterError, KeyError) as error:
+            has = (
+                "no parameter " if isinstance(error, KeyError) else ""
+            )  # of another version, or another program's node
             self._settings = None
-            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {error}")
+            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {has}{error}")
             return
         if settings is None:
             waiting = f"waiting for the arm's URDF on {values['urdf.topic']}"
