@@ -46,7 +46,7 @@ Base = Sequence[tuple[int, np.ndarray]]
 def read_urdf(path: str) -> str:
     """Return the text of a URDF file, whose path may begin with package://NAME/. Raises ParameterError."""
     try:
-        return _located(path).read_text(encoding="utf-8")
+        return _located(path).read_text(encoding="utf-8-sig")  # some editors of Windows begin a file with a mark
     except (OSError, UnicodeDecodeError) as error:
         raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
 

@@ -63,6 +63,27 @@ class Other(NamedTuple):
         return self.lower <= 0.0 <= self.upper
 
 
+def robot_of(text: str) -> Element:
+    """Return the `robot` element of a URDF. Raises ParameterError for other texts, and where xacro has not run."""
+    try:
+        robot = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ParameterError("urdf", f"{text[:60].strip()} ...", f"well-formed XML ({error})") from None
+    if robot.tag != "robot":
+        raise ParameterError("urdf", f"<{robot.tag}>", "a URDF, whose outermost element is `robot` without a namespace")
+    if left := next((element.tag for element in robot.iter() if "xacro" in element.tag.partition("}")[0]), ""):
+        raise ParameterError("urdf", left, "a URDF without xacro elements: run xacro first")
+    return robot
+
+
+def _check_axes(robot: Element, names: Sequence[str]) -> None:
+    """Raise ParameterError if the axis of a joint of the arm has no direction: its torque would be 0."""
+    for joint in robot.iter("joint"):
+        axis = joint.find("axis")
+        if joint.get("name") in names and axis is not None and not any(map(float, axis.get("xyz", "1").split())):
+            raise ParameterError(f"axis of {joint.get('name')}", axis.get("xyz"), "a direction, as 0 1 0")
+
+
 class UrdfJoints:
     """How the joints of a URDF move: the arm's by themselves, mimic joints with them, others as is reported.
 
@@ -74,13 +95,13 @@ class UrdfJoints:
     """
 
     def __init__(self, pin: Pinocchio, text: str, joint_names: Sequence[str]) -> None:
+        self.root = robot_of(text)  #: the `robot` element
         try:
             self.model = pin.buildModelFromXML(text)
         except (RuntimeError, ValueError) as error:
-            expected = f"a URDF that Pinocchio reads, without xacro elements: run xacro first ({error})"
+            expected = f"a URDF that Pinocchio reads ({error})"
             raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
         self._pin = pin
-        self.root = ElementTree.fromstring(text)  #: the `robot` element
         self.names = tuple(joint_names)
         self._mimics = dict(_mimics(self.root))
         movable = {self.model.names[n]: joint for n, joint in enumerate(self.model.joints) if n and joint.nv == 1}
@@ -91,6 +112,7 @@ class UrdfJoints:
             if name not in turning:
                 expected = f"turning joints of the URDF ({', '.join(turning) or 'it has none'})"
                 raise ParameterError("joint_names", name, expected)
+        _check_axes(self.root, self.names)
         self._leaders = {name: self._leader(name) for name in movable}
         free = sorted({leader.joint for leader in self._leaders.values() if leader.joint in movable} - set(self.names))
         self._reported: set[str] = set()
@@ -245,6 +267,8 @@ class UrdfJoints:
             return Other(name, -math.pi, math.pi)
         limits = self.model.lowerPositionLimit, self.model.upperPositionLimit
         lower, upper = (float(limit[joint.idx_q]) for limit in limits)
+        if lower > upper:
+            raise ParameterError(f"limits of {name}", [lower, upper], "the lower one, then the upper one")
         return Other(name, max(lower, -LARGEST), min(upper, LARGEST))
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from exo_gravity.core.errors import named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, check_bridge, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, limits_of
 from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour, request_real_time
@@ -271,8 +271,6 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
     for node, values in bridges.items():
         with named(f"{node} "):
             rate, limits, buses = values["rate"], limits_of(values), traffic_of(values, can_options(nodes[node]))
-            for bus in buses.values():
-                check_bridge(rate, motors_of(values), limits, bus.status_rate)
             serials = serials_of(values["can.serial"], values["can.channel"], len(values["joint_names"]))
             address = values["can.interface"], values["can.channel"], can_options(nodes[node])
             arm = ArmOnBus(address, motors_of(values), limits, 1.0 / rate, serials=serials)

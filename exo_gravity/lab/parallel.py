@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Generic, TypeVar
 
+from exo_gravity.core.errors import ParameterError
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -70,11 +72,15 @@ def on_cluster(address: str, work: Callable[[Item], Result], items: Iterable[Ite
     """Yield the outcome of each item, worked on by the workers of the Dask scheduler at `address`.
 
     What a worker that dies was working on goes to another one; an item that ends several workers fails. Raises OSError
-    if no scheduler answers, ModuleNotFoundError without dask[distributed].
+    if no scheduler answers, ParameterError for what is no address, ModuleNotFoundError without dask[distributed].
     """
     import distributed
 
-    with distributed.Client(address, timeout=CONNECT) as client:
+    try:
+        connected = distributed.Client(address, timeout=CONNECT)
+    except ValueError as error:
+        raise ParameterError("scheduler", address, f"an address as tcp://HOST:8786 ({error})") from None
+    with connected as client:
         futures = {client.submit(work, item, pure=False): item for item in items}
         for future in distributed.as_completed(futures):
             yield _outcome(futures[future], future.result, distributed.KilledWorker)

@@ -4,6 +4,7 @@
 A human wearer reads the steps from the screen; the simulator's virtual wearer executes them.
 """
 
+import re
 from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS, floats, one_float
 
 MAX_DURATION = 3600.0  # s
+NAME = re.compile(r"\w[\w .+-]{0,63}")
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
 
 
@@ -82,10 +84,12 @@ class TrialScript:
         """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
         if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
             raise ParameterError("script", content, "a mapping with the keys name and steps only")
-        steps = content["steps"]
+        name, steps = str(content["name"]), content["steps"]
+        if not NAME.fullmatch(name):  # of the trial's folder
+            raise ParameterError("name", name, "1 to 64 letters, digits, spaces and . _ + -, a letter or digit first")
         if not isinstance(steps, list) or not steps:
             raise ParameterError("steps", steps, "a list of at least one step")
-        script = cls(str(content["name"]), tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
+        script = cls(name, tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))
         script.check(next((len(step.value) for step in script.steps if step.action in PER_JOINT), 0))
         return script
 

@@ -7,9 +7,11 @@ without them, and a missing one ends the tool with one line instead of a traceba
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable
 from importlib.util import find_spec
+from io import TextIOWrapper
 
 from exo_gravity.core.errors import ExoGravityError, with_extra
 from exo_gravity.lab.packages import extras
@@ -38,13 +40,39 @@ def positive(text: str) -> int:
 
 
 def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
-    """Return the exit code of `work`; where that raises an error, print it as one line and return 2."""
+    """Return the exit code of `work`; where that raises an error, print it as one line and return 2.
+
+    Ctrl-C is 130, and a reader that has seen enough, as `head`, is 141, as shells say of both. What the terminal's
+    encoding lacks is printed as its code.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with extras(tool, extra):
-            return work()
+            code = work()
+        if sys.stdout:
+            sys.stdout.flush()
+        return code
+    except KeyboardInterrupt:
+        print(f"{tool}: stopped", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        _give_up_output()
+        return 141
     except (ExoGravityError, OSError) as error:
         print(f"{tool}: {error}", file=sys.stderr)
+        _give_up_output()
         return 2
+
+
+def _give_up_output() -> None:
+    """Drop what cannot be printed: Python would try again at its end, with a traceback and an exit code of its own."""
+    try:
+        if sys.stdout:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def require_ros(tool: str) -> None:

@@ -9,15 +9,13 @@ Exit code 0: fine. 1: warnings. 2: no one may wear an arm that this computer con
 """
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.lab.findings import Finding, Level
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.tools.cli import extras, non_negative, require_ros
+from exo_gravity.tools.cli import exit_code, extras, non_negative, require_ros
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,16 +48,16 @@ def main(args: Sequence[str] | None = None, root: Path = Path("/")) -> int:
     """Run the command line; return the exit code. root: the folder that has /proc and /sys."""
     options = _arguments(args)
     require_ros("doctor")
-    with extras("doctor", "report"):
-        from rich.console import Console
+    return exit_code("doctor", "report", lambda: _run(options, root))
+
+
+def _run(options: argparse.Namespace, root: Path) -> int:
+    """Examine the computer, and print each finding and the verdict; return the exit code."""
+    from rich.console import Console
+
     with extras("doctor", "ros"):
         from exo_gravity.lab.computer import examine
-    try:
-        nodes = load(options.params or packaged_config("sim.yaml"))
-        findings = examine(nodes, options.seconds, root)
-    except ExoGravityError as error:
-        print(f"doctor: {error}", file=sys.stderr)
-        return 2
+    findings = examine(load(options.params or packaged_config("sim.yaml")), options.seconds, root)
     show(findings, Console(highlight=False))
     warnings, faults, unknown = (
         sum(row.level is level for row in findings) for level in (Level.WARNING, Level.FAULT, Level.UNKNOWN)

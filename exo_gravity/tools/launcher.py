@@ -1,6 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """launcher: starts one process per top-level key of the parameter file, and stops them all when one ends.
 
+A file with a parameter that a node of an arm or the IMU would refuse is refused before any starts.
+
 With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
 
 Exit code 0: stopped by Ctrl-C, SIGTERM or a closed terminal. 1: a node ended, or motors may still be powered. 2: wrong
@@ -15,8 +17,9 @@ from functools import partial
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
+from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
+from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, planned, stop_on_signals
 from exo_gravity.tools.cli import require_ros
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -59,6 +62,8 @@ def main(args: Sequence[str] | None = None) -> None:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
+        nodes, names, _ = planned(path, options.only, more)
+        check_nodes({node: nodes[node] for node in names})
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():

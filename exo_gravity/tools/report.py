@@ -12,6 +12,7 @@ use, or part of a recording could not be read; the rest is reported first.
 
 import argparse
 import math
+import os
 from collections.abc import Sequence
 from functools import partial
 from glob import glob
@@ -48,7 +49,9 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
         option(name, type=non_negative, default=default, metavar=unit, help=description)
     video.add_arguments(parser)
     options = parser.parse_args(args)
-    options.bag = [Path(found) for text in options.bag for found in sorted(glob(text)) or [text]]
+    # A name that exists is no pattern: `run[1]` is not `run1`.
+    texts = [[text] if os.path.lexists(text) else sorted(glob(text)) or [text] for text in options.bag]
+    options.bag = [Path(text) for found in texts for text in found]
     if options.repair and len(options.bag) > 1:
         parser.error("--repair takes one recording")
     return options
@@ -103,10 +106,14 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from exo_gravity.lab.bag.storage import check_name
     from exo_gravity.lab.parallel import in_processes, on_cluster
     from exo_gravity.lab.report import cohort, overview
 
-    recordings = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
+    found = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
+    recordings = [*{one.resolve(): one for one in found}.values()]  # one that is named twice is one trial
+    for recording in recordings:
+        check_name(recording)
     output.mkdir(parents=True, exist_ok=True)
     judging = cohort.Judging(criteria, options.min_hold, options.decimate)
     cache = cohort.Cache(output / "cohort_cache.jsonl", judging)

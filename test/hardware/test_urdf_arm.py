@@ -99,9 +99,15 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(sid
 
 
 @pytest.mark.parametrize(("text", "joint", "problem"), [
-    ("<robot", "j", "a URDF that Pinocchio reads"),
-    ("<sdf/>", "j", "a URDF that Pinocchio reads"),
+    ("", "j", r"well-formed XML \(no element found"),
+    ("<robot", "j", r"well-formed XML \(unclosed token"),
+    (2 * ONE_LINK.format(mass=1, kind="revolute"), "j", r"well-formed XML \(junk after document element"),
+    ("<sdf/>", "j", "<sdf>': must be a URDF, whose outermost element is `robot`"),
+    (ONE_LINK.replace("<robot ", "<robot xmlns='http://ros.org' "), "j", "without a namespace"),
     ("<robot xmlns:xacro='http://wiki.ros.org/xacro'><xacro:include/></robot>", "j", "run xacro first"),
+    (ONE_LINK.replace('lower="-1" upper="1"', 'lower="2" upper="-1"').format(mass=1, kind="revolute"), "j",
+     r"limits of j = \[2.0, -1.0\]: must be the lower one, then the upper one"),
+    (ONE_LINK.replace('xyz="0 1 0"', 'xyz="0 0 0"').format(mass=1, kind="revolute"), "j", "axis of j = '0 0 0'"),
     (ONE_LINK.format(mass=1, kind="prismatic"), "j", "it has none"),
     (ONE_LINK.format(mass=1, kind="revolute"), "k", r"turning joints of the URDF \(j\)"),
     (ONE_LINK.format(mass=0, kind="revolute"), "j", "above 0 kg"),

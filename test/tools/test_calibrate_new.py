@@ -69,6 +69,40 @@ def test_what_does_not_fit_is_refused_by_name(changes, problem, tmp_path, capsys
     assert not list(tmp_path.iterdir())
 
 
+LOWER, UPPER = 'lower="-0.1"', 'upper="2.4"'
+CHANGED = {  # of the elbow's description: what is written instead, the exit code, and what is said
+    "degrees": (
+        {LOWER: 'lower="-10"', UPPER: 'upper="150"'},
+        0,
+        "-10 to 150 rad, are cut to ±3.1: are they in deg",
+    ),
+    "no room": ({LOWER: 'lower="0"', UPPER: 'upper="0"'}, 0, "elbow: its limits, 0 to 0 rad, leave no room"),
+    "a formula": ({LOWER: 'lower="-pi/2"'}, 2, "limit lower of elbow = '-pi/2': must be a number of rad"),
+    "the wrong way": ({LOWER: 'lower="3"'}, 2, "limits of elbow = [3.0, 2.4]"),
+    "cut": ({"</robot>": ""}, 2, "must be well-formed XML"),
+    "no joint that turns": ({"revolute": "prismatic"}, 2, "the joints (none of the URDF turns)"),
+    **{name: ({'"elbow"': f"'{name}'"}, 0, "Written: ") for name in ("on", "a: [b]", "0x10", '"e"', "Arm für P01")},
+}
+
+
+@pytest.mark.parametrize(("changes", "code", "said"), CHANGED.values(), ids=CHANGED)
+def test_a_doubtful_description_is_named_and_any_name_of_a_joint_is_written_as_it_is(
+    changes, code, said, tmp_path, capsys
+):
+    text = packaged_config("arms/elbow.urdf").read_text(encoding="utf-8")
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "my arm.urdf").write_text(text, encoding="utf-8")
+    output = tmp_path / "arm.yaml"
+    given = ["--urdf", str(tmp_path / "my arm.urdf"), "--motors", "AK80-64", "--ids", "1", "--channel", "can0"]
+    assert main(["new", *given, "--output", str(output)]) == code
+    printed = capsys.readouterr()
+    assert said in printed.out + printed.err and output.exists() == (code == 0)
+    if said == "Written: ":
+        assert carried_arm(load(output), "/right").limits.joint_names == (changes['"elbow"'][1:-1],)
+
+
 def test_every_turning_joint_that_follows_no_other_is_one_of_the_arms():
     text, names = random_chain(3, seed=1)
     assert list(turning_joints(text)) == names

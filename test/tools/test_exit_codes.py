@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import importlib
+import io
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.lab.processes import node_modules
+from exo_gravity.tools.cli import exit_code
 
 from ..support import CONFIG
 from ..support.selection import UNDER_COLCON
@@ -92,6 +95,33 @@ def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, m
     said = capsys.readouterr().err
     assert code == 2 and (sentence in said or says_what_is_absent(said))
     assert f"{tool}: " in said.splitlines()[-1]
+
+
+def raised(error: type[BaseException]) -> int:
+    raise error
+
+
+@pytest.mark.parametrize(("output", "code", "said"), [("pipe", 141, ""), ("/dev/full", 2, "No space left on device")])
+def test_an_output_that_cannot_be_written_ends_with_a_code_and_no_traceback(output, code, said, monkeypatch, capsys):
+    if output == "pipe":
+        reader, descriptor = os.pipe()
+        os.close(reader)  # as `head` does
+    else:
+        descriptor = os.open(output, os.O_WRONLY)
+    stream = os.fdopen(descriptor, "w")
+    monkeypatch.setattr(sys, "stdout", stream)
+    assert exit_code("tool", "report", lambda: print("a table") or 0) == code
+    assert said in capsys.readouterr().err
+    stream.close()  # as Python does at its end
+
+
+def test_ctrl_c_is_one_line_and_a_terminal_without_a_character_shows_its_code(monkeypatch, capsys):
+    assert exit_code("tool", "report", lambda: raised(KeyboardInterrupt)) == 130
+    assert capsys.readouterr().err == "tool: stopped\n"
+    ascii_alone = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", ascii_alone)
+    assert exit_code("tool", "report", lambda: print("0.1 ± 0.2") or 0) == 0
+    assert ascii_alone.buffer.getvalue() == b"0.1 \\xb1 0.2\n"
 
 
 @pytest.mark.parametrize("tool", quick(["launcher"], WITHOUT))

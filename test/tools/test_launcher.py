@@ -106,6 +106,22 @@ def test_an_option_of_the_bus_without_an_entry_for_each_motor_is_named(refused):
     assert error.startswith("launcher: /right/can_bridge can.options.bitrate = [500000, 1000000]: must be one value")
 
 
+WRONG = {  # a node, its changes, and what it would say itself
+    "a mass": ("/right/compensator", {"robot": {"mass": [585.0] * 4}}, "robot.mass = [585.0"),
+    "a rate": ("/right/can_bridge", {"rate": 20.0}, "rate = 20.0: must be at least"),
+    "a torque": ("/right/can_bridge", {"max_effort": [18.0] * 4}, "at most the motors' peak torque"),
+    "a mounting": ("/imu", {"rotation_trunk_from_imu": [0.0] * 4}, "must be a unit quaternion"),
+    "a model": ("/right/compensator", {"law": "anfis", "anfis_file": "none.json"}, "anfis_file = 'none.json'"),
+    "a URDF": ("/arm/compensator", {"law": "urdf", "urdf": {"file": "none.urdf"}}, "urdf.file = 'none.urdf'"),
+}
+
+
+@pytest.mark.parametrize(("node", "changes", "said"), WRONG.values(), ids=WRONG)
+def test_a_parameter_that_a_node_would_refuse_is_refused_before_any_starts(refused, node, changes, said):
+    error = refused({node: changes})
+    assert error.startswith(f"launcher: {node} ") and said in error
+
+
 def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):
     for theirs in ("can_bridge", "can.py", "yaml.py"):  # python-can installs a can_bridge of its own
         (tmp_path / theirs).write_text(f"#!{sys.executable}\nraise SystemExit('another program')\n")

@@ -203,6 +203,13 @@ def test_a_limit_on_the_command_line_is_in_degrees(short_bag, tmp_path, limits, 
 # What was recorded in part
 
 
+def test_a_name_with_brackets_is_that_of_its_folder_and_no_pattern(tmp_path, capsys):
+    for name in ("run[1]", "run1"):
+        (tmp_path / name).mkdir()
+    assert main([str(tmp_path / "run[1]")]) == 2
+    assert "run[1]: must be a rosbag2 folder" in capsys.readouterr().err
+
+
 def test_a_recording_without_a_hold_is_reported_with_figures_and_1(page_of, tmp_path):
     report = analyse(made.bag_of(replace(made.trial(made.POSES, hold=0.5, rate=100.0), steps=())))
     assert report.exit_code == 1 and "never still" in page_of(report).text

@@ -74,8 +74,8 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     moved = np.degrees(np.ptp(np.vstack((np.zeros(4), made.POSES)), axis=0))
     first = [float(row["range_of_motion_deg"]) for row in rows if "day_0" in row["recording"]]
     np.testing.assert_allclose(first, moved, atol=0.5)
-    # Of whom nothing has changed nothing is read: its own summary would not be there.
-    assert main([str(trials), "--output", str(tmp_path / "out")]) == 2
+    # Of whom nothing has changed nothing is read: its own summary would not be there. Named twice, it is one trial.
+    assert main([str(trials), f"{trials}/.", "--output", str(tmp_path / "out")]) == 2
     assert "4 recordings had not changed" in capsys.readouterr().out
     assert csv_rows(tmp_path / "out" / "cohort.csv") == rows
 
@@ -133,6 +133,8 @@ def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, capsy
     assert main([str(trials), "--scheduler", "tcp://127.0.0.1:9"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("report: ") and "127.0.0.1:9" in line
+    assert main([str(trials), "--scheduler", "my cluster"]) == 2
+    assert "scheduler = 'my cluster': must be an address" in capsys.readouterr().err
 
 
 def test_a_move_along_a_bell_of_speed_is_smooth():

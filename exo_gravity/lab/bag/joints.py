@@ -5,7 +5,7 @@ Others publish there too: a gripper, or a driver of more joints. Messages are ke
 `arrays` takes those that have the joints of the arm.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,6 +73,15 @@ class GrowingSeries:
             column.resize((count, *column.shape[1:]), refcheck=False)  # nothing else refers to it: see the class
 
 
+def _problem(names: Sequence[str], given: Mapping[str, int]) -> str:
+    """Return why a message with these names, and so many values in each field, is no joint state."""
+    if not names:
+        return f"a joint state names no joint, and has {given} values"
+    if twice := [name for name in names if names.count(name) > 1]:
+        return f"a joint state names {twice[0]!r} twice: {', '.join(names)}"
+    return f"a joint state has {given} values for the joints {', '.join(names)}"
+
+
 class JointArrays:
     """Collects the joint states of one topic: `count`, and `by_joints`, in order of appearance.
 
@@ -93,7 +102,7 @@ class JointArrays:
             given = {field: numbers.dtype[field].shape[0] for field in FIELDS if field in (numbers.dtype.names or ())}
             if not names or len(set(names)) < len(names) or set(given.values()) - {len(names)}:
                 self.decoder.damaged += len(index)
-                self.decoder.problem = f"a joint state has {given} values for the joints {', '.join(names)}"
+                self.decoder.problem = _problem(names, given)
                 continue
             seen = self._seen.get(names, 0)
             self._seen[names] = seen + len(index)

@@ -8,7 +8,7 @@ Whether an arm was carried comes from the key `state` of its can_bridge on /diag
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
@@ -21,6 +21,7 @@ from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import MAX_EFFORT
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag import content
@@ -41,6 +42,7 @@ from exo_gravity.lab.bag.joints import FIELDS, JointArrays, JointSeries
 from exo_gravity.lab.bag.layout import TYPES, Batch, Decoder
 from exo_gravity.lab.bag.pairing import Thinning, arrival_of, clocks_of, efforts_in_force
 from exo_gravity.lab.bag.storage import Storage, StoredRows
+from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import recorded_parameters
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
 from exo_gravity.lab.trial.session import Session
@@ -58,6 +60,7 @@ PLAUSIBLE = Plausible()
 STATE_GAP = 1.0  # s; can_bridge reports its state twice a second, except while it ends
 KNOWN = (Source.SIMULATED, Source.REAL)
 LISTED_STEPS = 3  # of the clock, a note each
+LISTED_TOPICS = 20  # in a sentence: a robot's recording may have hundreds
 
 Row = tuple[int, int]  # number of a message in the recording, time of arrival in ns
 
@@ -73,9 +76,7 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
     contents.read(storage)
     states = sorted(name for name, joints in contents.joints.items() if leaf(name) == STATES and joints.count)
     if not states and not contents.problems:
-        problem = (
-            f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {', '.join(sorted(storage.topics))}"
-        )
+        problem = f"the recording has no topic {STATES} of type {JOINT_STATE}; it has {_listed(storage.topics)}"
         if not storage.topics or any(leaf(t) == STATES and kind == JOINT_STATE for t, kind in storage.topics.items()):
             problem = "the recording is empty: it has no messages"
         raise DataError(f"{path}: {'; '.join((problem, *contents.notes))}")
@@ -101,6 +102,13 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
         contents.is_partial, contents.session, markers, contents.trunk.rows(seconds), contents.tilt.rows(seconds),
         contents.sources,
     )  # fmt: skip
+
+
+def _listed(topics: Mapping[str, str]) -> str:
+    """Return the first topics with their types, and the number of the others."""
+    shown = [f"{topic} ({kind or 'of no type'})" for topic, kind in sorted(topics.items())]
+    others = len(shown) - LISTED_TOPICS
+    return ", ".join(shown[:LISTED_TOPICS]) + (f" and {others} more" if others > 0 else "")
 
 
 class _Seconds(NamedTuple):
@@ -292,7 +300,7 @@ class _Contents:
             try:
                 step = json.loads(message.data)
                 entry = row, str(step["action"]), float(step["duration"])
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 raise DataError(f"{topic}: invalid {STEPS} message") from None
             if not 0.0 <= entry[2] < math.inf:
                 raise DataError(f"{topic}: duration = {entry[2]}: must be a number of seconds, 0 or more")
@@ -311,12 +319,15 @@ class _Contents:
         elif topic == content.SESSION:
             try:
                 self.session = Session(**json.loads(message.data))
-            except (ValueError, TypeError, ParameterError):
+            except (ValueError, TypeError, RecursionError, ParameterError):
                 raise DataError(f"{topic}: invalid session") from None
         else:
             node = message.data.partition(":")[0].strip()
             try:
-                recorded_parameters(message.data, node)
+                if leaf(node) in ("compensator", BRIDGE):
+                    recorded_of({node: message.data}, arm_of(node), leaf(node))
+                else:
+                    recorded_parameters(message.data, node)
                 self.parameters[node] = message.data
             except DataError:
                 self._damaged[topic] = self._damaged.get(topic, 0) + 1
@@ -356,6 +367,8 @@ class _Contents:
         command, steps = self._commands(topic, names, clock, stamped, seconds.line), self._script(name, seconds)
         time = (clock - seconds.start) / 1e9
         position, velocity, effort = np.moveaxis(values, 1, 0)
+        self._forget_impossible(name, names, effort)
+        self._forget_impossible(f"{name} {COMMANDS}", names, command)
         try:
             recording = Recording(name, names, time, position, velocity, effort, command, steps)
         except DataError as error:
@@ -367,7 +380,8 @@ class _Contents:
         """Return which positions (n, joints) are those of an arm (n,); None if their unit is wrong, a problem."""
         finite = np.isfinite(position).all(axis=1)
         if not finite.any():
-            self.problems.append(f"{name}: no position is a number: must be in rad")
+            least = joints[int(np.argmin(np.isfinite(position).sum(axis=0)))]
+            self.problems.append(f"{name}: {least} has no position that is a number: must be in rad")
             return None
         beyond = np.abs(position) > PLAUSIBLE.angle
         far = finite & beyond.any(axis=1)
@@ -382,6 +396,20 @@ class _Contents:
             if wrong.any():
                 self.notes.append(f"{name}: joint states left out, a position {what}: {np.sum(wrong)}")
         return finite & ~far
+
+    def _forget_impossible(self, name: str, joints: Sequence[str], effort: np.ndarray) -> None:
+        """Set torques (n, joints) in Nm that no motor has to NaN, all of them if their unit is wrong, and note it."""
+        beyond = np.abs(effort) > MAX_EFFORT
+        if not beyond.any():
+            return
+        joint = int(np.argmax(beyond.sum(axis=0)))
+        largest = float(np.abs(effort[beyond[:, joint], joint]).max())
+        is_unit = beyond.any(axis=1).mean() > PLAUSIBLE.share
+        effort[np.ones_like(beyond) if is_unit else beyond] = np.nan
+        question = "; are they in mNm?" if is_unit else ""
+        self.notes.append(
+            f"{name}: torques left out: {joints[joint]} = {largest:.4g} Nm: must be within ±{MAX_EFFORT:g} Nm{question}"
+        )
 
     def _commands(
         self, states: str, names: Sequence[str], clock: np.ndarray, stamped: bool, line: Timeline

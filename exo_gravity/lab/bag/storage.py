@@ -38,6 +38,7 @@ from exo_gravity.lab.bag.clock import LATEST, SECOND
 from exo_gravity.lab.bag.layout import Batch, records_at
 
 MAGIC = b"\x89MCAP0\r\n"
+ROS_1_MAGIC = b"#ROSBAG"
 ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
@@ -51,6 +52,14 @@ ROWS = 20_000  # messages in a batch, at most
 KEPT_BATCHES = 16  # of an MCAP file, in memory at once: to release each costs more time
 CACHED_ROWS = 4_000  # of a database, at once: more leave the processor's cache before they are put together
 BLOCK = 2**20  # bytes that are decompressed at once
+KINDS = (".mcap", ".db3")
+COMPRESSED = (".zstd", ".zst")  # ends of the names of files that rosbag2, or a person, compressed
+ROS_1 = "is a ROS 1 recording: convert it with `rosbags-convert --src FILE.bag --dst FOLDER`"
+OTHERS = {  # what is said of other files, by the ends of their names
+    ".bag": ROS_1,
+    ".yaml": "must be the folder of the recording, with its .mcap or .db3 files",
+    **dict.fromkeys((".gz", ".bz2", ".xz", ".lz4", ".zip", ".tar", ".tgz", ".7z"), "is packed: unpack it first"),
+}
 REPAIRED = "_repaired"  # with which the names of complete copies end
 
 Wanted = Callable[[str, str], bool]  # (topic, type) -> whether to yield its messages
@@ -88,22 +97,26 @@ class Storage:
         self.cut_short: str | None = None
         self.damaged = 0
         self.notes: list[str] = []
+        check_name(path)
         if not self.path.exists():
             raise DataError(f"{path}: no such file or folder")
         here = sorted(self.path.iterdir(), key=_natural) if self.path.is_dir() else [self.path]
-        files = [f for f in here if f == self.path or (f.is_file() and not f.name.startswith("."))]
-        self.files = [file for file in files if file.suffix in (".mcap", ".db3", ".zstd")]
+        files = [f for f in here if f.is_file() and (f == self.path or not f.name.startswith("."))]
+        self.files = [file for file in files if kind_of(file)]
         if not self.files:
-            raise DataError(f"{path}: must be a rosbag2 folder with an .mcap or .db3 file, or such a file")
+            others = (OTHERS[file.suffix.lower()] for file in files if file.suffix.lower() in OTHERS)
+            expected = next(others, "must be a rosbag2 folder with an .mcap or .db3 file, or such a file")
+            raise DataError(f"{path}: {expected}")
         named = _named_files(self.path / "metadata.yaml") if self.path.is_dir() else []
         self.is_listed = bool(named)  # by metadata.yaml, or is the file that was asked for
         if named:
             self._keep(named)
 
     def _keep(self, named: Sequence[str]) -> None:
-        """Keep the files that metadata.yaml names; NAME.zstd stands for NAME."""
+        """Keep the files that metadata.yaml names; one that was compressed stands for its name."""
         found = {file.name: file for file in self.files}
-        chosen = [found.get(name) or found.get(f"{name}.zstd") for name in named]
+        forms = ("", *COMPRESSED)
+        chosen = [next((found[name + end] for end in forms if name + end in found), None) for name in named]
         if missing := [name for name, file in zip(named, chosen, strict=True) if file is None]:
             self.notes.append(f"metadata.yaml names {', '.join(missing)}, which is not there")
         if kept := [file for file in chosen if file]:
@@ -142,13 +155,11 @@ class Storage:
 
     def _of_file(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
         with ExitStack() as stack:
-            kind = file.suffix
             content = file
-            if kind == ".zstd":
-                kind = file.with_suffix("").suffix
+            if file.suffix.lower() in COMPRESSED:
                 content = Path(stack.enter_context(tempfile.TemporaryDirectory()), file.stem)
                 _decompress_file(file, content)
-            read = self._mcap if kind == ".mcap" else self._sqlite
+            read = self._mcap if kind_of(file) == ".mcap" else self._sqlite
             for rows in read(content, wanted):
                 if decompressed := self._decompressed(rows):
                     yield decompressed
@@ -177,8 +188,9 @@ class Storage:
 
     def _mcap(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
         with file.open("rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
-                raise DataError(f"{file}: not an MCAP file, or empty")
+            if (first := stream.read(len(MAGIC))) != MAGIC:
+                is_ros_1 = first.startswith(ROS_1_MAGIC)
+                raise DataError(f"{file}: {ROS_1 if is_ros_1 else 'not an MCAP file, or empty'}")
             data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         reading = _McapFile(self, wanted)
         for number, rows in enumerate(reading.rows(data, len(MAGIC)), 1):
@@ -217,8 +229,8 @@ class Storage:
         if not found:
             return
         numbers, stamps, data = zip(*found, strict=True)
-        if {*map(type, stamps)} != {int} or {*map(type, data)} != {bytes}:
-            whole = [row for row in found if type(row[1]) is int and type(row[2]) is bytes]
+        if {*map(type, numbers), *map(type, stamps)} != {int} or {*map(type, data)} != {bytes}:
+            whole = [row for row in found if type(row[0]) is type(row[1]) is int and type(row[2]) is bytes]
             self.damaged += len(found) - len(whole)
             yield from self._whole(whole, chosen)
             return
@@ -386,6 +398,20 @@ def _decompress_file(file: Path, content: Path) -> None:
     raise DataError(f"{file}: the compressed file is cut or damaged ({reason}): copy it again")
 
 
+def kind_of(file: Path) -> str:
+    """Return how the name of a recording's file ends, ".mcap" or ".db3", compressed or not; "" of any other file."""
+    name = file.with_suffix("") if file.suffix.lower() in COMPRESSED else file
+    return name.suffix.lower() if name.suffix.lower() in KINDS else ""
+
+
+def check_name(path: str | Path) -> None:
+    """Raise DataError unless the name of a recording is UTF-8, as are the reports that show it."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise DataError(f"{str(path)!a}: its name must be UTF-8: rename it") from None
+
+
 def _named_files(metadata: Path) -> list[str]:
     """Return the names of the files of a recording, of any version of metadata.yaml; [] if it is not readable."""
     try:
@@ -393,7 +419,7 @@ def _named_files(metadata: Path) -> list[str]:
             "relative_file_paths"
         ]
         return [Path(path).name for path in paths]
-    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError):
+    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, RecursionError):
         return []
 
 

@@ -153,7 +153,7 @@ def repair(path: str | Path) -> tuple[Path, int]:
     Raises DataError if the recording is not MCAP, has no message, or has been repaired before.
     """
     source = Storage(path)
-    if other := next((file for file in source.files if file.suffix != ".mcap"), None):
+    if other := next((file for file in source.files if file.suffix.lower() != ".mcap"), None):
         raise DataError(f"{other}: must be an .mcap file; try `ros2 bag reindex`")
     folder = source.path.resolve().with_name(f"{source.path.resolve().stem}{REPAIRED}")
     types, connections, count = get_typestore(Stores.ROS2_JAZZY), dict[str, Connection](), 0

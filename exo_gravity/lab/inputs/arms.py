@@ -7,7 +7,7 @@ unknown parameter is an error here too. Errors name node and parameter: `/right/
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -25,7 +25,7 @@ from exo_gravity.core.compensation.settings import (
     urdf_settings_of,
     urdf_table,
 )
-from exo_gravity.core.errors import ParameterError, named
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
@@ -198,13 +198,22 @@ def recorded_of(parameters: Mapping[str, str], arm: str, executable: str) -> dic
     """Return every parameter of the compensator or can_bridge of `arm` in a recording, {} if it has none of that node.
 
     parameters: YAML text by node. One that the recorded version lacked has its default, one that is gone its new name.
+
+    Raises DataError if the text is not that of parameters, or a value of another type or length.
     """
     node = node_of(arm, executable)
     if node not in parameters:
         return {}
     recorded = recorded_parameters(parameters[node], node)
     given = {new: plain for name, value in recorded.items() for new, plain in in_force(name, value).items()}
-    return {param.name: param.default for param in _table_of(executable, given)} | given
+    table = _table_of(executable, given)
+    for param in table:
+        if param.name in given:
+            try:  # a range may have been another one
+                replace(param, bounds=None, choices=(), required=False).check(given[param.name])
+            except ParameterError as error:
+                raise DataError(f"{node}: the recording has parameters of another form: {error}") from None
+    return {param.name: param.default for param in table} | given
 
 
 def fitting(node: str, values: dict[str, Any]) -> dict[str, Any]:

@@ -6,25 +6,37 @@ from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table, settings_of, urdf_table
+from exo_gravity.core.compensation.settings import (
+    COMPENSATOR,
+    compensator_table,
+    settings_of,
+    urdf_settings_of,
+    urdf_table,
+)
 from exo_gravity.core.errors import named
+from exo_gravity.core.motors.joint_motor import motors_of, traffic_of
 from exo_gravity.core.params import Param
-from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
+from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.arms import node_values, read_arm
-from exo_gravity.lab.inputs.parameter_file import Nodes
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options
 
 
 def check_nodes(nodes: Nodes) -> None:
     """Check the parameters of each node of an arm and of the IMU as the node does at its start. Raises ParameterError.
 
-    The URDF of `law: urdf` is left to the node, which may receive it from a topic.
+    The URDF of `law: urdf` is left to the node if it comes from a topic.
     """
     for node, given in nodes.items():
         namespace, _, name = node.rpartition("/")
         if name == "can_bridge":
-            node_values(nodes, node, CAN_BRIDGE)
+            values = node_values(nodes, node, CAN_BRIDGE)
+            with named(f"{node} "):
+                motors, limits = motors_of(values), limits_of(values)
+                for bus in traffic_of(values, can_options(given)).values():
+                    check_bridge(values["rate"], motors, limits, bus.status_rate)
         elif name == "imu":
             values = node_values(nodes, node, IMU)
             settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")
@@ -32,7 +44,10 @@ def check_nodes(nodes: Nodes) -> None:
                 TrunkEstimator(*(values[setting] for setting in settings))
         elif name == "compensator" and given.get("law") == URDF_LAW:
             table = urdf_table(given)
-            node_values({node: _of_urdf(given, table)}, node, table)
+            values = node_values({node: _of_urdf(given, table)}, node, table)
+            if values["urdf.file"]:
+                with named(f"{node} "):
+                    urdf_settings_of(values, arm_from(values, read_urdf(values["urdf.file"])))
         elif name == "compensator" and f"{namespace}/can_bridge" in nodes:
             read_arm(nodes, namespace).settings()
         elif name == "compensator":

@@ -56,7 +56,7 @@ def recorded_parameters(text: str, node: str) -> Mapping[str, Any]:
         given = yaml.load(text, Loader)[node]["ros__parameters"]
         if {*map(type, given.keys())} <= {str}:
             return MappingProxyType(given)
-    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError):
+    except (yaml.YAMLError, AttributeError, LookupError, TypeError, ValueError, RecursionError):
         pass
     raise DataError(f"{node}: the recording has no parameters of it that can be read")
 

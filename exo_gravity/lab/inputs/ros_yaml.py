@@ -6,8 +6,9 @@ string and a truth value, `1:30` a number and a string. The rules here are those
 takes C's `strtol` with base 0, then `strtod`. test/nodes/test_parameter_file.py compares both on a real node.
 
 What rcl reads in a way that nobody means is refused, with its line: a key that is given twice (rcl merges), anchors and
-aliases (rcl ends at an alias), wildcards in a node's name (rcl applies them, no tool does), values and lists that are
-empty, lists in lists. An empty mapping, at which rcl ends, is no parameter: the launcher hands nodes a copy without it.
+aliases (rcl ends at an alias), wildcards in a node's name (rcl applies them, no tool does), names that no node can
+have, whole numbers that a leading 0 makes octal (`010` is 8), values and lists that are empty, lists in lists. An empty
+mapping, at which rcl ends, is no parameter: the launcher hands nodes a copy without it.
 """
 
 import math
@@ -33,7 +34,9 @@ INTEGER = re.compile(r"([+-]?)(?:0[xX]([0-9a-fA-F]+)|(0[0-7]*)|([1-9][0-9]*))")
 DECIMAL = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 HEXADECIMAL = re.compile(r"[+-]?0[xX](?:[0-9a-fA-F]+\.?[0-9a-fA-F]*|\.[0-9a-fA-F]+)(?:[pP][+-]?[0-9]+)?")
 C_NOT_FINITE = re.compile(r"[+-]?(?:inf|infinity|nan(?:\(\w*\))?)", re.IGNORECASE)
+OCTAL = re.compile(r"[+-]?0+[1-7][0-7]+")  # of 8 or more: not the number that its digits show
 LARGEST_INTEGER = 2**63 - 1
+NODE = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")  # rmw's rule for the names of nodes and namespaces
 
 STRING = "tag:yaml.org,2002:str"  # !!str, the one tag that rcl minds
 
@@ -98,6 +101,9 @@ class _Reader:
             self._refuse(node, "the full name of one node: wildcards are not applied", line)
         if not node.startswith("/") or node.endswith("/"):
             raise ParameterError("node name", node, f"fully qualified, as in {FORM} (line {line})")
+        if not NODE.fullmatch(node):
+            expected = f"of letters A-Z, digits and _, no part of it empty or with a digit first (line {line})"
+            raise ParameterError("node name", node, expected)
 
     def _parameters(self, node: str) -> dict[str, Any]:
         """Return the parameters of one node by their dotted names."""
@@ -159,6 +165,9 @@ class _Reader:
         text, is_quoted = self._next.value, self._next.style in ("'", '"') or self._next.tag == STRING
         if not text and not is_quoted:
             raise ParameterError(name, None, f"given a value, or left out (line {self._line})")
+        if not is_quoted and OCTAL.fullmatch(text):
+            number = text.lstrip("+-0")
+            self._refuse(f"{name} {text}", f"{number} or {int(number, 8)}: with a leading 0, ROS reads it as octal")
         self._advance()
         return text if is_quoted else scalar(text)
 

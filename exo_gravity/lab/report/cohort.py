@@ -20,13 +20,12 @@ import numpy as np
 
 from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.lab.bag.storage import REPAIRED, Storage
+from exo_gravity.lab.bag.storage import REPAIRED, Storage, kind_of
 from exo_gravity.lab.parallel import Outcome
 from exo_gravity.lab.report.smoothness import spectral_arc_length
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording
 
-SUFFIXES = (".mcap", ".db3", ".zstd")
 SPEED_RATE = 50.0  # Hz, at which the speed of a movement is taken
 BLOCK = 2**22  # bytes that are hashed at once
 COLUMNS = (
@@ -53,7 +52,7 @@ def recordings_below(path: Path) -> list[Path]:
 
     Copies that `report --repair` wrote are left out where what they are copies of is there.
     """
-    files = (file for file in path.rglob("*") if file.suffix in SUFFIXES and not file.name.startswith("."))
+    files = (file for file in path.rglob("*") if kind_of(file) and file.is_file() and not file.name.startswith("."))
     folders = {file.parent for file in files if not file.parent.name.startswith(".")}
     repaired = {folder for folder in folders if folder.name.endswith(REPAIRED)}
     copies = {f for f in repaired if folders & {f.parent, f.with_name(f.name.removesuffix(REPAIRED))}}

@@ -66,6 +66,8 @@ class Recording:
                 raise DataError(f"{self.name}: shape of {field} = {getattr(self, field).shape}: must be {shape}")
         if len(self.time) < 2:
             raise DataError(f"{self.name}: {len(self.time)} samples: must be at least 2")
+        if self.time[-1] == self.time[0]:
+            raise DataError(f"{self.name}: all {len(self.time)} samples have the same time: it must advance")
         if np.any(np.diff(self.time) < 0):
             raise DataError(f"{self.name}: time decreases between two samples: must be in ascending order")
         if not np.all(np.isfinite(self.position)):

@@ -24,6 +24,7 @@ from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.vocabulary import NONE
+from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, Stopping
@@ -60,11 +61,12 @@ def is_guided(params: Path) -> bool:
 
 
 def check_bridges(params: Path) -> None:
-    """Raise ParameterError unless the parameter file has a can_bridge: a trial follows the arm that it carries."""
+    """Raise ParameterError unless the parameter file has a can_bridge, whose arm a trial follows, and its nodes fit."""
     nodes = load(params)
     if not stages(nodes)[0]:
         expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
         raise ParameterError("params", str(params), expected)
+    check_nodes(nodes)
 
 
 @dataclass(frozen=True)

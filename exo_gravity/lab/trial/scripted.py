@@ -35,7 +35,7 @@ def read_script(name: str) -> tuple[Path, TrialScript]:
     path = packaged.get(name, Path(name))
     try:
         return path.resolve(), TrialScript.parse(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise ParameterError("trial", name, f"a readable YAML file ({reason})") from None
 

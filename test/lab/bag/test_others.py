@@ -6,12 +6,15 @@ Each kind comes from a public report. What was recorded is known, so is the verd
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import sqlite3
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import zstandard
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
@@ -255,7 +258,113 @@ def test_a_write_ahead_log_on_a_read_only_medium_is_read(tmp_path):
     made.assert_same(read.recordings[0], TRIAL)
 
 
+OTHER_FILES = {  # by its name: how a file that is no recording begins, and what is said of it
+    "old.bag": (b"#ROSBAG V2.0\n", "is a ROS 1 recording: convert it"),
+    "old.mcap": (b"#ROSBAG V2.0\n", "is a ROS 1 recording: convert it"),
+    "bag.mcap.gz": (b"\x1f\x8b", "is packed: unpack it first"),
+    "metadata.yaml": (b"rosbag2_bagfile_information:", "must be the folder of the recording"),
+    "bag.zstd": (b"\x28\xb5\x2f\xfd", "must be a rosbag2 folder"),
+    "table.csv": (b"time,a", "must be a rosbag2 folder"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_FILES)
+def test_another_file_is_refused_with_what_it_is_alone_and_in_a_folder(tmp_path, name):
+    begin, said = OTHER_FILES[name]
+    file = tmp_path / name
+    file.write_bytes(begin + bytes(100))
+    for path in (file, tmp_path):
+        with pytest.raises(DataError, match=f"^{path}.*: {said}"):
+            read_bag(path)
+
+
+def test_a_pipe_and_a_device_are_refused_instead_of_read_for_ever(tmp_path):
+    os.mkfifo(tmp_path / "pipe.mcap")
+    (tmp_path / "zeros.db3").symlink_to("/dev/zero")
+    for name in ("pipe.mcap", "zeros.db3"):
+        with pytest.raises(DataError, match="must be a rosbag2 folder"):
+            read_bag(tmp_path / name)
+
+
+def test_names_in_capitals_and_files_that_a_person_compressed_are_read(tmp_path):
+    bag = made.write_bag(tmp_path / "bag", CONTENT)
+    capitals, compressed = tmp_path / "BAG.MCAP", bag / "bag.mcap.zst"
+    (bag / "bag.mcap").rename(capitals)
+    compressed.write_bytes(zstandard.compress(capitals.read_bytes()))
+    for path in (capitals, compressed, bag):
+        read = read_bag(path)
+        made.assert_same(read.recordings[0], TRIAL)
+        assert not any("metadata" in note for note in read.notes)
+
+
+def test_a_name_that_is_not_utf_8_is_refused_before_a_report_is_half_written(tmp_path):
+    folder = made.write_bag(tmp_path / "bag", CONTENT).rename(tmp_path / os.fsdecode(b"m\xfcller"))
+    with pytest.raises(DataError, match=r"udcfcller': its name must be UTF-8: rename it"):
+        read_bag(folder)
+
+
+def test_a_database_whose_rows_name_their_topics_by_texts_is_damaged(tmp_path):
+    file = made.write_bag(tmp_path / "bag", CONTENT, StoragePlugin.SQLITE3) / "bag.db3"
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.executescript(
+            "CREATE TABLE others AS SELECT id, CAST(topic_id AS TEXT) AS topic_id, timestamp, data FROM messages; "
+            "DROP TABLE messages; ALTER TABLE others RENAME TO messages;"
+        )
+    with pytest.raises(DataError, match=f"the recording is damaged: parts left out: {len(CONTENT)}"):
+        read_bag(file)
+
+
 # What is on the topics
+
+
+def test_a_joint_that_is_named_twice_and_one_without_a_position_are_named(tmp_path):
+    def states(names, last):
+        for time, pose in zip(TRIAL.time, TRIAL.position, strict=True):
+            stamp = made.START + round(float(time) * SECOND)
+            yield STATES, made.JOINT_STATE, stamp, made.joint_state(stamp, names, [*pose[:3], last])
+
+    with pytest.raises(DataError, match="names 'right_joint_1' twice"):
+        read_bag(made.write_bag(tmp_path / "twice", states((made.NAMES[0], *made.NAMES[:3]), 0.0)))
+    with pytest.raises(DataError, match="right: right_joint_4 has no position that is a number"):
+        read_bag(made.write_bag(tmp_path / "nan", states(made.NAMES, np.nan)))
+
+
+def test_joint_states_that_all_have_the_same_time_are_no_arm_that_was_never_held(tmp_path):
+    content = [(topic, kind, made.START, data) for topic, kind, _, data in CONTENT]
+    with pytest.raises(DataError, match="right: all 800 samples have the same time"):
+        read_bag(bag_in_order(tmp_path / "bag", content))
+
+
+def test_torques_that_no_motor_has_are_left_out_and_named(tmp_path):
+    for name, scale, lost in (("all", np.full(len(TRIAL.time), 1000.0), 1.0), ("one", np.ones(len(TRIAL.time)), 0.0)):
+        scale[300] = 1e30
+        trial = replace(TRIAL, effort=TRIAL.effort * scale[:, None], command=TRIAL.command * scale[:, None])
+        read = read_bag(made.write_bag(tmp_path / name, made.messages(trial)))
+        (arm,) = read.recordings
+        assert np.isnan(arm.effort).mean() == pytest.approx(lost, abs=0.002)
+        notes = [note for note in read.notes if "torques left out: " in note]
+        assert len(notes) == 2 and all(("are they in mNm?" in note) == (name == "all") for note in notes)
+
+
+OF_ANOTHER_FORM = {
+    "text": "{support: lots}", "mapping": "{can.interface: socketcan, can.channel: {a: 1}}", "number": "{law: 7}",
+    "other joints": "{robot.mass: [1.0, 2.0]}", "file": "{law: urdf, urdf.file: 7, joint_names: [a]}",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("values", OF_ANOTHER_FORM.values(), ids=OF_ANOTHER_FORM)
+def test_recorded_parameters_of_another_form_are_left_out_and_the_recording_is_reported(tmp_path, values):
+    node = "/right/can_bridge" if "can." in values else "/right/compensator"
+    given = made.text_entry("/recorder/parameters", 0.0, f"{node}: {{ros__parameters: {values}}}")
+    report, arm, _ = report_of(made.write_bag(tmp_path / "bag", [*CONTENT, given]))
+    made.assert_same(arm, TRIAL)
+    assert "/recorder/parameters: damaged messages left out: 1" in report.notes and not report.bag.parameters
+
+
+@pytest.mark.parametrize("topic", ["/recorder/session", "/right/wearer_step"])
+def test_texts_that_nest_too_deep_are_a_problem_and_no_traceback(tmp_path, topic):
+    read = read_bag(made.write_bag(tmp_path / "bag", [*CONTENT, made.text_entry(topic, 3.0, "[" * 100_000)]))
+    assert len(read.problems) == 1 and read.problems[0].startswith(f"{topic}: invalid")
 
 
 def test_degrees_are_refused_and_a_single_impossible_angle_is_left_out(tmp_path):
