@@ -131,11 +131,6 @@ def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
     assert abs(np.degrees(arm.positions[joint] - stop)) < 1.0
 
 
-def test_each_joint_has_a_range_of_190_degrees():
-    config = ArmConfig()
-    np.testing.assert_allclose(np.degrees(np.subtract(config.position_max, config.position_min)), 190.0)
-
-
 def test_reset_puts_the_arm_at_rest_in_a_pose():
     arm = SimulatedArm()
     arm.reset(RAISED)

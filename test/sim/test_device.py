@@ -18,13 +18,6 @@ from exo_gravity.sim.script import TrialScript
 from ..support.simulated_device import RAISED, SPECS, command, make_device
 
 
-def test_a_motor_answers_only_to_its_own_id():
-    device = make_device(ids=(11, 12, 13, 14))
-    assert device.exchange(1, ENTER) is None
-    can_id, data = device.exchange(13, ENTER)
-    assert (can_id, unpack_reply(SPECS[2], data).motor_id) == (13, 13)
-
-
 def test_a_reply_has_the_present_position_and_velocity():
     device = make_device()
     device.arm.reset(RAISED)
@@ -106,13 +99,22 @@ def test_the_wearer_starts_after_the_delay():
     np.testing.assert_allclose(device.arm.positions, RAISED, atol=0.03)
 
 
-def test_on_a_silent_bus_the_motors_keep_their_last_command():
+@pytest.mark.parametrize(("fault", "of_joint_1"), [("bus_silent", True), ("cut_off", (True, False, False, False))])
+def test_a_motor_that_no_frame_reaches_keeps_its_last_command(fault, of_joint_1):
     device = make_device()
     device.exchange(1, ENTER)
     device.exchange(1, command(0, 2.0))
-    device.bus_silent = True
+    setattr(device, fault, of_joint_1)
     assert device.exchange(1, command(0, 0.0)) is None
     assert device.motors[0].torque(0.0, 0.0) == pytest.approx(2.0, abs=0.01)
+    assert (device.exchange(3, ENTER) is None) is (fault == "bus_silent")
+
+
+def test_an_encoder_error_shifts_the_angle_that_a_motor_replies():
+    device = make_device()
+    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
+    reply = unpack_reply(SPECS[1], device.exchange(2, command(1))[1])
+    assert reply.position == pytest.approx(0.698, abs=0.001)
 
 
 def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
