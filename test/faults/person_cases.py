@@ -23,7 +23,7 @@ from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from ..support.launched_nodes import LaunchedNodes, Parameters, executable
+from ..support.launched_nodes import Parameters, executable
 from .actions import CUT, ERROR, NO_ERROR, RELEASE, in_turn, pause, publish, simulator, stamped, wearer
 from .bus_cases import stays_off
 from .command_cases import stopped_for
@@ -67,18 +67,13 @@ class AskingRig(WearerRig):
 class AdaptiveRig(WearerRig):
     """Zero-G with a support that adapts, and the node `wearer`, which asks for it."""
 
+    wearer = True
     compensator: ClassVar[Parameters] = {**WearerRig.compensator, "support": 0.5, "support_adapts": True}
     # The wearer carries half of their arm themselves, so that a support of one half holds it.
     simulator: ClassVar[Parameters] = {
         **WearerRig.simulator,
         "wearer": {"mass": (0.5 * WORN_MASS).tolist(), "cog": WORN_COG.tolist()},
     }
-
-    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {"rate": self.rate}
-        nodes = self._nodes(without=("simulator",), port=port, can_bridge=bridge, compensator=self.compensator)
-        nodes.wearer = True
-        return [nodes]
 
 
 def ask(rig: Rig, service_type: Any, name: str, request: Any) -> None:
