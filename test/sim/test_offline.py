@@ -40,13 +40,17 @@ LIMITS = Limits(
     sign_check_torque=0.0,
 )
 ONE_G = Settings("right", DEFAULT_LINKS)
+BENT = (0.1, -0.06)  # rad
 DELAY = 2.5  # s after the motors are switched on, in which they ramp in
 
 
-def make(true=None, assumed=ONE_G, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT):
-    """Return a trial of a simulated arm that is as `true`, whose controller has the settings `assumed`."""
+def make(true=None, assumed=ONE_G, tilt=BENT, ids=(1, 2, 3, 4), script=SCRIPT):
+    """Return a trial of a simulated arm that is as `true`, whose controller has the settings `assumed`.
+
+    tilt: of the trunk, rad; None: it is not measured.
+    """
     device = SimulatedDevice(SimulatedArm(true), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
-    device.pitch, device.roll = 0.1, -0.06
+    device.pitch, device.roll = tilt or BENT
     motors = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
     arm = ArmSetup("right", device, motors, LIMITS, assumed, 125.0, tilt and resting(*tilt))
     return OfflineTrial(arm, script, DELAY)
@@ -78,7 +82,7 @@ def test_zero_g_holds_a_wearers_arm_for_10_s_within_a_sixth_of_a_degree_by_masse
     assumed = Settings("right", robot, mode="zero_g", support=1.0, wearer_mass=mass, wearer_cog=cog)
     steps = [{"move": [0.2, 0.35, -0.2, 0.9], "over": 3.0}, {"hold": 10.0}]  # where the rated torques carry both arms
     script = TrialScript.parse({"name": "release", "steps": steps})
-    trial = make(ArmConfig(wearer_mass=1.03 * mass, wearer_cog=cog), assumed, script=script)
+    trial = make(ArmConfig(wearer_mass=1.03 * mass, wearer_cog=cog), assumed, (0.06, -0.04), script=script)
     position = held(trial.run())
     assert np.degrees(np.abs(position - position[0]).max()) < 0.5 / 3.0
     assert trial.trouble == ""
