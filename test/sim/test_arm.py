@@ -44,14 +44,6 @@ def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt(side):
         np.testing.assert_allclose(arm.weight, arm.data.qfrc_bias, atol=1e-12)
 
 
-def test_the_static_torque_of_a_worn_arm_includes_the_wearers_arm():
-    mass, cog = (0.0, 0.0, 2.0, 1.7), (0.0, 0.0, 0.16, 0.2)
-    arm = SimulatedArm(ArmConfig(wearer_mass=mass, wearer_cog=cog))
-    arm.reset(RAISED)
-    expected = gravity_torque(arm.config.links.with_wearer(mass, cog), RAISED)
-    np.testing.assert_allclose(arm.data.qfrc_bias, expected, atol=1e-12)
-
-
 def test_centres_of_gravity_off_the_links_axes_add_the_torques_of_their_moments():
     rng = np.random.default_rng(2)
     links = SimulatedArm().config.links
