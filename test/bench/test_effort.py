@@ -3,16 +3,14 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bench.effort.exertion import MIDDLE, POSES, RATE, REACH, TASKS, Exertion, Sweep, Task, exertion_of, measure
+from bench.effort.exertion import MIDDLE, POSES, RATE, REACH, Sweep, Task, exertion_of, measure
 from bench.effort.holds import hold, perturbed_arm
-from bench.effort.report import Results, comparisons, figure, tables, write_csv
 from bench.effort.study import NOTHING, ONE_G, ZERO_G, Study
 from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
@@ -112,21 +110,3 @@ def test_an_arm_with_friction_and_inertia_creeps_less_than_a_fifth_of_a_degree_p
 
 def test_an_arm_whose_wearer_is_a_tenth_heavier_than_known_is_seen_to_fall():
     assert hold(perturbed_arm(0, wearer_error=0.9), POSES.poses[9], 3.0)[0] > 10.0
-
-
-def test_tables_files_and_comparisons_hold_what_was_measured(tmp_path):
-    exertions = {}
-    for n, setting in enumerate((NOTHING, ONE_G, ZERO_G)):
-        for task in TASKS:
-            felt = (0.3, 0.2, 0.01) if task.name.startswith("sweep") else None
-            exertions[setting, task.name] = Exertion(np.full(4, 4.0 - n), np.full(4, 8.0), 1.5, 60.0, felt, 5.0 - n)
-    results = Results(exertions, {(setting, 0.5): 0.1 for setting in (ONE_G, ZERO_G)})
-    assert [table.row_count for table in tables(results)] == [3, 3, 3, 2]
-    text = "\n".join(comparisons(results))
-    assert "One-G saves 25 %, Zero-G 50 %" in text and "Zero-G 3.00 Nm, One-G 4.00 Nm: the same order" in text
-    write_csv(results, tmp_path)
-    with (tmp_path / "exertion.csv").open() as file:
-        written = list(csv.DictReader(file))
-    assert len(written) == len(exertions)
-    assert written[0]["rms_elbow_nm"] == "4.0" and written[2]["inertia_kg_m2"] == "0.3"
-    figure(results).savefig(tmp_path / "effort.png")

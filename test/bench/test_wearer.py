@@ -14,7 +14,6 @@ from bench.wearer.devices import draw, holding, simulated
 from bench.wearer.muscles import ACTIVATION, DELAY, Muscles, Phase, phase_at
 from bench.wearer.report import verdict
 from bench.wearer.strapped_arm import RHYTHM, StrappedArm
-from bench.wearer.straps import TIED, table
 from bench.wearer.study import KINDS, Trial
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
@@ -151,13 +150,6 @@ def test_a_strapped_arm_is_held_by_the_torque_of_both_arms_and_its_shoulder_rise
     arm.data.qfrc_applied[7:] = (0.0, 3.0, 0.0, 0.0)  # the wearer's muscles lift both arms by the straps
     arm.step(torque, 250)
     assert arm.positions[1] > POSE[1] + 0.05
-
-
-def test_the_table_of_straps_has_a_row_for_each_tie():
-    trial = judge_of_constant(0.5)
-    lines = table([[*[trial] * (len(TIED) - 1), replace(trial, true_share=0.7)]]).splitlines()
-    assert len(lines) == 2 + len(TIED) and "0.50 0.50 0.50 0.50" in lines[2]
-    assert "-20.0" in lines[-1] and "+0.0" in lines[2]
 
 
 def judge_of_constant(error: float) -> Trial:

@@ -51,6 +51,7 @@ from .actions import (
     states_at,
     tilt,
     trunk_imu,
+    wearer,
 )
 from .bus_cases import OWNERSHIP, SUPPLY, TWO_BUSES, V3_BOARDS
 from .command_cases import CLOCK, EFFORT_COMMANDS, MONITOR, RIDES
@@ -105,8 +106,7 @@ def not_thrown_back(records: np.ndarray) -> str:
 
 
 def push_elbow(rig: Rig) -> None:
-    script = rig.write_script("push", [{"push": [0.0, 0.0, 0.0, 0.5], "over": 0.2}, {"hold": 600.0}])
-    assert rig.probe.set_parameters("simulator", trial=str(script)).successful
+    wearer(rig, [{"push": [0.0, 0.0, 0.0, 0.5], "over": 0.2}, {"hold": 600.0}])
 
 
 # fmt: off

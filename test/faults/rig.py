@@ -34,7 +34,6 @@ from ..support.truth import Truth
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
 CARRY_LIMIT = 60.0  # s for the nodes to start and bring the arm to a stage
-SIMULATOR = ("simulator",)
 CARRYING = ("active", "ramping in", "proving signs")
 
 
@@ -45,10 +44,11 @@ class Rig:
     struck: the joint (0..) whose motor is the one that fails; it carries much of the arm's weight.
     bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. one_process:
     whether can_bridge and compensator of an arm share a process, in every rig of a run. two_buses: whether motors 3 and
-    4 are on a second bus.
+    4 are on a second bus. without: nodes that do not run, or not with the bridge. wearer: whether `wearer` runs.
     """
 
-    one_process = two_buses = False
+    one_process = two_buses = wearer = False
+    without: Sequence[str] = ("simulator",)
     base = "sim.yaml"
     rate = 250.0  # Hz
     pose: Sequence[float] = RAISED
@@ -101,8 +101,9 @@ class Rig:
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
-        bridge = {"rate": self.rate, **self.bridge}
-        return [self._nodes(without=SIMULATOR, port=port, can_bridge=bridge, compensator=self.compensator)]
+        changes = {"can_bridge": {"rate": self.rate, **self.bridge}, "compensator": self.compensator}
+        changes = {node: values for node, values in changes.items() if node not in self.without}
+        return [self._nodes(without=self.without, port=port, wearer=self.wearer, **changes)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
         share: dict[str, Any] = {"one_process": self.one_process, "two_buses": self.two_buses}

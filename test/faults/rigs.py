@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY
 
 from ..support import CONFIG, ROOT
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
@@ -29,9 +29,8 @@ from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .injected import injected
 from .players import BE_SOUND, EFFORTS, OPERATOR
-from .rig import CARRY_LIMIT, NEAR, SIMULATOR, Rig
+from .rig import CARRY_LIMIT, NEAR, Rig
 
-NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 UPRIGHT: Parameters = {"trunk": {"pitch": 0.0, "roll": 0.0}}
 COMPENSATOR = load(CONFIG / "sim.yaml")["/right/compensator"]
 ROBOT = ArmModel(*(COMPENSATOR[name] for name in ("link_length", "robot.cog", "robot.mass")))
@@ -87,6 +86,7 @@ class CommandedRig(Rig):
 
     rate = 100.0
     pose = (0.0, 0.6, 0.0, 0.3)  # soon down: these rows are about what is refused
+    without = ("compensator", "imu", "simulator")
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
@@ -95,10 +95,6 @@ class CommandedRig(Rig):
         self._publisher = self.probe.node.create_publisher(JointState, "/right/effort_commands", 1)
         self.probe.node.create_subscription(JointState, "/right/joint_states", self._on_joint_states, NEWEST_ONLY)
         self.probe.executor.wake()
-
-    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {"rate": self.rate, **self.bridge}
-        return [self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)]
 
     def _on_joint_states(self, state: JointState) -> None:
         message = JointState(header=state.header, name=state.name)
@@ -114,6 +110,9 @@ class CommandedRig(Rig):
 class ExternalClockRig(Rig):
     """Bridge and compensator use /clock, which this process publishes, `clock_offset` s off the system's clock."""
 
+    without = ("imu", "simulator")
+    bridge: ClassVar[Parameters] = {"use_sim_time": True}
+    compensator: ClassVar[Parameters] = {"use_sim_time": True, **NO_IMU}
     simulator: ClassVar[Parameters] = UPRIGHT
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
@@ -122,11 +121,6 @@ class ExternalClockRig(Rig):
         self._publisher = self.probe.node.create_publisher(Clock, "/clock", 10)
         self.probe.node.create_timer(0.002, self._publish_clock)
         self.probe.executor.wake()
-
-    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        clock = {"use_sim_time": True}
-        compensator, bridge = {**clock, **NO_IMU}, clock
-        return [self._nodes(without=("imu", "simulator"), port=port, compensator=compensator, can_bridge=bridge)]
 
     def _publish_clock(self) -> None:
         fraction, seconds = math.modf(time.time() + self.clock_offset)
@@ -138,7 +132,7 @@ class LauncherRig(Rig):
 
     def _make_nodes(self, port: int) -> list[LaunchedNodes]:
         self._launcher = LauncherProcess(
-            self.folder, without=SIMULATOR, port=port, timing=self.timing, one_process=self.one_process
+            self.folder, without=self.without, port=port, timing=self.timing, one_process=self.one_process
         )
         return [self._launcher]
 
@@ -232,12 +226,9 @@ class HeldRig(PlayedRig):
 class AssistedRig(PlayedRig):
     """A separate process assists the arm by `EFFORTS`."""
 
+    without = ("imu", "simulator")
+    compensator: ClassVar[Parameters] = {**NO_IMU, "assist": {"max_effort": [1.0] * 4}}
     simulator: ClassVar[Parameters] = UPRIGHT
-
-    def _make_nodes(self, port: int) -> list[LaunchedNodes]:
-        bridge = {"rate": self.rate}
-        compensator = {**NO_IMU, "assist": {"max_effort": [1.0] * 4}}
-        return [self._nodes(without=("imu", "simulator"), port=port, can_bridge=bridge, compensator=compensator)]
 
     def bring_to(self, stage: str) -> None:
         """Bring the arm to `stage`, with the outer loop's efforts in full."""

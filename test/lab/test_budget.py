@@ -42,22 +42,16 @@ def needs(support=1.0, tilt=20.0, rated=RATED, peak=PEAK, robot=ROBOT):
 
 
 @pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
-def test_each_joints_largest_torque_is_that_of_the_straight_horizontal_arm(support):
-    carrying = ROBOT.with_wearer(*LOAD, support)
-    _, m2, m3, m4 = (carrying.gravity * moment for moment in carrying.first_moment)
+def test_each_joints_largest_torque_is_that_of_the_straight_horizontal_arm_and_joint_1_feels_a_tilted_trunk(support):
+    carrying, tilt = ROBOT.with_wearer(*LOAD, support), math.radians(20.0)
+    m1, m2, m3, m4 = (carrying.gravity * moment for moment in carrying.first_moment)
     expected = [0.0, m2 + m3 + m4, m3 + m4, m4]
     assert [joint.torque for joint in needs(support, tilt=0.0)] == pytest.approx(expected, abs=2e-3)
+    horizontal = math.sqrt(1 - Tilt.of("left", tilt, tilt).direction[2] ** 2)
+    assert needs(support)[0].torque == pytest.approx((m1 + m2 + m3 + m4) * horizontal, abs=2e-3)
 
 
-def test_joint_1_of_a_tilted_trunk_needs_the_horizontal_part_of_gravity_times_the_whole_moment():
-    carrying = ROBOT.with_wearer(*LOAD)
-    tilt = math.radians(20.0)
-    down = Tilt.of("left", tilt, tilt).direction[2]
-    whole = carrying.gravity * sum(carrying.first_moment) * math.sqrt(1 - down**2)
-    assert needs()[0].torque == pytest.approx(whole, abs=2e-3)
-
-
-def test_no_random_pose_of_either_arm_needs_more_than_the_largest_torque():
+def test_the_worst_pose_needs_the_largest_torque_and_no_random_one_of_either_arm_needs_more():
     joints = needs()
     rng = np.random.default_rng(11)
     pose, tilts = rng.uniform(LOW, HIGH, (20_000, 4)), np.radians(rng.uniform(-20, 20, (20_000, 2)))
@@ -66,6 +60,8 @@ def test_no_random_pose_of_either_arm_needs_more_than_the_largest_torque():
         direction = np.array([Tilt.of(side, *tilt).direction for tilt in tilts])
         largest = np.abs(gravity_torque(carrying, pose, direction)).max(axis=0)
         assert np.all(largest <= [joint.torque + 2e-3 for joint in joints])
+    at_worst = np.abs([torque_at(carrying, joint.worst[None])[0] for joint in joints]).diagonal()
+    assert at_worst == pytest.approx([joint.torque for joint in joints], abs=5e-3)
 
 
 def test_the_torque_at_a_point_agrees_with_the_exact_law_for_the_left_arm():
@@ -73,12 +69,6 @@ def test_the_torque_at_a_point_agrees_with_the_exact_law_for_the_left_arm():
     for point in points:
         direction = Tilt.of("left", pitch=point[4], roll=point[5]).direction
         assert torque_at(ROBOT, point[None])[0] == pytest.approx(gravity_torque(ROBOT, point[:4], direction), abs=1e-12)
-
-
-def test_the_worst_pose_needs_the_largest_torque():
-    for number, joint in enumerate(needs()):
-        torque = torque_at(ROBOT.with_wearer(*LOAD), joint.worst[None])[0, number]
-        assert abs(torque) == pytest.approx(joint.torque, abs=5e-3)
 
 
 def test_the_shares_agree_with_those_of_other_random_poses():
@@ -113,11 +103,8 @@ def test_an_arm_that_bends_the_other_way_gets_the_same_support():
     assert other.support == pytest.approx(one.support, abs=2e-3)
 
 
-def test_strong_enough_motors_support_the_whole_arm():
+def test_strong_motors_support_the_whole_arm_and_none_if_the_robot_alone_needs_more_than_rated_torque():
     assert [joint.support for joint in needs(rated=(50, 50, 50, 50))] == [1.0] * 4
-
-
-def test_there_is_no_support_if_the_robot_alone_needs_more_than_rated_torque():
     assert needs(rated=(3, 3.7, 3, 3))[1].support is None
     assert needs(rated=(3, 3.8, 3, 3))[1].support == pytest.approx(0.0, abs=0.005)
 
@@ -145,13 +132,10 @@ def test_overload_names_each_overloaded_joint_and_the_support_that_fits():
     assert overload("abcd", needs(support=0.068)) == ""
 
 
-def test_a_torque_scale_below_1_reduces_the_motors_torque_and_one_above_1_does_not_raise_it():
+def test_a_torque_scale_below_1_and_a_warm_motor_reduce_its_torque_and_a_scale_above_1_does_not_raise_it():
     bridge = values_of(CAN_BRIDGE, {**BUS, "torque_scale": [1.0, 0.5, 1.5, 1.0]})
     rated, peak = motor_torques(bridge)
     assert rated.tolist() == [3.0, 4.5, 3.0, 3.0] and peak.tolist() == [9.0, 9.0, 9.0, 9.0]
-
-
-def test_a_motor_that_weakens_when_warm_is_counted_as_warm():
     rated, _ = motor_torques(values_of(CAN_BRIDGE, {**BUS, "torque_scale_slope": [-0.001, 0.0, 0.001, -0.001]}))
     assert rated == pytest.approx([3.0 * (1.0 - 0.045), 9.0, 3.0, 3.0 * (1.0 - 0.045)])
 

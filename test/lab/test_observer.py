@@ -317,13 +317,10 @@ def test_a_watch_tells_torques_beyond_their_band_the_share_and_nothing_that_is_o
     assert abs(float(carried["b wearer (Nm)"])) < float(carried["b wearer band (Nm)"])
 
 
-def test_a_watch_follows_the_load_in_the_settings():
+def test_a_watch_follows_the_load_and_the_stiffness_of_elastic_joints_in_the_settings():
     loaded = replace(SETTINGS, payload_mass=1.0)
     needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
     assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
-
-
-def test_a_watch_follows_the_stiffness_of_elastic_joints():
     elastic = replace(SETTINGS, joint_stiffness=(150.0,) * 4)
     held = gravity_torque(WHOLE, POSE, TILT.direction)
     behind = gravity_torque(WHOLE, np.subtract(POSE, np.divide(held, 150.0)), TILT.direction)

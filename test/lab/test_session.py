@@ -9,19 +9,15 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.trial.session import Session
 
 
-@pytest.mark.parametrize("code", ["P01", "0042", "pilot-3_b", "A" * 32])
-def test_a_code_names_the_folder_of_the_subject_and_the_day(code):
-    assert Session(code).folder(date(2026, 3, 14)) == f"{code}/2026-03-14"
+@pytest.mark.parametrize("code", ["", "P01", "0042", "pilot-3_b", "A" * 32])
+def test_a_code_names_the_folder_of_the_subject_and_the_day_and_without_one_there_is_none(code):
+    assert Session(code).folder(date(2026, 3, 14)) == (f"{code}/2026-03-14" if code else "")
 
 
 @pytest.mark.parametrize("code", ["Anna Meier", "../P01", "a/b", ".", "-P01", "Jörg", "P01\n", "A" * 33, "P.1", "CON:"])
 def test_characters_that_do_not_belong_in_the_name_of_a_folder_are_refused(code):
     with pytest.raises(ParameterError, match=r"subject = .*: must be a code"):
         Session(code)
-
-
-def test_without_a_subject_there_is_no_folder():
-    assert Session(protocol="pilot").folder(date(2026, 3, 14)) == ""
 
 
 HALF = ({"note": "calm \ud83d"}, {"protocol": "a\0"})  # an emoji cut by a field's maxlength; a C string ends there

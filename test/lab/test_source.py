@@ -21,14 +21,12 @@ SIMULATED, REAL, UNKNOWN = Source.SIMULATED, Source.REAL, Source.UNKNOWN
         ("socketcan", "vcan0", True, SIMULATED),
         ("socketcan", "", False, UNKNOWN),
         ("", "", False, UNKNOWN),
+        (None, None, False, UNKNOWN),
     ],
 )
 def test_an_arm_is_real_only_if_its_file_names_a_bus_that_leads_to_motors(interface, channel, has_simulator, source):
-    assert source_of({"can.interface": interface, "can.channel": channel}, has_simulator) is source
-
-
-def test_without_the_bridges_parameters_the_source_is_unknown():
-    assert source_of({}, False) is UNKNOWN
+    bridge = {} if interface is None else {"can.interface": interface, "can.channel": channel}
+    assert source_of(bridge, has_simulator) is source
 
 
 def test_several_arms_are_real_only_together():

@@ -8,38 +8,27 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..support.bus_listener import BusListener
 from ..support.launched_nodes import LaunchedNodes
+from ..support.own_node import own_node
 from ..support.ros_probe import RosProbe
 
 
 @pytest.fixture
 def node() -> Iterator[Node]:
     """A node in the namespace /right, in a separate context, which ends with the test."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("listener", namespace="/right", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    with own_node("listener") as (node, _):
+        yield node
 
 
 @pytest.fixture(scope="module")
 def executor() -> Iterator[SingleThreadedExecutor]:
     """The executor of one node in the namespace /right, which the tests of a module share."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("spinning", namespace="/right", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield executor
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    with own_node("spinning") as (_, executor):
+        yield executor
 
 
 @pytest.fixture

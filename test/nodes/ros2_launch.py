@@ -12,8 +12,8 @@ import re
 import signal
 import subprocess
 import threading
-import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -23,6 +23,7 @@ from ..support.document_commands import ROS2
 from ..support.launched_nodes import CALM, LaunchedNodes, children
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
+from ..support.waiting import wait_until
 
 PACKAGE = ("exo_gravity", "exo.launch.py")
 ANSWER_TIMEOUT = 60.0  # s for a command's output
@@ -124,10 +125,7 @@ def close_terminal(launched):
 def test_when_launch_is_killed_or_its_terminal_closed_the_nodes_let_the_arm_down(launched, end_launch):
     end_launch(launched)
     launched.wait()
-    end = time.monotonic() + STOP_TIMEOUT
-    while not launched.truth.motors_are_off():
-        assert time.monotonic() < end
-        time.sleep(0.1)
+    wait_until(launched.truth.motors_are_off, timeout=STOP_TIMEOUT)
     assert launched.was_let_down()
 
 
@@ -140,17 +138,22 @@ def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down(launched):
     assert launched.was_let_down()
 
 
-def test_a_namespace_is_in_front_of_every_node_and_of_the_imus_topics(prepare):
-    probe = RosProbe("/lab/right")
-    launched = Launched(prepare(), "namespace:=lab", "log_level:=warn")
+@contextmanager
+def in_lab(nodes: LaunchedNodes, *arguments: str, **options: Path) -> Iterator[tuple[RosProbe, set[str]]]:
+    """Launch an arm in the namespace /lab; once it is carried, yield a probe and the names of all topics."""
+    probe, launched = RosProbe("/lab/right"), Launched(nodes, *arguments, **options)
     try:
         probe.wait_until_carried()
-        topics = {name for name, _ in probe.node.get_topic_names_and_types()}
-        assert "/lab/imu/data" in topics and "/imu/data" not in topics
+        yield probe, {name for name, _ in probe.node.get_topic_names_and_types()}
     finally:
         launched.ctrl_c()
         assert launched.wait() == 0
         probe.close()
+
+
+def test_a_namespace_is_in_front_of_every_node_and_of_the_imus_topics(prepare):
+    with in_lab(prepare(), "namespace:=lab", "log_level:=warn") as (_, topics):
+        assert "/lab/imu/data" in topics and "/imu/data" not in topics
 
 
 INCLUDING = """
@@ -172,25 +175,15 @@ def generate_launch_description():
 def test_a_file_that_includes_this_one_pushes_its_namespace_and_its_remappings(prepare, tmp_path):
     file = tmp_path / "mine.launch.py"
     file.write_text(INCLUDING.format(path=str(ROOT / "launch" / "exo.launch.py")))
-    probe = RosProbe("/lab/right")
-    launched = Launched(prepare(compensator={"assist.max_effort": [1.0] * 4}), file=file)
-    try:
-        probe.wait_until_carried()
-        topics = {name for name, _ in probe.node.get_topic_names_and_types()}
+    with in_lab(prepare(compensator={"assist.max_effort": [1.0] * 4}), file=file) as (probe, topics):
         assert {"/lab/imu/data", "/lab/right/my_controller/efforts"} <= topics and "/imu/data" not in topics
         assert probe.diagnostic("compensator", "mass carried (kg)") == "1.854"  # of the file, and not the defaults'
-    finally:
-        launched.ctrl_c()
-        assert launched.wait() == 0
-        probe.close()
 
 
 def test_the_panel_starts_alone_by_arguments(prepare):
     launched = Launched(prepare(), "panel:=true", "only:=/panel")
-    end = time.monotonic() + ANSWER_TIMEOUT
-    while not any("the panel is at http://" in line for line in launched.log):
-        assert time.monotonic() < end, launched.log
-        time.sleep(0.1)
+    is_open = lambda: any("the panel is at http://" in line for line in launched.log)  # noqa: E731
+    wait_until(is_open, timeout=ANSWER_TIMEOUT, seen=lambda: launched.log)
     launched.ctrl_c()
     assert launched.wait() == 0
     assert not any("right/" in line for line in launched.log)
@@ -202,9 +195,8 @@ def standing(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
     nodes = LaunchedNodes(tmp_path_factory.mktemp("commands"), timing=CALM, can_bridge={"autostart": False})
     launched, probe = Launched(nodes), RosProbe()
     probe.wait_until(lambda: probe.status_contains("can_bridge", "inactive"))
-    end = time.monotonic() + ANSWER_TIMEOUT
-    while "/right/can_bridge" not in typed("ros2 node list", ""):  # the daemon that the first command starts
-        assert time.monotonic() < end
+    # By the daemon that the first command starts.
+    wait_until(lambda: "/right/can_bridge" in typed("ros2 node list", ""), timeout=ANSWER_TIMEOUT)
     yield probe
     launched.ctrl_c()
     launched.wait()

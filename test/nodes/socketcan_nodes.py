@@ -7,7 +7,6 @@ one, so the nodes' clock is slowed down in proportion: the limits stay those of 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,7 +21,9 @@ from exo_gravity.hardware.can.can_port import open_bus
 from exo_gravity.lab import processes
 from exo_gravity.lab.processes import Launcher
 
-CONFIG = Path(__file__).parents[2] / "config" / "sim.yaml"
+from ..support import CONFIG
+from ..support.waiting import wait_until
+
 VCAN = ("socketcan", "vcan0")
 AK60 = MOTORS["AK60-6"]
 IDS = (1, 2, 3, 4)
@@ -64,7 +65,7 @@ def nodes(
     """Bridge, compensator and simulator as processes on these channels with a slow clock, and their log so far."""
     (tmp_path / "sitecustomize.py").write_text(SITECUSTOMIZE)
     (tmp_path / "trial.yaml").write_text(yaml.safe_dump(TRIAL))
-    content = yaml.safe_load(CONFIG.read_text())
+    content = yaml.safe_load((CONFIG / "sim.yaml").read_text())
     del content["/imu"]
     for node, changes in CHANGES.items():
         content[f"/right/{node}"]["ros__parameters"].update(changes)
@@ -86,11 +87,8 @@ def nodes(
 
 def wait_for(text: str, nodes: Launcher, log: list[str]) -> None:
     """Wait until a line of the log contains `text`."""
-    end = time.monotonic() + 120.0
-    while not any(text in line for line in log):
-        assert nodes.dead() is None
-        assert time.monotonic() < end, f"not logged in time: {text}"
-        time.sleep(0.1)
+    wait_until(lambda: nodes.dead() or any(text in line for line in log), timeout=120.0, seen=lambda: text)
+    assert nodes.dead() is None
 
 
 def angles(frames: list[can.Message]) -> list[float]:

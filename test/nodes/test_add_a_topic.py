@@ -5,9 +5,6 @@ import signal
 import subprocess
 import sys
 
-import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64
 
@@ -23,23 +20,9 @@ node.main()
 """
 
 
-@pytest.fixture
-def gripper():
-    """A node of the left arm, and its executor."""
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("gripper", namespace="/left", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield node, executor
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
-
-
-def test_a_new_topic_is_recorded_in_the_arms_namespace(gripper, tmp_path):
-    node, executor = gripper
-    publisher = node.create_publisher(Float64, "grip_force", 1)
+def test_a_new_topic_is_recorded_in_the_arms_namespace(executor, tmp_path):
+    (node,) = executor.get_nodes()
+    publisher = node.create_publisher(Float64, "/left/grip_force", 1)
     command = [sys.executable, "-c", RECORDER, "--ros-args", "-p", f"output:={tmp_path / 'bag'}"]
     recorder = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:

@@ -2,7 +2,6 @@
 """CONTRIBUTING, "Add an IMU", followed literally: a class with `read` and `close`, and its name in two places."""
 
 import pytest
-import rclpy
 
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.trunk.params import IMU_SOURCES
@@ -23,16 +22,6 @@ class LevelImu(ImuSource):
 
     def close(self):
         self.is_open = False
-
-
-@pytest.fixture
-def node():
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    node = rclpy.create_node("imu", context=context)
-    yield node
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monkeypatch, node):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -21,7 +20,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 
-from ..support.joint_state_feeder import POSE, JointStateFeeder
+from ..support.joint_state_feeder import POSE, Feeder, JointStateFeeder
 from ..support.launched_nodes import NO_IMU
 from ..support.ros_probe import RosProbe
 
@@ -39,8 +38,8 @@ def feed(probe: RosProbe) -> Iterator[Callable[..., None]]:
         feeder.close()
 
 
-class TiltFeeder:
-    """Publishes every 10 ms, from a thread, pitch and roll of a trunk that bows by 0.3 rad.
+class TiltFeeder(Feeder):
+    """Publishes every 10 ms pitch and roll of a trunk that bows by 0.3 rad.
 
     lag: age of the stamps in s. vector_bow: rad, of which gravity's vector is published too; None for none.
     """
@@ -50,24 +49,16 @@ class TiltFeeder:
         self.vector_bow: float | None = None
         self._vectors = node.create_publisher(Imu, "/imu/data", 1)
         self._publisher = node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._publish)
-        self._thread.start()
+        super().__init__(0.01)
 
-    def _publish(self) -> None:
+    def send(self, number: int) -> None:
         angles, vector = Vector3Stamped(), Imu()
         angles.vector.y = 0.3
-        while not self._stopping.wait(0.01):
-            stamp = Time(nanoseconds=time.time_ns() - round(self.lag * 1e9)).to_msg()
-            angles.header.stamp = vector.header.stamp = stamp
-            self._publisher.publish(angles)
-            if (bow := self.vector_bow) is not None:
-                vector.orientation.y, vector.orientation.w = math.sin(bow / 2.0), math.cos(bow / 2.0)
-                self._vectors.publish(vector)
-
-    def close(self) -> None:
-        self._stopping.set()
-        self._thread.join()
+        angles.header.stamp = vector.header.stamp = Time(nanoseconds=time.time_ns() - round(self.lag * 1e9)).to_msg()
+        self._publisher.publish(angles)
+        if (bow := self.vector_bow) is not None:
+            vector.orientation.y, vector.orientation.w = math.sin(bow / 2.0), math.cos(bow / 2.0)
+            self._vectors.publish(vector)
 
 
 @pytest.fixture

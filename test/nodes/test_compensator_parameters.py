@@ -14,14 +14,12 @@ from rclpy.parameter import Parameter
 
 from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.sim.script import TrialScript
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes
 from ..support.ros_probe import RosProbe
 
 NODE = "/right/compensator"
 OTHER_NODES = ("can_bridge", "simulator", "imu")
-SCRIPT = TrialScript.parse({"name": "hold", "steps": [{"hold": 1.0}]})
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +35,7 @@ def compensator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
 
 REFUSALS = [
     ({"robot.mass": [0.6, 0.5, 0.6]}, "robot.mass = [0.6, 0.5, 0.6]: must be 4 numbers from 0 to 20"),
-    ({"robot.mass": [0.6, 0.5, 900.0, 0.2]}, "must be 4 numbers from 0 to 20"),
-    ({"robot.cog": [0.0, 0.0, 0.31, 0.0]}, "within its link"),
     ({"support": math.nan}, "support out of range Min: 0.0, Max: 1.0"),
-    ({"wearer.body_mass": 0.9}, "wearer.body_mass = 0.9: must be a number from 10 to 300 kg"),
     ({"wearer.mass": [0.0, 0.0, 9.0, 9.0], "support": 1.0}, "total mass in kg = 19.85: must be at most 10 "),
     ({"use_imu": True}, "read-only parameter: use_imu"),
     ({"suport": 0.5}, "suport = 0.5: must be one of "),

@@ -13,10 +13,8 @@ import sys
 import time
 
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
@@ -32,6 +30,7 @@ from exo_gravity.nodes.recorder.node import LiveLine
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 
+from ..support.own_node import own_node
 from ..support.thorough import quick
 from ..support.waiting import PATIENCE, wait_until
 
@@ -52,14 +51,10 @@ def start(output, *arguments, **options):
 class PublishingArm:
     """A node in this process that publishes like a bridge and a compensator."""
 
-    def __init__(self):
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("bridge", namespace="/right", context=self.context)
+    def __init__(self, node, executor):
+        self.node, self.executor = node, executor
         self.node.declare_parameter("robot.mass", [0.5, 0.6, 0.7, 0.8])
         self.node.declare_parameter("support", 0.0)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
         create = self.node.create_publisher
         self.states = create(JointState, "joint_states", 1)
         self.efforts = create(JointState, "effort_commands", 1)
@@ -69,11 +64,6 @@ class PublishingArm:
         self.steps = create(String, "wearer_step", LATCHED)
         self.markers = create(String, "/event_marker", 10)
         self.other = create(String, "chatter", 10)
-
-    def close(self):
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
 
     def wait_until(self, condition):
         """Spin until `condition()` holds."""
@@ -100,38 +90,37 @@ class PublishingArm:
 
 @pytest.fixture
 def arm():
-    arm = PublishingArm()
-    yield arm
-    arm.close()
+    with own_node("bridge") as own:
+        yield PublishingArm(*own)
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A complete recording: its folder, the lines of JSON, the exit code, and the type hash that DDS announces."""
     path = tmp_path_factory.mktemp("recorder") / "bag"
-    arm = PublishingArm()
-    arm.steps.publish(String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
-    of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
-    process = start(path, "-p", "live:=true", *of_whom)
-    try:
-        arm.wait_until(arm.is_recorded)
-        known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
-        for k in range(COUNT):
-            arm.publish(k)
-        status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
-        arm.markers.publish(String(data="cramp"))
-        arm.faults.publish(DiagnosticArray(status=[status]))
-        arm.node.set_parameters([Parameter("support", value=0.5)])
-        lines = []
-        while not lines or "motor 2 is silent" not in lines[-1]:
-            lines.append(process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=PATIENCE)
-        yield path, lines, process.returncode, known.topic_type_hash
-    finally:
-        process.kill()
-        process.wait()
-        arm.close()
+    with own_node("bridge") as own:
+        arm = PublishingArm(*own)
+        arm.steps.publish(String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
+        of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
+        process = start(path, "-p", "live:=true", *of_whom)
+        try:
+            arm.wait_until(arm.is_recorded)
+            known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
+            for k in range(COUNT):
+                arm.publish(k)
+            status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
+            arm.markers.publish(String(data="cramp"))
+            arm.faults.publish(DiagnosticArray(status=[status]))
+            arm.node.set_parameters([Parameter("support", value=0.5)])
+            lines = []
+            while not lines or "motor 2 is silent" not in lines[-1]:
+                lines.append(process.stdout.readline())
+            process.send_signal(signal.SIGINT)
+            process.communicate(timeout=PATIENCE)
+            yield path, lines, process.returncode, known.topic_type_hash
+        finally:
+            process.kill()
+            process.wait()
 
 
 def recorded(path, topic):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import pytest
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rosbags.highlevel import AnyReader
@@ -17,7 +16,6 @@ from exo_gravity.lab.view.urdf import ROOT
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
-from ..support import CONFIG
 from ..support.joint_state_feeder import PARTS
 from ..support.launched_nodes import LaunchedNodes
 from ..support.node_thread import NodeThread
@@ -89,13 +87,11 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def nodes(folder):
     """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
-    content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
-    base = folder / "both.yaml"
-    content["/robot_model"] = {"ros__parameters": {"rate": 20.0}}
-    content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
-    base.write_text(yaml.safe_dump(content), encoding="utf-8")
-    nodes = LaunchedNodes(folder, base=base, without=("simulator", "imu"), can_bridge={"autostart": False}).start()
-    yield nodes
+    without, waiting = ("simulator", "imu"), {"autostart": False}
+    nodes = LaunchedNodes(folder, base="sim_both.yaml", without=without, can_bridge=waiting)
+    nodes.add("/robot_model", rate=20.0)
+    nodes.add("/recorder", output=str(folder / "bag"))
+    yield nodes.start()
     nodes.stop()
     print("\n".join(nodes.log))
 

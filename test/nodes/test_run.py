@@ -7,10 +7,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 
@@ -19,6 +17,7 @@ from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.nodes.ros import run as running
 from exo_gravity.nodes.ros.run import WAITS_FOR_BRIDGES, handle_signals
 
+from ..support.own_node import own_node
 from ..support.waiting import wait_until
 
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
@@ -102,16 +101,8 @@ def test_which_signals_end_a_node(environment, has_nohup, waits, ends):
 def waiting():
     """A node that waits for /clock, and its executor."""
     keep_to_this_machine()
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    given = [Parameter("use_sim_time", value=True)]
-    node = rclpy.create_node("waiting", namespace="/right", context=context, parameter_overrides=given)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    yield node, executor
-    executor.shutdown()
-    node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    with own_node("waiting", parameter_overrides=[Parameter("use_sim_time", value=True)]) as own:
+        yield own
 
 
 def test_a_node_whose_clock_nobody_publishes_says_so_until_it_is_published(waiting, monkeypatch):

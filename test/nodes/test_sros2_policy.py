@@ -8,26 +8,22 @@ These tests do not show that DDS enforces the policy, which takes a middleware b
 
 from __future__ import annotations
 
-import threading
 import time
 import xml.etree.ElementTree as ElementTree
 
 import pytest
-import rclpy
-import yaml
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import NodeNameNonExistentError
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.bag.storage import Storage
-from exo_gravity.lab.processes import Launcher
 
 from ..support import CONFIG
-from ..support.launched_nodes import PORTS
-from ..support.ports import free_port
+from ..support.launched_nodes import LaunchedNodes
+from ..support.node_thread import NodeThread
+from ..support.own_node import own_node
 
 POLICY = CONFIG / "sros2" / "policy.xml"
 RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
@@ -70,44 +66,25 @@ def graph_of(node, name):
     return dict(zip(NO_RULES, found, strict=True))
 
 
-def parameter_file(folder):
-    """Write config/sim_both.yaml with unused ports, recorder and robot_model; bridges do not start by themselves."""
-    ports = {"left": next(PORTS), "right": next(PORTS)}
-    content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text(encoding="utf-8"))
-    for name, entry in content.items():
-        values = entry["ros__parameters"]
-        if "can" in values:
-            values["can"]["options"]["port"] = ports[name.split("/")[1]]
-        if name.endswith("/can_bridge"):
-            values["autostart"] = False
-            values["largest_moment"] = [0.1] * 4  # then it reads the trunk's tilt, too
-    content["/recorder"] = {"ros__parameters": {"output": str(folder / "bag")}}
-    content["/robot_model"] = {"ros__parameters": {"rate": 30.0}}
-    content["/panel"] = {"ros__parameters": {"port": free_port(), "output": str(folder)}}
-    path = folder / "params.yaml"
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    return path
+def all_nodes(folder, one_process):
+    """Return the nodes of config/sim_both.yaml, recorder, robot_model and panel; the bridges are not configured."""
+    bridge = {"autostart": False, "largest_moment": [0.1] * 4}  # with a moment it reads the trunk's tilt, too
+    nodes = LaunchedNodes(folder, base="sim_both.yaml", one_process=one_process, wearer=True, can_bridge=bridge)
+    nodes.add("/recorder", output=str(folder / "bag"))
+    nodes.add("/robot_model", rate=30.0)
+    nodes.add_panel()
+    return nodes
 
 
-def outer_loops(context):
-    """Return an executor with a node for each arm, as a user's own controller might be."""
-    executor = SingleThreadedExecutor(context=context)
-    for arm in ("left", "right"):
-        node = rclpy.create_node("outer_loop", namespace=arm, context=context)
-        node.create_publisher(JointState, "assist_efforts", 1)
-        for topic in ("joint_states", "wearer_efforts", "wearer_efforts_std"):
-            node.create_subscription(JointState, topic, lambda message: None, 1)
-        node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: None, 1)
-        executor.add_node(node)
-    return executor
-
-
-def spin(executor, ending):
-    while not ending.is_set():
-        executor.spin_once(timeout_sec=0.1)
-    for node in executor.get_nodes():
-        node.destroy_node()
-    executor.shutdown()
+def outer_loop(arm):
+    """Return a node of an arm, as a user's own controller might be."""
+    thread = NodeThread("outer_loop", namespace=arm)
+    (node,) = thread.nodes
+    node.create_publisher(JointState, "assist_efforts", 1)
+    for topic in ("joint_states", "wearer_efforts", "wearer_efforts_std"):
+        node.create_subscription(JointState, topic, lambda message: None, 1)
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda message: None, 1)
+    return thread
 
 
 def lasting_rules(rules_of):
@@ -130,29 +107,22 @@ def nodes_with_recorded_parameters(bag):
 @pytest.fixture(scope="module", params=[False, True], ids=["two processes", "one process"])
 def session(tmp_path_factory, request):
     """The graph of the running nodes, and the nodes whose parameters the recorder has written."""
-    folder, ending, context = tmp_path_factory.mktemp("sros2"), threading.Event(), rclpy.Context()
-    rclpy.init(context=context)
-    observer = rclpy.create_node("observer", context=context)
-    launcher = Launcher(parameter_file(folder), on_line=lambda node, line: None, one_process=request.param)
-    threads = [
-        threading.Thread(target=launcher.run, args=(ending,)),
-        threading.Thread(target=spin, args=(outer_loops(context), ending)),
-    ]
-    for thread in threads:
-        thread.start()
+    folder, loops = tmp_path_factory.mktemp("sros2"), [outer_loop("left"), outer_loop("right")]
+    nodes = all_nodes(folder, request.param)
+    for started in (nodes, *loops):
+        started.start()
     expected = lasting_rules(read_policy().get), set(NODES) - {"/recorder"}
     found, end = None, time.monotonic() + 90.0
-    while found != expected and time.monotonic() < end:  # the tests below show the difference
-        time.sleep(0.2)
-        found = (
-            lasting_rules(lambda node: graph_of(observer, node)),
-            nodes_with_recorded_parameters(folder / "bag") & set(NODES),
-        )
-    ending.set()
-    for thread in threads:
-        thread.join()
-    observer.destroy_node()
-    rclpy.try_shutdown(context=context)
+    with own_node("observer") as (observer, _):
+        while found != expected and time.monotonic() < end:  # the tests below show the difference
+            time.sleep(0.2)
+            found = (
+                lasting_rules(lambda node: graph_of(observer, node)),
+                nodes_with_recorded_parameters(folder / "bag") & set(NODES),
+            )
+    nodes.stop()
+    for loop in loops:
+        loop.close()
     return found
 
 

@@ -159,13 +159,6 @@ def seated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosProbe]:
 
 
 @pytest.mark.thorough
-def test_set_zero_is_refused_with_the_zeros_to_write(seated):
-    seated.wait_until_carried()
-    answer = seated.trigger("set_zero")
-    assert not answer.success and "write zero: [" in answer.message
-
-
-@pytest.mark.thorough
 def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(seated, tmp_path):
     path = str(tmp_path / "anfis.json")
     assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) == 0

@@ -7,7 +7,6 @@ import random
 from collections.abc import Iterator
 
 import pytest
-import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -22,7 +21,6 @@ from rcl_interfaces.srv import (
 from type_description_interfaces.srv import GetTypeDescription
 
 from ..support.launched_nodes import CALM
-from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
 
 pytestmark = [pytest.mark.real_time, pytest.mark.thorough]
@@ -77,11 +75,9 @@ def value(chance: random.Random) -> ParameterValue:
 def nodes(prepare, tmp_path):
     """Every node of a simulated arm."""
     nodes = prepare(timing=CALM, wearer=True)
-    content = yaml.safe_load(nodes.path.read_text())
-    content["/recorder"] = {"ros__parameters": {"output": str(tmp_path / "bag")}}
-    content["/robot_model"] = {"ros__parameters": {"rate": 30.0}}
-    content["/panel"] = {"ros__parameters": {"port": free_port(), "output": str(tmp_path)}}
-    nodes.path.write_text(yaml.safe_dump(content))
+    nodes.add("/recorder", output=str(tmp_path / "bag"))
+    nodes.add("/robot_model", rate=30.0)
+    nodes.add_panel()
     nodes.start()
     yield nodes
     nodes.stop()

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 import os
 import signal
-import threading
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -29,7 +28,7 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.nodes.wearer.node import WearerNode
 
-from ..support.joint_state_feeder import PARTS, POSE
+from ..support.joint_state_feeder import PARTS, POSE, Feeder
 from ..support.launched_nodes import NO_IMU
 from ..support.urdf_oracle import MujocoArm
 from ..support.waiting import wait_until
@@ -46,7 +45,7 @@ WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's a
 NONE = ["0.0"] * len(PARTS)  # Nm
 
 
-class StillArm:
+class StillArm(Feeder):
     """Publishes the joint states of a still arm every 5 ms; `effort` of its motors in Nm. Stamps count them in ns."""
 
     def __init__(
@@ -57,25 +56,17 @@ class StillArm:
     ) -> None:
         self.effort: Sequence[float] = ()
         self.velocity: Sequence[float] = (0.0,) * len(names)
-        self._names, self._pose = names, pose
+        self._message = JointState(name=names, position=pose)
         self.sinking = 0.0  # rad every 5 ms, of the abduction
         self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._publish)
-        self._thread.start()
+        super().__init__(0.005)
 
-    def _publish(self) -> None:
-        message, number = JointState(name=self._names, position=self._pose), 0
-        while not self._stopping.wait(0.005):
-            number += 1
-            message.header.stamp = Time(nanoseconds=number).to_msg()
-            message.effort, message.velocity = self.effort, self.velocity
-            message.position[1] -= self.sinking
-            self._publisher.publish(message)
-
-    def close(self) -> None:
-        self._stopping.set()
-        self._thread.join()
+    def send(self, number: int) -> None:
+        message = self._message
+        message.header.stamp = Time(nanoseconds=number).to_msg()
+        message.effort, message.velocity = self.effort, self.velocity
+        message.position[1] -= self.sinking
+        self._publisher.publish(message)
 
 
 @pytest.fixture

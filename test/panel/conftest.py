@@ -49,3 +49,9 @@ def visit(browser: Browser, stage: Stage) -> Iterator[Callable[..., Page]]:
     for page in pages:
         page.context.close()
     assert errors == []
+
+
+@pytest.fixture
+def page(visit: Callable[..., Page]) -> Page:
+    """The open page."""
+    return visit()

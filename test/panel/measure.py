@@ -17,8 +17,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import yaml
-
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import is_special, unpack_command
 
@@ -26,7 +24,6 @@ from ..faults.live_arm import resident
 from ..support.bus_listener import CAN_IDS, BusListener, Frame
 from ..support.launched_nodes import LaunchedNodes
 from ..support.panel_browser import chromium, enable, open_page, wait_for_state
-from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
 
 SPECS = [MOTORS[name] for name in ("AK60-6", "AK80-9", "AK60-6", "AK60-6")]
@@ -42,15 +39,6 @@ LONGEST = 0.15  # s, p99 from press to fading torque
 LARGEST_SHARE = 0.15  # of a core
 WARM_UP = 5  # min until memory counts: caches and plots fill
 MAX_GROWTH = 5.0  # MB, of the node and of the tab, from then until the end
-
-
-def with_panel(nodes: LaunchedNodes) -> str:
-    """Add the panel to the nodes' parameter file, and return its address."""
-    port = free_port()
-    content = yaml.safe_load(nodes.path.read_text())
-    content["/panel"] = {"ros__parameters": {"port": port, "output": str(nodes.folder / "out")}}
-    nodes.path.write_text(yaml.safe_dump(content))
-    return f"http://127.0.0.1:{port}/"
 
 
 def first_fading(frames: list[Frame], since: float) -> float:
@@ -71,7 +59,7 @@ def press(count: int) -> int:
     delays: list[float] = []
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
         nodes = LaunchedNodes(Path(folder))
-        url = with_panel(nodes)
+        url = nodes.add_panel()
         nodes.start()
         listener, probe = BusListener(nodes.bus), RosProbe()
         try:
@@ -117,7 +105,7 @@ def load() -> int:
 def _phase(folder: Path, panel: bool) -> tuple[int, int, float]:
     folder.mkdir()
     nodes = LaunchedNodes(folder, base="sim_both.yaml", timing=TIMING)
-    url = with_panel(nodes) if panel else ""
+    url = nodes.add_panel() if panel else ""
     nodes.start()
     probe = RosProbe()
     try:
@@ -154,7 +142,7 @@ def memory(minutes: int) -> int:
     seen: list[tuple[float, float]] = []  # MB
     with tempfile.TemporaryDirectory() as folder, chromium(gives_way=True) as browser:
         nodes = LaunchedNodes(Path(folder), base="sim_both.yaml", timing=SLOW)
-        url = with_panel(nodes)
+        url = nodes.add_panel()
         nodes.start()
         probe = RosProbe()
         try:

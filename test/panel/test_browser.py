@@ -41,8 +41,7 @@ def active(stage):
     return stage
 
 
-def test_enable_asks_once_and_says_what_will_happen_also_beyond_rated_torque(visit, stage):
-    page = visit()
+def test_enable_asks_once_and_says_what_will_happen_also_beyond_rated_torque(page, stage):
     page.click(of_arm(".enable"))
     assert stage.arms.calls == []
     assert "takes its weight" in page.inner_text("#ask-text")
@@ -86,8 +85,7 @@ def test_a_question_is_about_the_settings_at_the_press_and_is_asked_again_where_
     assert stage.arms.calls == [("enable", "right")]
 
 
-def test_let_down_ends_an_enable_whose_settings_are_still_being_read(visit, stage):
-    page = visit()
+def test_let_down_ends_an_enable_whose_settings_are_still_being_read(page, stage):
     page.click(of_arm(".enable"))
     page.wait_for_selector("#ask:visible")
     stage.arms.delay, reads = 1.0, stage.arms.reads
@@ -98,8 +96,7 @@ def test_let_down_ends_an_enable_whose_settings_are_still_being_read(visit, stag
     assert stage.arms.calls == BOTH_DOWN and not page.is_visible("#ask")
 
 
-def test_an_arm_whose_settings_cannot_be_read_is_not_enabled(visit, stage):
-    page = visit()
+def test_an_arm_whose_settings_cannot_be_read_is_not_enabled(page, stage):
     stage.arms.problem = "the compensator does not answer"
     page.click(of_arm(".enable"))
     page.wait_for_selector("#message:has-text('the compensator does not answer')")
@@ -107,8 +104,7 @@ def test_an_arm_whose_settings_cannot_be_read_is_not_enabled(visit, stage):
 
 
 @pytest.mark.parametrize("means", ["click", "space", "touch while asking", "space in a field", "space on enable"])
-def test_one_press_lets_both_arms_down(visit, active, means):
-    page = visit()
+def test_one_press_lets_both_arms_down(active, page, means):
     wait_for_state(page, "active")
     if means == "touch while asking":
         page.click(of_arm('[data-mode="zero_g"]'))
@@ -125,8 +121,7 @@ def test_one_press_lets_both_arms_down(visit, active, means):
     assert active.arms.calls == BOTH_DOWN
 
 
-def test_one_arm_alone_can_be_let_down_and_what_is_not_confirmed_is_an_alarm(visit, active):
-    page = visit()
+def test_one_arm_alone_can_be_let_down_and_what_is_not_confirmed_is_an_alarm(active, page):
     page.click(of_arm(".down", "left"))
     wait_for_state(page, "letting down", "left")
     assert active.arms.calls == [("let_down", "left")]
@@ -175,8 +170,7 @@ def test_no_text_of_a_fault_is_longer_than_its_place(visit, stage, width, langua
     assert tallest == 0.0
 
 
-def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(visit, stage):
-    page = visit()
+def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(page, stage):
     buttons = [page.locator(of_arm(name)) for name in (".enable", '[data-mode="zero_g"]')]
     before = [button.bounding_box() for button in buttons]
     stage.arms.fail("right", "over_temperature")
@@ -196,8 +190,7 @@ def test_a_fault_shows_its_remedy_moves_no_button_and_is_cleared_or_resumed(visi
     assert not page.is_visible(of_arm(".resume"))
 
 
-def test_a_start_from_unknown_angles_asks_beside_the_picture_whether_the_arm_hangs_so(visit, stage):
-    page = visit()
+def test_a_start_from_unknown_angles_asks_beside_the_picture_whether_the_arm_hangs_so(page, stage):
     stage.arms.states["right"], stage.arms.asked["right"] = "checking", "0, -2, 1, 23"
     wait_for_state(page, "checking")
     question = page.locator('.pose[data-arm="right"]')
@@ -265,8 +258,7 @@ def test_the_first_wearers_data_of_a_carried_arm_ask_first_and_set_the_support_t
     assert right["wearer.first_moment"] == [0.0] * 4
 
 
-def test_a_heavier_wearers_data_lower_the_support_to_what_rated_torque_allows(visit, stage):
-    page = visit()
+def test_a_heavier_wearers_data_lower_the_support_to_what_rated_torque_allows(page, stage):
     page.wait_for_selector(of_arm(".mark:not([hidden])"), state="attached")  # at 6.8 %
     page.fill("input[name=body_mass]", "60")
     page.click("#wearer button")
@@ -295,8 +287,7 @@ def test_an_arm_that_moves_is_not_called_carried(visit, stage):
     assert "The arm is carried." in page.inner_text(of_arm(".sentence"))
 
 
-def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_motors_are_off(visit, stage):
-    page = visit()
+def test_the_bar_says_in_sight_what_the_arms_do_and_let_down_is_grey_while_the_motors_are_off(page, stage):
     wait_for_state(page, "disabled")
     assert page.locator("#let-down[data-off]").count() == 1
     assert "motors of all arms are off" in page.inner_text("#let-down-hint")
@@ -343,8 +334,7 @@ def test_the_page_says_which_arm_is_simulated_as_the_devices_say(visit, stage):
     wait_until(page, lambda: page.inner_text("#source") == "Real arm")
 
 
-def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(visit, stage):
-    page = visit()
+def test_a_reload_in_the_middle_keeps_control_and_shows_the_state(page, stage):
     enable(page)
     wait_for_state(page, "active")
     page.reload()
@@ -376,8 +366,7 @@ def test_the_second_page_watches_lets_down_and_takes_control(visit, stage, monke
     assert first.is_disabled(of_arm(".clear"))
 
 
-def test_without_a_connection_the_page_shows_no_old_state(visit, active):
-    page = visit()
+def test_without_a_connection_the_page_shows_no_old_state(active, page):
     wait_for_state(page, "active")
     active.server.stop()
     wait_for_state(page, "unseen")
@@ -388,8 +377,7 @@ def test_without_a_connection_the_page_shows_no_old_state(visit, active):
     page.wait_for_selector("#alarm:has-text('NOT confirmed')")
 
 
-def test_recording_trial_wearer_and_parameters_are_asked_for(visit, stage):
-    page = visit()
+def test_recording_trial_wearer_and_parameters_are_asked_for(page, stage):
     page.click("#record")
     page.click("#record-stop:enabled")
     page.select_option("#trials", "two_poses")
@@ -453,8 +441,7 @@ def test_the_key_m_sets_a_marker_while_it_is_recorded(visit, stage):
     assert stage.files.calls == ["record", "marker cramp at 3", "marker cramp at 3", "marker "]
 
 
-def test_usual_markers_have_a_button_and_a_digit_and_the_space_bar_still_lets_down(visit, active):
-    page = visit()
+def test_usual_markers_have_a_button_and_a_digit_and_the_space_bar_still_lets_down(active, page):
     wait_for_state(page, "active")
     assert page.is_disabled("#presets button") and page.is_disabled("[name=marker_text]")
     page.click("#record")
@@ -467,8 +454,7 @@ def test_usual_markers_have_a_button_and_a_digit_and_the_space_bar_still_lets_do
     wait_for_state(page, "letting down")
 
 
-def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage):
-    page = visit()
+def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(page, stage):
     page.focus("#session [name=note]")
     stage.arms.states["right"] = "active"
     wait_for_state(page, "active")
@@ -478,8 +464,7 @@ def test_while_an_arm_is_carried_no_text_field_takes_the_space_bar(visit, stage)
     assert stage.arms.calls == BOTH_DOWN
 
 
-def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(visit, active):
-    page = visit()
+def test_the_share_that_the_wearer_carries_is_a_bar_with_its_band(active, page):
     for reported, shown in ((("unknown",) * 2, "–"), (("40", "10"), "40 %"), (("-30", "10"), "-30 %")):  # pressed down
         active.arms.share = reported
         wait_until(page, lambda shown=shown: page.inner_text(of_arm(".carries strong")) == shown)
@@ -517,8 +502,7 @@ def test_the_share_is_shown_only_while_it_means_something(visit, stage):
     assert page.inner_text(of_arm(".carries strong")) == "–"
 
 
-def test_in_one_g_the_motors_carry_nothing_of_the_wearers_arm(visit, stage):
-    page = visit()
+def test_in_one_g_the_motors_carry_nothing_of_the_wearers_arm(page, stage):
     page.wait_for_selector(of_arm(".mark:not([hidden])"), state="attached")
     assert page.input_value(of_arm(".support input")) == "0" and page.is_disabled(of_arm(".support input"))
     stage.arms.settings["right"]["mode"] = "zero_g"

@@ -29,8 +29,7 @@ def serious(page: Page) -> list[str]:
     ]
 
 
-def test_the_page_is_german_when_its_user_wants_it(visit, stage):
-    page = visit()
+def test_the_page_is_german_when_its_user_wants_it(page, stage):
     page.select_option("#language", "de")
     assert page.inner_text("#let-down") == "Absenken"
     assert page.get_attribute("html", "lang") == "de"
@@ -47,8 +46,7 @@ def test_the_page_starts_in_its_browsers_language(browser, stage):
     page.wait_for_selector("#let-down:has-text('Absenken')")
 
 
-def test_the_keyboard_alone_reaches_everything(visit, stage):
-    page = visit()
+def test_the_keyboard_alone_reaches_everything(page, stage):
     reached = set()
     for _ in range(80):
         page.keyboard.press("Tab")

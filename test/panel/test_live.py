@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -15,7 +14,6 @@ from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
 
 from ..support.launched_nodes import LaunchedNodes
-from ..support.ports import free_port
 from ..support.ros_probe import RosProbe
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
@@ -39,15 +37,6 @@ class Clinic:
 
 
 RECORDING = 50_000  # bytes of a file into which joint states are written
-
-
-def with_panel(nodes: LaunchedNodes, **parameters: Any) -> str:
-    """Add the panel to the parameter file of nodes that have not started; return its address."""
-    port = free_port()
-    content = yaml.safe_load(nodes.path.read_text())
-    content["/panel"] = {"ros__parameters": {"port": port, "output": str(nodes.folder / "out"), **parameters}}
-    nodes.path.write_text(yaml.safe_dump(content))
-    return f"http://127.0.0.1:{port}/"
 
 
 def carried_on_page(nodes: LaunchedNodes, probe: RosProbe, browser: Browser, url: str) -> Page:
@@ -74,7 +63,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
     script = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
     (folder / "scripts" / "long.yaml").write_text(yaml.safe_dump(script))
     nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
-    url = with_panel(nodes, trials=str(folder / "scripts"))
+    url = nodes.add_panel(trials=str(folder / "scripts"))
     nodes.start()
     probe = RosProbe()
     try:

@@ -258,17 +258,6 @@ def test_only_a_request_that_is_json_and_short_is_carried_out(stage, content, st
     assert (answer.status_code, bool(stage.arms.calls)) == (status, status == 200)
 
 
-def test_the_operator_enables_and_a_watching_page_lets_down(stages):
-    stage = stages()
-    with live(stage) as one, live(stage) as other:
-        operator, watcher = (first(connection, "page")["page"] for connection in (one, other))
-        assert act(stage, watcher, {"do": "enable", "arm": "right"}).status_code == 403
-        assert act(stage, operator, {"do": "enable", "arm": "right"}).status_code == 200
-        assert act(stage, watcher).status_code == 200
-    assert stage.arms.calls == [("enable", "right"), ("let_down", "right"), ("let_down", "left")]
-    assert stage.notes[-1].startswith("127.0.0.1 page 2: let down")
-
-
 def test_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
     stage.files.reports["demo_1"] = tmp_path / "report.html"
     stage.files.reports["demo_1"].write_text("<p>held</p>")

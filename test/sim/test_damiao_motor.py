@@ -52,8 +52,12 @@ class Bench:
         return self.motor.receive(data, self.angle, 0.0, self.time, REGISTERS)
 
 
-def test_a_command_while_off_is_kept_and_enter_carries_it_out() -> None:
-    bench = Bench()
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_command_while_off_is_kept_and_enter_carries_it_out(bench: Bench) -> None:
     assert bench.push(2.0) == 0 and bench.wait(0.01) == 0.0
     assert bench.state(ENTER) == ON
     assert bench.wait(0.01) == pytest.approx(2.0, abs=0.01)
@@ -61,8 +65,7 @@ def test_a_command_while_off_is_kept_and_enter_carries_it_out() -> None:
     assert bench.state(ENTER) == ON and bench.wait(0.01) == 0.0
 
 
-def test_a_motor_without_commands_lets_go_and_ignores_enter_until_its_error_is_cleared() -> None:
-    bench = Bench()
+def test_a_motor_without_commands_lets_go_and_ignores_enter_until_its_error_is_cleared(bench: Bench) -> None:
     bench.state(ENTER)
     bench.push(2.0)
     assert bench.wait(0.19) == pytest.approx(2.0, abs=0.01)
@@ -72,8 +75,7 @@ def test_a_motor_without_commands_lets_go_and_ignores_enter_until_its_error_is_c
     assert bench.state(ENTER) == ON
 
 
-def test_every_id_with_its_lowest_8_bits_restarts_its_time_out_but_another_mode_moves_nothing() -> None:
-    bench = Bench()
+def test_every_id_with_its_lowest_8_bits_restarts_its_time_out_but_another_mode_moves_nothing(bench: Bench) -> None:
     assert set(bench.motor.received_ids) == {3 + 0x100 * mode for mode in range(8)} | {REGISTERS}
     bench.state(ENTER)
     for _ in range(5):
@@ -83,8 +85,7 @@ def test_every_id_with_its_lowest_8_bits_restarts_its_time_out_but_another_mode_
     assert bench.state(EXIT, 0x203) == 0 and not bench.motor.entered
 
 
-def test_an_error_switches_the_motor_off_and_comes_back_while_its_cause_stays() -> None:
-    bench = Bench()
+def test_an_error_switches_the_motor_off_and_comes_back_while_its_cause_stays(bench: Bench) -> None:
     bench.state(ENTER)
     bench.motor.error = 0x9
     bench.wait(STEP)
@@ -94,16 +95,14 @@ def test_an_error_switches_the_motor_off_and_comes_back_while_its_cause_stays() 
     assert bench.state(CLEAR_ERROR) == 0 and bench.state(ENTER) == ON
 
 
-def test_a_hot_coil_switches_the_motor_off() -> None:
-    bench = Bench()
+def test_a_hot_coil_switches_the_motor_off(bench: Bench) -> None:
     bench.state(ENTER)
     bench.motor.temperature = 101.0
     bench.wait(STEP)
     assert bench.push(0.0) == 0xC
 
 
-def test_registers_are_told_and_what_is_written_counts_until_the_power_goes() -> None:
-    bench = Bench()
+def test_registers_are_told_and_what_is_written_counts_until_the_power_goes(bench: Bench) -> None:
     told = {number: bench.ask(number) for number in (7, 9, 10, 20, 21, 22, 23)}
     values = [struct.unpack("<I", told[number][4:])[0] for number in (7, 9, 10)]
     assert values == [0x13, 4000, 1]
@@ -121,8 +120,7 @@ def test_registers_are_told_and_what_is_written_counts_until_the_power_goes() ->
     assert struct.unpack("<f", bench.ask(TMAX)[4:])[0] == 10.0
 
 
-def test_a_stored_register_survives_a_power_cycle_and_a_refresh_tells_the_state() -> None:
-    bench = Bench()
+def test_a_stored_register_survives_a_power_cycle_and_a_refresh_tells_the_state(bench: Bench) -> None:
     bench.ask(PMAX, 0x55, struct.pack("<f", 12.566))
     bench.ask(1, 0xAA)
     bench.motor.unplugged = True
@@ -134,8 +132,7 @@ def test_a_stored_register_survives_a_power_cycle_and_a_refresh_tells_the_state(
     assert refreshed == bench.send(bytes(8), 0x103)  # which commands nothing in MIT mode either
 
 
-def test_the_zero_is_set_at_once_and_kept() -> None:
-    bench = Bench()
+def test_the_zero_is_set_at_once_and_kept(bench: Bench) -> None:
     assert bench.state(SET_ZERO) == 0
     bench.motor.unplugged = True
     bench.motor.unplugged = False

@@ -18,15 +18,12 @@ from exo_gravity.sim.script import TrialScript
 from ..support.simulated_device import RAISED, SPECS, command, make_device
 
 
-def test_a_motor_answers_only_to_its_own_id():
-    device = make_device(ids=(11, 12, 13, 14))
-    assert device.exchange(1, ENTER) is None
-    can_id, data = device.exchange(13, ENTER)
-    assert (can_id, unpack_reply(SPECS[2], data).motor_id) == (13, 13)
+@pytest.fixture
+def device():
+    return make_device()
 
 
-def test_a_reply_has_the_present_position_and_velocity():
-    device = make_device()
+def test_a_reply_has_the_present_position_and_velocity(device):
     device.arm.reset(RAISED)
     device.advance(0.2)
     for joint in range(4):
@@ -35,16 +32,14 @@ def test_a_reply_has_the_present_position_and_velocity():
         assert reply.velocity == pytest.approx(device.arm.velocities[joint], abs=0.013)
 
 
-def test_time_advances_in_whole_steps_and_the_remainder_is_kept():
-    device = make_device()
+def test_time_advances_in_whole_steps_and_the_remainder_is_kept(device):
     device.advance(0.0104)
     assert device.time == pytest.approx(0.010)
     device.advance(0.0006)
     assert device.time == pytest.approx(0.011)
 
 
-def test_gravity_torque_through_frames_holds_the_arm():
-    device = make_device()
+def test_gravity_torque_through_frames_holds_the_arm(device):
     device.arm.reset(RAISED)
     for can_id in (1, 2, 3, 4):
         device.exchange(can_id, ENTER)
@@ -67,8 +62,7 @@ def test_a_motors_damping_acts_at_every_step():
     assert np.abs(device.arm.velocities).max() < 0.015
 
 
-def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it():
-    device = make_device()
+def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it(device):
     device.arm.reset(RAISED)
     for joint in range(len(SPECS)):
         device.exchange(joint + 1, ENTER)
@@ -83,8 +77,7 @@ def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it():
     assert np.abs(changes[1:] - changes[:-1]).max() < 0.5
 
 
-def test_tilting_the_trunk_moves_the_arm():
-    device = make_device()
+def test_tilting_the_trunk_moves_the_arm(device):
     device.advance(0.5)
     assert np.abs(device.arm.positions).max() < 1e-6
     device.pitch = 0.6
@@ -92,8 +85,7 @@ def test_tilting_the_trunk_moves_the_arm():
     assert np.abs(device.arm.positions).max() > 0.2
 
 
-def test_the_wearer_starts_after_the_delay():
-    device = make_device()
+def test_the_wearer_starts_after_the_delay(device):
     device.advance(1.0)
     wearer = VirtualWearer(
         TrialScript.parse({"name": "test", "steps": [{"move": list(RAISED), "over": 2.0}, {"hold": 1.0}]})
@@ -106,13 +98,20 @@ def test_the_wearer_starts_after_the_delay():
     np.testing.assert_allclose(device.arm.positions, RAISED, atol=0.03)
 
 
-def test_on_a_silent_bus_the_motors_keep_their_last_command():
-    device = make_device()
+@pytest.mark.parametrize(("fault", "of_joint_1"), [("bus_silent", True), ("cut_off", (True, False, False, False))])
+def test_a_motor_that_no_frame_reaches_keeps_its_last_command(device, fault, of_joint_1):
     device.exchange(1, ENTER)
     device.exchange(1, command(0, 2.0))
-    device.bus_silent = True
+    setattr(device, fault, of_joint_1)
     assert device.exchange(1, command(0, 0.0)) is None
     assert device.motors[0].torque(0.0, 0.0) == pytest.approx(2.0, abs=0.01)
+    assert (device.exchange(3, ENTER) is None) is (fault == "bus_silent")
+
+
+def test_an_encoder_error_shifts_the_angle_that_a_motor_replies(device):
+    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
+    reply = unpack_reply(SPECS[1], device.exchange(2, command(1))[1])
+    assert reply.position == pytest.approx(0.698, abs=0.001)
 
 
 def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
@@ -128,11 +127,6 @@ def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
 def test_two_motors_with_the_same_id_are_rejected(ids):
     with pytest.raises(ParameterError, match="can_id"):
         make_device(ids=ids)
-
-
-@pytest.fixture
-def device():
-    return make_device()
 
 
 def perform(device, *steps):

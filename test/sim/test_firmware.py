@@ -171,11 +171,12 @@ def test_the_open_drive_obeys_every_id_with_its_lowest_7_bits(name, can_id):
         ("vendor", PUSH[:6], True),
         ("open_drive", PUSH[:6], True),
         ("ak", b"", False),
+        ("ak", PUSH + bytes(1), False),
         ("vendor", b"", True),
         ("open_drive", b"", False),
     ],
 )
-def test_short_and_remote_frames_are_filled_with_what_is_left_of_the_frame_before(name, data, is_command):
+def test_short_and_remote_frames_are_ignored_or_filled_with_what_is_left_of_the_frame_before(name, data, is_command):
     motor = motor_of(name, timeout=0.01)
     play(motor, ENTER, PUSH)
     for _ in range(20):

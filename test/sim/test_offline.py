@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from exo_gravity.core import ArmModel
+from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.families import MOTORS
@@ -37,15 +39,20 @@ LIMITS = Limits(
     (3.0, 9.0, 3.0, 3.0),
     sign_check_torque=0.0,
 )
+ONE_G = Settings("right", DEFAULT_LINKS)
+BENT = (0.1, -0.06)  # rad
 DELAY = 2.5  # s after the motors are switched on, in which they ramp in
 
 
-def make(links=DEFAULT_LINKS, tilt=(0.1, -0.06), ids=(1, 2, 3, 4), script=SCRIPT):
-    """Return a trial of a simulated arm whose controller assumes `links`."""
-    device = SimulatedDevice(SimulatedArm(ArmConfig()), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
-    device.pitch, device.roll = 0.1, -0.06
-    assumed = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
-    arm = ArmSetup("right", device, assumed, LIMITS, Settings("right", links), 125.0, tilt and resting(*tilt))
+def make(true=None, assumed=ONE_G, tilt=BENT, ids=(1, 2, 3, 4), script=SCRIPT):
+    """Return a trial of a simulated arm that is as `true`, whose controller has the settings `assumed`.
+
+    tilt: of the trunk, rad; None: it is not measured.
+    """
+    device = SimulatedDevice(SimulatedArm(true), [SimulatedMotor(motor) for motor in MOTORS_AS_MOUNTED])
+    device.pitch, device.roll = tilt or BENT
+    motors = [replace(motor, can_id=can_id) for motor, can_id in zip(MOTORS_AS_MOUNTED, ids, strict=True)]
+    arm = ArmSetup("right", device, motors, LIMITS, assumed, 125.0, tilt and resting(*tilt))
     return OfflineTrial(arm, script, DELAY)
 
 
@@ -67,6 +74,18 @@ def test_the_arm_stays_where_the_wearer_released_it(done):
     assert trial.trouble == "" and trial.events == []
     np.testing.assert_allclose(position[0], POSE, atol=0.03)
     assert np.ptp(position, axis=0).max() < 0.001
+
+
+def test_zero_g_holds_a_wearers_arm_for_10_s_within_a_sixth_of_a_degree_by_masses_a_few_per_cent_off():
+    mass, cog = Wearer(75.0).on_links(DEFAULT_LINKS.length)
+    robot = ArmModel(DEFAULT_LINKS.length, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+    assumed = Settings("right", robot, mode="zero_g", support=1.0, wearer_mass=mass, wearer_cog=cog)
+    steps = [{"move": [0.2, 0.35, -0.2, 0.9], "over": 3.0}, {"hold": 10.0}]  # where the rated torques carry both arms
+    script = TrialScript.parse({"name": "release", "steps": steps})
+    trial = make(ArmConfig(wearer_mass=1.03 * mass, wearer_cog=cog), assumed, (0.06, -0.04), script=script)
+    position = held(trial.run())
+    assert np.degrees(np.abs(position - position[0]).max()) < 0.5 / 3.0
+    assert trial.trouble == ""
 
 
 def test_at_the_end_the_arm_is_let_down_gently_and_the_motors_are_off(done):

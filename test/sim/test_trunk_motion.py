@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.sim.script import Step
-from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
+from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, Turn, Walk, motion_of
 
 from ..support.trunk import orientation
 
@@ -97,8 +97,3 @@ def test_a_step_of_a_script_names_the_motion():
     assert motion_of(Step("walk", 3.0), 0.1, 0.2) == Walk((0.1, 0.2), 3.0)
     assert motion_of(Step("sit", 3.0), 0.1, 0.2) == SitDown((0.1, 0.2))
     assert motion_of(Step("hold", 3.0), 0.1, 0.2) is None
-
-
-def test_a_trunk_at_rest_neither_turns_nor_accelerates():
-    state = TrunkState(0.3, 0.2)
-    assert state.angular_velocity == state.angular_acceleration == state.acceleration == (0.0, 0.0, 0.0)

@@ -84,31 +84,6 @@ def test_what_was_written_survives_a_kill(tmp_path):
     assert path.stat().st_size >= 950 * RECORD.itemsize
 
 
-def test_a_motor_that_loses_power_for_30_ms_comes_back_switched_off(device):
-    device.exchange(2, ENTER)
-    device.unplug(1, 0.03)
-    device.advance(0.02)
-    assert device.exchange(2, JOINTS[1].command(0.0, 0.0)) is None
-    device.advance(0.02)
-    assert device.exchange(2, JOINTS[1].command(0.0, 0.0)) is not None
-    assert not device.motors[1].entered
-
-
-def test_a_motor_that_is_cut_off_keeps_its_torque_and_does_not_reply(device):
-    device.exchange(2, JOINTS[1].command(2.0, 0.0))
-    device.exchange(2, ENTER)
-    device.cut_off = (False, True, False, False)
-    assert device.exchange(2, EXIT) is None
-    assert device.motors[1].torque(0.0, 0.0) == pytest.approx(2.0, abs=0.01)
-    assert device.exchange(3, ENTER) is not None
-
-
-def test_an_encoder_error_shifts_the_angle_that_a_motor_replies(device):
-    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
-    _, data = device.exchange(2, JOINTS[1].command(0.0, 0.0))
-    assert JOINTS[1].sample(data, 0.0).position == pytest.approx(0.698, abs=0.001)
-
-
 def test_a_file_that_cannot_be_created_is_refused(tmp_path):
     with pytest.raises(ParameterError, match="truth"):
         TruthLog(tmp_path / "missing" / "truth.bin")

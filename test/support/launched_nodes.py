@@ -21,7 +21,7 @@ from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import Launcher, wearers
 
 from . import CONFIG
-from .ports import own_ports
+from .ports import free_port, own_ports
 
 Parameters = Mapping[str, Any]
 
@@ -108,9 +108,20 @@ class LaunchedNodes:
         self.ended_node: tuple[str, int] | None = None
         self._thread: threading.Thread | None = None
 
+    def add(self, name: str, **parameters: Any) -> None:
+        """Add a node to the file, before the start. name: its full name."""
+        content = yaml.safe_load(self.path.read_text())
+        self.path.write_text(yaml.safe_dump({**content, name: {"ros__parameters": parameters}}))
+
+    def add_panel(self, **parameters: Any) -> str:
+        """Add the panel; return the address of its page."""
+        port = free_port()
+        self.add("/panel", port=port, output=str(self.folder / "out"), **parameters)
+        return f"http://127.0.0.1:{port}/"
+
     @property
     def names(self) -> list[str]:
-        """The full names of the nodes to start: a test may have added some to the file."""
+        """The full names of the nodes to start."""
         nodes = load(self.path)
         return [*nodes, *(wearers(nodes) if self.wearer else ())]
 

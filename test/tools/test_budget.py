@@ -2,7 +2,6 @@
 """budget: from a parameter file to a table, a verdict, figures and an exit code."""
 
 import re
-import sys
 
 import matplotlib.image
 import pytest
@@ -94,12 +93,3 @@ def test_mirrored_arms_share_one_table(tmp_path, capsys):
 def test_a_wearer_who_does_not_fit_and_an_arm_without_a_bridge_are_refused_by_the_node(run, given, named):
     code, text = run("--body-mass", 75, **given)
     assert code == 2 and text.startswith("budget: ") and named in text and text.count("\n") == 1
-
-
-def test_a_missing_package_is_named_with_the_extra_that_installs_it(run, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(SystemExit) as ended:
-        run("--body-mass", 75, "--support", 0.068)
-    assert ended.value.code == 2
-    text = capsys.readouterr().err
-    assert "matplotlib is not installed" in text and "'.[report]'" in text

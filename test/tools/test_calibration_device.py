@@ -12,7 +12,7 @@ import pytest
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.lab.calibration import recorded
 from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
-from exo_gravity.lab.calibration.tours import friction_from, moments_from
+from exo_gravity.lab.calibration.tours import friction_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.trial.recording import Recording
@@ -43,23 +43,6 @@ def tours():
     loaded = ArmConfig(TRUTH, wearer_mass=(0.0, 0.0, 0.0, weight[0]), wearer_cog=(0.0, 0.0, 0.0, weight[1]))
     runs = device(), device(truth=loaded, load=weight)
     return [(run, run.run(Itinerary(run.limits, 8, 160.0))) for run in runs]
-
-
-@pytest.mark.thorough
-def test_two_tours_with_and_without_a_weight_give_kilograms_and_true_scales(tours):
-    assert [tour.trouble for _, tour in tours] == ["", ""]
-    result = moments_from(ARM, [one for _, tour in tours for one in tour.measured])
-    assert result.refusals == ()
-    found = result.identified
-    error = np.abs(found.moments[1:4] - TRUTH.first_moment[1:])
-    assert np.all(error < np.maximum(0.02 * np.array(TRUTH.first_moment[1:]), 2.0 * found.error[1:4]))
-    np.testing.assert_allclose(found.scale[1:], SCALES[1:], rtol=0.02)
-    # The remainder is a small part of friction: an arm with these values stays where it is let go.
-    poses = np.random.default_rng(2).uniform((-1.0, 0.1, -0.3, 0.1), (1.0, 1.4, 1.4, 1.6), (50, 4))
-    direction = tours[0][1].measured[0].direction
-    new = ArmModel.from_moments(ARM.robot.length, found.moments[:4], found.moments[4:])
-    remainder = gravity_torque(TRUTH, poses, direction) - gravity_torque(new, poses, direction)
-    assert np.abs(remainder).max() < 0.2 * FRICTION.min()
 
 
 def recorded_by(run, folder, torque_scale=1.0):

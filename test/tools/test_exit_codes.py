@@ -39,7 +39,7 @@ WRONG = [
     ("train_anfis", [*LAW, "--bag", "nowhere"], "nowhere"),
     ("train_anfis", [*LAW, "--side", "middle"], "middle"),
     ("train_anfis", [*LAW, "--functions", "1"], "functions"),
-    ("trial", ["no_such_trial"], "no_such_trial"),
+    ("trial", ["no_such_trial"], "thirteen_poses, two_poses or a YAML file"),
     ("trial", ["demo", *NO_FILE], "nowhere.yaml"),
     ("trial", ["demo", "--offline", "--params", EXO], "a file with a simulator"),
     ("trial", ["two_poses", "--params", "urdf.yaml"], "a file with a can_bridge, whose arm a trial follows"),
@@ -51,6 +51,7 @@ WRONG = [
 ]
 WITHOUT = {  # by tool: the package, words that need it, and how it is installed
     "report": ("rosbags.typesys", ["b"], ".[report]"),
+    "budget": ("matplotlib.figure", ["--body-mass", "75", "--support", "0.068"], ".[report]"),
     "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
     "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
     "doctor": ("rich", ["--seconds", "0"], "python3-rich"),

@@ -250,16 +250,6 @@ def test_a_killed_trial_is_not_said_to_have_been_let_down(tmp_path, capsys):
     assert "let down" not in (tmp_path / "out" / "motions.csv").read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("without_pictures")
-def test_a_recording_cut_short_is_reported_and_says_so(short_bag, tmp_path, capsys):
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes((short_bag / "short.mcap").read_bytes())
-    made.cut(cut, 2 / 3)
-    assert main([str(cut), "--output", str(tmp_path / "out")]) in (0, 1)
-    assert "cut short" in " ".join(capsys.readouterr().out.split())
-    assert len(csv_rows(tmp_path / "out" / "holds.csv")) >= 4
-
-
 def test_a_trial_of_which_nothing_was_recorded_has_a_report_too(tmp_path):
     write_empty(tmp_path, "demo", "stopped by the operator")
     assert "demo" in Page(tmp_path).text and "Nothing was recorded: stopped by the operator." in Page(tmp_path).text

@@ -18,7 +18,7 @@ import yaml
 from rich.console import Console
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import DataError
 from exo_gravity.lab.trial import run as running
 from exo_gravity.lab.trial.run import TrialEnd, follow, is_guided, too_busy
 from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen, describe
@@ -45,12 +45,6 @@ def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limit
     for pitch, roll in itertools.product((-0.35, 0.0, 0.35), repeat=2):  # 20 degrees
         torque = gravity_torque(arm, poses, Tilt.of("right", pitch, roll).direction)
         assert np.all(np.abs(torque) < RATED)
-
-
-def test_an_unknown_name_is_answered_with_the_packaged_trials():
-    with pytest.raises(ParameterError) as caught:
-        read_script("nosuch")
-    assert all(name in str(caught.value) for name in PACKAGED)
 
 
 def bag_with(holds):
@@ -228,15 +222,6 @@ def test_a_trial_on_running_nodes_ends_after_a_few_seconds_without_a_bridge():
     screen.take(json.dumps(line))
     screen.now += 2.0 * BRIDGE_TIMEOUT
     assert not screen.has_no_bridge
-
-
-def test_a_file_without_a_bridge_is_refused_at_once(tmp_path, capsys):
-    path = tmp_path / "urdf.yaml"
-    of_urdf = {"law": "urdf", "urdf.file": "arm.urdf", "joint_names": ["a1", "a2"], "command_interface": "multi_array"}
-    path.write_text(yaml.safe_dump({"/arm/compensator": {"ros__parameters": of_urdf}}))
-    assert trial.main(["two_poses", "--params", str(path), "--output", str(tmp_path / "out")]) == 2
-    assert "must be a file with a can_bridge" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,11 @@ def guess_of(moments=MOMENTS, tilt=UPRIGHT) -> TorqueGuess:
     return TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), moments, tilt)
 
 
+@pytest.fixture
+def guess() -> TorqueGuess:
+    return guess_of()
+
+
 def expected(tour, links, scales=(1.0,) * 4):
     """The commanded torque (n, 4) in Nm that holds the true arm in each measured pose."""
     return np.array([gravity_torque(links, o.theta, o.direction) / scales for o in tour.measured])
@@ -151,9 +156,8 @@ def test_a_joint_that_slips_between_two_passes_is_named():
     assert not tour.measured
 
 
-def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
+def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour(guess):
     run = TourRun()
-    guess = guess_of()
     for now, tilt, words in ((1.5, (0.0, 0.0), "no joint states for 500 ms"), (1.01, (0.2, 0.0), "tilted by 0.20 rad")):
         tour = Tour(run.limits, guess, fixed([POSE]), 100.0)
         assert tour.step(1.0, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) is not None
@@ -161,8 +165,7 @@ def test_joint_states_that_stop_and_a_stand_that_moves_end_the_tour():
         assert words in tour.trouble
 
 
-def test_the_arm_is_held_until_the_next_pose_is_chosen():
-    guess = guess_of()
+def test_the_arm_is_held_until_the_next_pose_is_chosen(guess):
     tour = Tour(LIMITS, guess, fixed([POSE]), 100.0)
     for cycle in range(200):
         assert tour.step(0.01 * cycle, (0.0,) * 4, (0.0,) * 4, Tilt.of("right")) == pytest.approx((0.0,) * 4, abs=0.01)
@@ -178,8 +181,7 @@ class Broken(Itinerary):
         raise np.linalg.LinAlgError("Singular matrix")
 
 
-def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_reason():
-    guess = guess_of()
+def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_reason(guess):
     tour, step = Tour(LIMITS, guess, Broken(LIMITS, 1, 60.0), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
     assert tour.step(0.0, *step) is not None
     tour.plan()
@@ -187,8 +189,7 @@ def test_an_error_of_any_kind_in_the_choice_of_a_pose_ends_the_tour_with_its_rea
     assert tour.trouble == "the next pose could not be chosen: LinAlgError: Singular matrix"
 
 
-def test_a_pose_is_swept_again_if_motors_vibrated_in_it(monkeypatch):
-    guess = TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), moments_of(DEFAULT_LINKS), Tilt.of("right"))
+def test_a_pose_is_swept_again_if_motors_vibrated_in_it(guess, monkeypatch):
     tour, frictions, way = Tour(LIMITS, guess, fixed([POSE]), 100.0), [0.2, 0.9, 0.2, 0.2], np.linspace(-0.03, 0.03, 20)
     position, down = np.array(POSE.theta) + way[:, None], np.tile((0.0, 0.0, 1.0), (20, 1))
 
@@ -203,8 +204,7 @@ def test_a_pose_is_swept_again_if_motors_vibrated_in_it(monkeypatch):
     np.testing.assert_allclose(tour.measured[0].friction, 0.2)
 
 
-def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs():
-    guess = guess_of()
+def test_an_arm_is_not_held_for_ever_while_the_choice_of_a_pose_hangs(guess):
     tour, step = Tour(LIMITS, guess, fixed([POSE]), 100.0), ((0.0,) * 4, (0.0,) * 4, Tilt.of("right"))
     efforts = [tour.step(0.05 * cycle, *step) for cycle in range(610)]
     assert efforts[590] is not None and efforts[-1] is None
@@ -279,8 +279,7 @@ def test_an_arm_hangs_on_until_it_is_carried_though_its_motors_are_stronger_than
     np.testing.assert_allclose(run.log[0][1:5], (0.0, 0.1, 0.19, 0.0), atol=0.1)
 
 
-def test_chosen_poses_are_within_the_limits_and_can_be_held():
-    guess = guess_of()
+def test_chosen_poses_are_within_the_limits_and_can_be_held(guess):
     limits = replace(LIMITS, max_effort=(3.0, 4.0, 1.8, 3.0))
     itinerary = Itinerary(limits, 4, 120.0)
     low, high = measurable(LIMITS, POSE.amplitude)
@@ -311,17 +310,15 @@ def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more
     assert len(taken) == 8
 
 
-def test_the_first_poses_are_visited_again_at_the_end():
-    guess = guess_of()
+def test_the_first_poses_are_visited_again_at_the_end(guess):
     itinerary, taken = Itinerary(LIMITS, 4, 160.0, again=2), np.empty((0, 4))
     while station := itinerary.next(taken, np.zeros(4), 15.0 * len(taken), guess, (0.2,) * 4):
         taken = np.vstack((taken, station.theta))
     assert len(taken) == itinerary.count == 6 and np.array_equal(taken[4:], taken[:2])
 
 
-def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so():
+def test_without_a_pose_that_the_motors_can_hold_the_tour_says_so(guess):
     weak = replace(LIMITS, max_effort=(0.1,) * 4)
-    guess = guess_of()
     itinerary, state = Itinerary(weak, 4, 120.0), (np.zeros((1, 4)), np.zeros(4), 0.0, guess, (0.0,) * 4)
     itinerary.next(*state)  # the hanging arm
     with pytest.raises(DataError, match="max_effort"):
