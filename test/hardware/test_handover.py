@@ -11,11 +11,10 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, MotorCommand, unpack_command
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
-from exo_gravity.hardware.can.can_port import ArmOnBus
 
 from ..support.simulated_device import drive_of
 from ..support.thorough import quick
-from .rig import LIMITS, MOTORS_OF_ARM, VirtualRig
+from .rig import MOTORS_OF_ARM, VirtualRig
 from .simulated_rig import PERIOD
 from .wires import Responder
 
@@ -55,15 +54,6 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     assert rig.motors_on == [False] * 4
 
 
-def test_a_motor_that_does_not_reply_may_still_be_powered():
-    rig = VirtualRig()
-    rig.device.bus_silent = True
-    log = []
-    assert not rig.let_down(log=log.append, is_wanted=True)
-    assert log == ["a motor does not reply; it may still be powered; trying again"]
-    assert rig.notes.drive.powered
-
-
 @pytest.mark.parametrize("is_adapter", quick([True], [False, True]), ids=["a motor", "the adapter"])
 def test_an_arm_that_is_reached_again_late_is_let_down(is_adapter):
     rig, log = VirtualRig(), []
@@ -92,10 +82,3 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_the_log_is_honest():
     assert rig.let_down(log=log.append)
     assert log == ["CAN bus can0 cannot be opened; the motors may still be powered"]
     rig.assert_let_down()
-
-
-def test_a_single_attempt_at_a_bus_that_cannot_be_opened_fails_with_the_reason():
-    rig, log = VirtualRig(), []
-    rig.arm = ArmOnBus(("no_such_interface", "x", {}), MOTORS_OF_ARM, LIMITS, PERIOD)
-    assert not rig.let_down(log=log.append, is_wanted=True)
-    assert "CAN bus no_such_interface x" in log[0]
