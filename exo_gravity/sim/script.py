@@ -84,7 +84,7 @@ class TrialScript:
         """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
         if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
             raise ParameterError("script", content, "a mapping with the keys name and steps only")
-        name, steps = str(content["name"]), content["steps"]
+        name, steps = str(content["name"] or ""), content["steps"]
         if not NAME.fullmatch(name):  # of the trial's folder
             raise ParameterError("name", name, "1 to 64 letters, digits, spaces and . _ + -, a letter or digit first")
         if not isinstance(steps, list) or not steps:
