@@ -19,7 +19,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS, floats, one_float
 
 MAX_DURATION = 3600.0  # s
-NAME = re.compile(r"\w[\w .+-]{0,63}")
+NAME = re.compile(r"\w[^/\x00-\x1f\x7f]{0,99}")
 TIMED = {"hold": 0.1, "walk": 2.0, "sit": 1.0}  # steps that have only a duration, and the shortest of each in s
 
 
@@ -84,9 +84,9 @@ class TrialScript:
         """Return the script described by YAML content. Raises ParameterError that names the invalid entry."""
         if not isinstance(content, Mapping) or set(content) != {"name", "steps"}:
             raise ParameterError("script", content, "a mapping with the keys name and steps only")
-        name, steps = str(content["name"]), content["steps"]
+        name, steps = str(content["name"] or ""), content["steps"]
         if not NAME.fullmatch(name):  # of the trial's folder
-            raise ParameterError("name", name, "1 to 64 letters, digits, spaces and . _ + -, a letter or digit first")
+            raise ParameterError("name", name, "1 to 100 characters without / and line breaks, a letter or digit first")
         if not isinstance(steps, list) or not steps:
             raise ParameterError("steps", steps, "a list of at least one step")
         script = cls(name, tuple(Step.parse(entry, f"steps[{i}]") for i, entry in enumerate(steps)))

@@ -10,6 +10,7 @@ Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong us
 import argparse
 import math
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 
 from exo_gravity.core.arm.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
@@ -52,7 +53,9 @@ def _run(options: argparse.Namespace) -> int:
     for arm in arms:
         for joint in range(len(arm.joints)):
             written.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-            joint_figure(arm, joint).savefig(folder / written[-1], dpi=DPI)
+            picture = BytesIO()
+            joint_figure(arm, joint).savefig(picture, dpi=DPI)
+            (folder / written[-1]).write_bytes(picture.getvalue())  # at once: Ctrl-C leaves no half of a picture
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")

@@ -33,7 +33,7 @@ def test_steps_of_the_trunk_have_an_angle_or_only_a_duration_and_one_of_the_hand
     [
         (None, "script"),
         ({"name": "x", "steps": [], "extra": 1}, "script"),
-        *(({"name": name, "steps": [{"hold": 1}]}, "name") for name in ("/tmp/x", "../x", "", "a\nb", "x" * 65)),
+        *(({"name": name, "steps": [{"hold": 1}]}, "name") for name in ("/tmp/x", "../x", "", None, "a\nb", "x" * 101)),
         ({"name": "x", "steps": []}, "steps"),
         ({"name": "x", "steps": [{"hold": 1, "over": 1}]}, "steps[0]"),
         ({"name": "x", "steps": [{"hold": "long"}]}, "steps[0].hold"),

@@ -136,7 +136,7 @@ class AnfisLaw:
             return cls(Anfis(*parts), low, high, moment, gravity, str(content["source"]), error)
         except KeyError as error:
             raise DataError(f"ANFIS file: the key {error.args[0]} is missing") from None
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             raise DataError(f"ANFIS file: {error}: must be a file from train_anfis") from None
 
     def outside(self, arm: ArmModel, theta: Sequence[float], tilt: Tilt) -> str:
