@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -89,6 +90,19 @@ def test_efforts_of_the_outer_loop_are_added_and_the_arm_stays_carried_without_t
     rig.wait_until(lambda: rig.adds(STILL))
     rig.wait_until(lambda: (rig.values["assist"], rig.values["assist reason"]) == ("waiting", "stopped"))
     rig.wait_until(lambda: rig.message == "compensating" and rig.values["warnings"] == "none")
+
+
+@pytest.mark.thorough
+def test_wrong_efforts_are_withdrawn_and_reported_while_gravity_compensation_goes_on(rig):
+    rig.assisted = True
+    rig.set(assist__max_effort=[1.0] * 4)
+    rig.wait_until(lambda: rig.adds(ASSIST))
+    rig.efforts = (math.nan, 0.0, 0.0, 0.0)  # other refusals: test/core/terms/test_assist.py
+    rig.wait_until(lambda: rig.adds(STILL))
+    rig.wait_until(lambda: rig.message.startswith("gravity compensation alone: assist_efforts must be numbers"))
+    assert (rig.values["assist reason"], rig.values["warnings"]) == ("invalid", "terms_refused")
+    rig.efforts = ASSIST
+    rig.wait_until(lambda: rig.adds(ASSIST) and rig.message == "compensating")
 
 
 def test_a_second_outer_loop_ends_the_assistance_of_both(rig):
