@@ -10,7 +10,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 
-import can
 import pytest
 
 from exo_gravity.core.motors.ak import MIT
@@ -29,14 +28,23 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.hardware.can.can_port import CanPort, message_of
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 
 from ..support.copies import prepared
 from ..support.thorough import quick
-from .carried_arm import DRIVEN, ENERGY, EVENTS, POSE, REAL_RATE, UNKNOWN_LOSS, CarriedArm, stall
+from .carried_arm import (
+    EVENTS,
+    POSE,
+    REAL_RATE,
+    UNKNOWN_LOSS,
+    CarriedArm,
+    assert_held_and_let_down,
+    assert_switched_on_and_off_without_a_collision,
+    stall,
+)
+from .wires import Responder, motor_bus
 
 NAMES = ("DM-J4340", "DM-J8009", "DM-J4340", "DM-J4310")
 PEAK = (9.0, 18.0, 9.0, 7.0)  # Nm
@@ -75,42 +83,23 @@ MIXED = ("AK80-9", "DM-J8009", "DM-J4340", "AK60-6")
 
 @pytest.mark.parametrize("names", [pytest.param(NAMES, marks=pytest.mark.thorough), MIXED], ids=["damiao", "mixed"])
 def test_an_arm_is_switched_on_and_off_without_a_collision(names: tuple[str, ...]) -> None:
-    arm = arm_of(names, bitrate=1_000_000)
-    arm.enable()
-    assert arm.run_until(lambda: arm.safety.state is State.PROVING and arm.safety.waiting_for == "", 5.0)
-    arm.run(0.5)
-    assert arm.device.powered
-    arm.safety.disable(arm.now)
-    assert arm.run_until(lambda: arm.loop.is_off, 1.0)
-    assert not arm.device.powered
-    assert arm.wire.collisions == arm.wire.bus_offs == 0
+    assert_switched_on_and_off_without_a_collision(arm_of(names, bitrate=1_000_000))
 
 
 @pytest.mark.parametrize("is_fd", quick([True], [False, True]), ids=["classic", "fd"])
 def test_an_arm_is_held_and_let_down(is_fd: bool) -> None:
     arm = arm_of(is_fd=is_fd)
-    frames: list[can.Message] = []
-
-    class Listener:
-        def deliver(self, message: can.Message) -> None:
-            frames.append(message)
-
-    arm.wire.ends.append(Listener())
+    listener = Responder(arm.wire)
     arm.carry()
-    assert {(message.is_fd, message.bitrate_switch) for message in frames} == {(is_fd, is_fd)}
+    assert {(message.is_fd, message.bitrate_switch) for message in listener.received} == {(is_fd, is_fd)}
     arm.raise_to(POSE)
-    arm.run(3.0)
-    assert arm.caused.speed < 0.05
-    arm.safety.disable(arm.now)
-    assert arm.run_until(lambda: arm.loop.is_off, 30.0)
-    assert not arm.device.powered
-    assert arm.caused.speed < DRIVEN and arm.caused.energy < ENERGY
+    assert_held_and_let_down(arm)
 
 
 def test_a_torque_that_another_tool_left_in_the_motors_memory_is_not_carried_out() -> None:
     arm = arm_of(remembered=4.9)
     arm.carry()
-    assert arm.caused.speed < DRIVEN and arm.caused.energy < ENERGY
+    arm.assert_not_thrown()
 
 
 EVENTS_HERE = {**EVENTS, "loop stalls for 300 ms": stall(0.3)}
@@ -120,14 +109,9 @@ WORST = ("motor 2 restarts in 30 ms", "loop stalls for 300 ms")
 @pytest.mark.parametrize("event", quick(WORST, EVENTS_HERE))
 def test_whatever_the_firmware_drops_the_motors_drive_no_joint(event: str) -> None:
     arm = raised_arm()
-    EVENTS_HERE[event](arm)
-    arm.see_out()
-    caused = arm.caused
-    speed, energy = (DRIVEN, ENERGY) if "stalls" in event else UNKNOWN_LOSS
-    assert caused.speed < speed and caused.energy < energy, caused
-    dips = sum(motor.dips for motor in arm.device.motors)
-    assert bool(dips) == (event == "loop stalls for 300 ms")
+    arm.go_through(EVENTS_HERE[event], is_loss="stalls" not in event)
     assert arm.safety.state is State.ACTIVE or arm.safety.fault
+    assert any(motor.dips for motor in arm.device.motors) == (event == "loop stalls for 300 ms")
 
 
 def test_motors_that_let_go_in_a_stall_are_switched_on_again_and_lower_the_arm() -> None:
@@ -190,7 +174,7 @@ def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> No
     FOREIGN[command](arm)
     arm.run_until(lambda: arm.loop.is_off, 30.0)
     assert arm.safety.fault and arm.safety.fault.code is FaultCode.FOREIGN_COMMAND
-    assert arm.caused.speed < UNKNOWN_LOSS[0] and arm.caused.energy < UNKNOWN_LOSS[1], arm.caused
+    arm.assert_not_thrown(*UNKNOWN_LOSS)
     assert not arm.device.powered
 
 
@@ -231,7 +215,7 @@ def test_a_motor_with_an_error_is_never_switched_on_again() -> None:
     fault = arm.safety.fault
     assert fault and fault.code is FaultCode.MOTOR_ERROR and "error 10 (over-current)" in fault.reason
     assert not arm.device.motors[1].entered
-    assert arm.caused.speed < UNKNOWN_LOSS[0] and arm.caused.energy < UNKNOWN_LOSS[1], arm.caused
+    arm.assert_not_thrown(*UNKNOWN_LOSS)
 
 
 def test_an_error_that_has_passed_is_forgotten_once_the_operator_clears_the_fault() -> None:
@@ -250,7 +234,7 @@ def test_an_error_that_has_passed_is_forgotten_once_the_operator_clears_the_faul
 def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
     arm = arm_of()
     joints = [replace(joint_of(name, 1 + i), master_id=0x20 + i if i == 1 else 0) for i, name in enumerate(NAMES)]
-    bus = MotorBus([CanPort(arm.wire.open(), arm.clock)] * len(joints), joints, clock=arm.clock)
+    bus = motor_bus(arm.wire, joints)
     bus.listen()
     arm.run(0.1)
     assert bus.boards.hindrance(arm.now, 250.0) == ""

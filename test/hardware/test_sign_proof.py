@@ -4,24 +4,15 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import pytest
 
-from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.lab.controllers import DirectController
-from exo_gravity.lab.inputs.arms import carried_arm, node_values
-from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.damiao import DamiaoMotor
-from exo_gravity.sim.params import device_of, simulator_table
-from exo_gravity.sim.virtual_arm import VirtualArm
 
 from ..support.thorough import quick
-from .carried_arm import DRIVEN
+from .carried_arm import DRIVEN, ShippedArm
 
 RATE = 100.0  # Hz, the lowest in use: a light joint gains most speed in a cycle
 LIGHT = 6  # the seven-joint arm's last joint, 0.002 kg m^2
@@ -51,27 +42,12 @@ class ReversedMotor(DamiaoMotor):
         return False
 
 
-class ProvenArm(VirtualArm):
-    """The simulated arm of a file in config. fastest: rad/s, the largest true speed of a joint so far.
-
-    kinds: of motors, by joint (0..), in place of the usual ones.
-    """
-
-    def __init__(self, name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
-        nodes = load(packaged_config(f"{name}.yaml"))
-        arm = carried_arm(nodes, "/right")
-        given = device_of(node_values(nodes, "/right/simulator", simulator_table(nodes["/right/simulator"])))
-        motors = [kinds.get(n, simulated)(joint) for n, joint in enumerate(arm.motors)]
-        device = SimulatedDevice(given.arm, motors)
-        settings = replace(arm.settings, use_imu=False)
-        controller = DirectController(Compensator(settings, arm.limits.joint_names), arm.limits)
-        self.fastest = 0.0
-        super().__init__(device, controller, arm.motors, arm.limits, RATE, look=self._look)
-        self.enable()
-        assert self.run_until(lambda: self.safety.state in (State.RAMPING_IN, State.FAULT), 60.0)
-
-    def _look(self) -> None:
-        self.fastest = max(self.fastest, *map(abs, self.device.arm.velocities), 0.0)
+def proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> ShippedArm:
+    """Return an arm whose signs are proven, or that is refused."""
+    arm = ShippedArm(name, RATE, kinds)
+    arm.enable()
+    assert arm.run_until(lambda: arm.safety.state in (State.RAMPING_IN, State.FAULT))
+    return arm
 
 
 PROVEN: list[tuple[str, dict[int, type[DamiaoMotor]]]] = [
@@ -89,13 +65,13 @@ PROVEN: list[tuple[str, dict[int, type[DamiaoMotor]]]] = [
     ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies"],
 )
 def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
-    arm = ProvenArm(name, kinds)
+    arm = proven(name, kinds)
     assert arm.safety.state is State.RAMPING_IN, arm.safety.fault
     assert 0.0 < arm.fastest < DRIVEN
 
 
 def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
-    arm = ProvenArm("seven_joints", {LIGHT: ReversedMotor})
+    arm = proven("seven_joints", {LIGHT: ReversedMotor})
     assert arm.safety.fault and arm.safety.fault.code is FaultCode.WRONG_SIGN
     arm.run(1.0)
     assert not arm.device.powered

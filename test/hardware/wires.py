@@ -6,11 +6,14 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import can
 
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.virtual_time import Wire
@@ -76,3 +79,8 @@ def wire_for_test() -> Iterator[Wire | RealWire]:
     yield wire
     if isinstance(wire, RealWire):
         wire.close()
+
+
+def motor_bus(wire: Wire | RealWire, joints: Sequence[JointMotor]) -> MotorBus:
+    """Return the bridge's end of a bus with all these motors."""
+    return MotorBus([CanPort(wire.open(), wire.clock)] * len(joints), joints, clock=wire.clock)
