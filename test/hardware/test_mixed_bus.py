@@ -17,8 +17,6 @@ from exo_gravity.core.motors.frames import ENTER, EXIT, EXTENDED, ID_BITS, WireF
 from exo_gravity.core.safety.drive import Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 from exo_gravity.sim.virtual_time import Wire
@@ -26,7 +24,7 @@ from exo_gravity.sim.virtual_time import Wire
 from ..support.simulated_device import OFF, drive_of, joints_of, make_device, sending
 from .rig import CYCLE, LIMITS
 from .test_motor_bus import WEIGHTLESS, now
-from .wires import wire_for_test
+from .wires import motor_bus, wire_for_test
 
 MIXED = (MIT, MIT_V3, MIT_V3, MIT)
 V3 = (MIT_V3,) * 4
@@ -59,10 +57,6 @@ def start(wire: Wire) -> Callable[..., SimulatedDevice]:
     return start
 
 
-def motor_bus(wire: Wire, formats: tuple[WireFormat, ...]) -> MotorBus:
-    return MotorBus([CanPort(wire.open(), wire.clock)] * len(formats), joints_of(formats), clock=wire.clock)
-
-
 def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
     """Return the commands on the bus so far, V3 boards' with `EXTENDED` in their ID."""
     frames = []
@@ -77,7 +71,7 @@ def sent(bus: can.BusABC) -> list[tuple[int, bytes]]:
 @pytest.mark.parametrize("formats", [MIXED, V3], ids=["mixed", "v3"])
 def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wire, other, start, formats) -> None:
     start(formats)
-    bus = motor_bus(wire, formats)
+    bus = motor_bus(wire, joints_of(formats))
     bus.listen()
     sent(other)
     for _ in range(3):
@@ -96,7 +90,7 @@ def test_every_motor_is_read_and_a_v3_board_that_is_off_is_sent_only_its_exit(wi
 
 def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wire, other, start) -> None:
     device, joints = start(MIXED), joints_of(MIXED)
-    bus = motor_bus(wire, MIXED)
+    bus = motor_bus(wire, joints_of(MIXED))
     bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
     for _ in range(3):
         assert bus.exchange(ON, now(bus) + 1.0)
@@ -111,7 +105,7 @@ def test_motors_of_both_formats_apply_their_torque_and_are_switched_off(wire, ot
 @pytest.mark.parametrize("mode", [0, 1, 5, 8])
 def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wire, other, mode) -> None:
     joints = joints_of(MIXED)
-    bus = motor_bus(wire, MIXED)
+    bus = motor_bus(wire, joints_of(MIXED))
     bus.exchange(ON, now(bus))
     sent(other)
     other.send(can.Message(arbitration_id=mode << 8 | 2, data=bytes(8), is_extended_id=True))
@@ -127,7 +121,7 @@ def test_a_foreign_command_to_a_v3_board_is_counted_and_opposed(wire, other, mod
 
 def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wire, other, start) -> None:
     start(MIXED)
-    bus = motor_bus(wire, MIXED)
+    bus = motor_bus(wire, joints_of(MIXED))
     bus.listen()
     message = can.Message(arbitration_id=0x803, data=bytes(8), is_extended_id=True)
     wire.repeat(message, 0.01)
@@ -136,7 +130,7 @@ def test_status_frames_are_not_taken_for_another_host_but_its_commands_are(wire,
 
 
 def test_a_broadcast_that_v3_boards_obey_is_opposed_at_each_of_them(wire, other) -> None:
-    bus = motor_bus(wire, MIXED)
+    bus = motor_bus(wire, joints_of(MIXED))
     bus.exchange(ON, now(bus))
     sent(other)
     other.send(can.Message(arbitration_id=0x8FF, data=bytes(8), is_extended_id=True))
@@ -148,7 +142,7 @@ def test_a_broadcast_that_v3_boards_obey_is_opposed_at_each_of_them(wire, other)
 
 def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other) -> None:
     joints = joints_of(MIXED)
-    bus = motor_bus(wire, MIXED)
+    bus = motor_bus(wire, joints_of(MIXED))
     bus.exchange(ON, now(bus))
     sent(other)
     other.send(can.Message(arbitration_id=1, data=EXIT, is_extended_id=False))
@@ -163,7 +157,7 @@ def test_an_exit_that_was_not_ours_is_undone_on_both_kinds_of_board(wire, other)
 @pytest.mark.parametrize("formats", [(MIT,) * 4, V3], ids=["v2", "v3"])
 def test_another_host_that_drives_motors_which_are_off_is_a_fault_until_it_stops(wire, other, start, formats) -> None:
     device, joint = start(formats), joints_of(formats)[1]
-    bus = motor_bus(wire, formats)
+    bus = motor_bus(wire, joints_of(formats))
     loop = ControlLoop(bus, SafetyMachine(LIMITS, CYCLE), CYCLE, NoController())
 
     def run(seconds: float) -> None:

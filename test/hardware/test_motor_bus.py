@@ -24,7 +24,7 @@ from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, 
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
 from ..support.simulated_device import OFF, drive_of, frame, sending
-from .wires import wire_for_test
+from .wires import motor_bus, wire_for_test
 
 AK60 = MOTORS["AK60-6"]
 MOUNTED = (("AK60-6", 1, 0.0), ("AK80-9", -1, 0.4), ("AK60-6", 1, -0.2), ("AK60-6", 1, 0.0))
@@ -41,14 +41,14 @@ def wire():
 
 
 @pytest.fixture
-def bus(wire):
-    return MotorBus([CanPort(wire.open(), wire.clock)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM, clock=wire.clock)
-
-
-@pytest.fixture
 def other(wire):
     """The test's end of the bus."""
     return wire.open()
+
+
+@pytest.fixture
+def bus(wire):
+    return motor_bus(wire, MOTORS_OF_ARM)
 
 
 def now(bus: MotorBus) -> float:
@@ -82,15 +82,6 @@ def test_a_bus_in_place_of_the_motors_ports_is_refused_at_once(other):
         MotorBus(other, MOTORS_OF_ARM)
     with pytest.raises(ParameterError, match="ports"):
         MotorBus([None], MOTORS_OF_ARM)
-
-
-def test_an_exchange_moves_the_simulated_arm(bus, device):
-    before = device.arm.positions[3]
-    end = now(bus) + 5.0
-    bus.exchange(sending(Send.ENTER), now(bus) + 1.0)
-    while device.arm.positions[3] < before + 0.2 and now(bus) < end:
-        bus.exchange(drive_of((0.0, 0.0, 0.0, 2.0)), now(bus) + 1.0)
-    assert device.arm.positions[3] > before + 0.2
 
 
 def test_each_motor_gets_the_frames_that_it_is_to_be_sent(bus, other):
