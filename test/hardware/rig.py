@@ -21,7 +21,7 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import Clock
 from exo_gravity.hardware.control_loop import Controller, NoController
-from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
+from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.virtual_arm import VirtualArm
@@ -132,13 +132,26 @@ class VirtualRig(Rig):
         for motor in self.device.motors:
             motor.unplugged = not on
 
+    def notes_of(self, drive: Drive | None = None) -> DriveNotes:
+        """Return notes in memory, as a bridge has them that applies `drive`; by default what holds the arm."""
+        notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+        notes.clock = self.clock
+        notes.note(drive or self.drive)
+        return notes
+
+    def leave_on(self) -> None:
+        """Leave the notes of a bridge that died with its watchdog, on each bus; of other buses they know nothing."""
+        for part in self.arm.parts:
+            lock = BusLock(part.address, "a dead bridge")
+            own = [torque if joint in part.joints else 7.0 for joint, torque in enumerate(self.carrying)]
+            lock.notes.note(drive_of(own))
+            lock.release()
+
     def let_down(
         self, drive: Drive | None = None, is_wanted: bool = False, log: Callable[[str], None] = lambda text: None
     ) -> bool:
         """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
-        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
-        self.notes.clock = self.clock
-        self.notes.note(drive or self.drive)
+        self.notes = self.notes_of(drive)
         return let_down(self.arm, ArmNotes([self.notes] * 4), log, lambda: is_wanted)
 
 

@@ -11,8 +11,6 @@ import sys
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 from exo_gravity.hardware.ownership.bus_lock import (
     ATTEMPT_TIME,
@@ -28,7 +26,7 @@ from exo_gravity.sim.virtual_time import VirtualClock
 from ..support.simulated_device import OFF, drive_of
 from .rig import MOTORS_OF_ARM, VirtualRig
 from .simulated_rig import NoWatchdog
-from .wires import Responder
+from .wires import Responder, motor_bus
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
@@ -177,7 +175,7 @@ def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
 def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
     """Another host does not see the lock: its frames show it."""
     rig = VirtualRig(carried=False, pose=(0.0,) * 4)
-    other = MotorBus([CanPort(rig.wire.open(), rig.clock)] * len(MOTORS_OF_ARM), MOTORS_OF_ARM, clock=rig.clock)
+    other = motor_bus(rig.wire, MOTORS_OF_ARM)
     rig.clock.every(0.02, lambda: other.exchange(OFF, rig.clock.monotonic()))
     owned = OwnedBus(rig.arm, "a test", print, rig.clock)
     with pytest.raises(BusError, match="is in use: another sender commands motor"):
@@ -189,7 +187,7 @@ def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
 @pytest.mark.parametrize("is_recovery", [True, False], ids=["recovery", "next owner"])
 def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(is_recovery):
     rig, log = VirtualRig(), []
-    leave_on(rig)
+    rig.leave_on()
     if is_recovery:
         take_over(rig.arm, "a recovery", log.append, clock=rig.clock).release()
     else:
@@ -217,18 +215,11 @@ def test_a_watchdog_stays_with_an_arm_that_the_next_owner_cannot_reach(monkeypat
             stayed.append(lock.notes.drive.powered)
 
     monkeypatch.setattr(owned_bus, "Watchdog", Stays)
-    leave_on(rig)
+    rig.leave_on()
     rig.device.bus_silent = True
     with pytest.raises(BusError, match="a motor that may be powered does not reply"):
         OwnedBus(rig.arm, "the next owner", lambda text: None, rig.clock)
     assert stayed == [True]
     lock = BusLock(rig.arm.address, "a test")
     assert lock.notes.drive.powered
-    lock.release()
-
-
-def leave_on(rig: VirtualRig) -> None:
-    """Note that the arm of `rig` is carried, and release its bus."""
-    lock = BusLock(rig.arm.address, "/right/can_bridge (PID 1)")
-    lock.notes.note(rig.drive)
     lock.release()

@@ -55,15 +55,6 @@ def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     assert rig.motors_on == [False] * 4
 
 
-def test_a_motor_that_does_not_reply_may_still_be_powered():
-    rig = VirtualRig()
-    rig.device.bus_silent = True
-    log = []
-    assert not rig.let_down(log=log.append, is_wanted=True)
-    assert log == ["a motor does not reply; it may still be powered; trying again"]
-    assert rig.notes.drive.powered
-
-
 @pytest.mark.parametrize("is_adapter", quick([True], [False, True]), ids=["a motor", "the adapter"])
 def test_an_arm_that_is_reached_again_late_is_let_down(is_adapter):
     rig, log = VirtualRig(), []

@@ -14,7 +14,7 @@ from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import Drive, State
 
 from ..support.thorough import quick
-from .rig import QUICK, SAFE_SPEED, CarriedArm, VirtualRig, raised_arm
+from .rig import QUICK, SAFE_SPEED, VirtualRig, raised_arm
 
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT_V3], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
 CAUSED_SPEED = 0.6  # rad/s that motors may cause
@@ -30,14 +30,6 @@ class OnWatch:
 
     def _look(self) -> None:
         self.was_on |= any(self._rig.motors_on)
-
-
-def carried_again(arm: CarriedArm) -> None:
-    """Clear the fault, enable the hanging arm, and expect that it is carried."""
-    assert arm.safety.clear(arm.clock.monotonic()) or arm.safety.state is State.DISABLED
-    assert arm.safety.enable(arm.clock.monotonic())
-    arm.run_until(lambda: arm.safety.state is State.ACTIVE, 8.0)
-    assert arm.rig.motors_on == [True] * 4
 
 
 SUPPLY_RETURNS = [(MIT, 2.0, True), (MIT_V3, 9.0, False)]
@@ -64,7 +56,10 @@ def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
     watch.end()
     arm.rig.device.arm.reset(NO_TORQUE)
     arm.run(0.6)
-    carried_again(arm)
+    assert arm.safety.clear(arm.clock.monotonic()) or arm.safety.state is State.DISABLED
+    assert arm.safety.enable(arm.clock.monotonic())
+    arm.run_until(lambda: arm.safety.state is State.ACTIVE, 8.0)
+    assert arm.rig.motors_on == [True] * 4
 
 
 RETURNS = [(MIT, 3.0, 9.0), (MIT, 7.4, 7.6), (MIT_V3, 3.0, 9.0), (MIT_V3, 7.4, 7.6)]
@@ -97,18 +92,6 @@ def test_an_arm_whose_bus_was_cut_is_let_down_by_its_motors_that_kept_their_powe
     arm.assert_let_down()
     # Motors of V1 and V2 boards drop what they held at the first command that they hear, under damping.
     assert arm.rig.top_speed < (CAUSED_SPEED if wire_format is MIT_V3 else SAFE_SPEED)
-
-
-def test_a_single_motor_that_restarts_is_switched_on_again_and_let_down_with_the_others() -> None:
-    arm = raised_arm()
-    motor = arm.rig.device.motors[2]
-    motor.unplugged = True
-    arm.run(0.1)
-    motor.unplugged = False
-    arm.run(0.3)
-    assert arm.rig.motors_on == [True] * 4
-    arm.run_until(lambda: arm.loop.is_off)
-    assert arm.rig.motors_on == [False] * 4
 
 
 AWAY = [(wire_format, away) for wire_format in (MIT, MIT_V3) for away in (0.5, 6.0, 15.0)]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,7 +23,7 @@ from exo_gravity.core.safety.power import Power
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
-from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, DriveNotes, notes_file
+from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, notes_file
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down
 from exo_gravity.sim.virtual_time import TICK, Played, VirtualBus, Wire
 
@@ -36,7 +35,6 @@ from .wires import Responder
 
 FIRST, SECOND = f"first{os.getpid()}", f"second{os.getpid()}"
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
-BOTH_FORMATS = pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
 
 
 class HalfPlayed(Played):
@@ -190,16 +188,7 @@ def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -
     assert bus.ignored[FOREIGN_COMMAND] == bus.foreign_commands == 1
 
 
-def notes_of(rig: VirtualRig) -> tuple[DriveNotes, DriveNotes]:
-    """Return the notes of both buses of an arm that is carried."""
-    notes = tuple(DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes))) for _ in range(2))
-    for page in notes:
-        page.clock = rig.clock
-        page.note(rig.drive)
-    return notes[0], notes[1]
-
-
-@BOTH_FORMATS
+@pytest.mark.parametrize("wire_format", [MIT, MIT_V3], ids=["mit", "mit_v3"])
 def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
     """Motors 3 and 4 hold next to nothing here: they must still be braked while the first bus lowers joint 2."""
     rig = TwoBusRig(pose=(0.0, 1.3, 0.0, 0.3), carried=False, wire_format=wire_format)
@@ -208,9 +197,7 @@ def test_the_watchdog_lets_the_arm_down_as_one(wire_format: WireFormat) -> None:
     for motor, torque in zip(rig.motors, carrying, strict=True):
         for frame in ((motor.command_id, motor.command(torque, 0.0)), *motor.enter):
             rig.device.exchange(*frame)
-    near, far = notes_of(rig)
-    for page in (near, far):
-        page.note(drive_of(carrying))
+    near, far = (rig.notes_of(drive_of(carrying)) for _ in range(2))
     damped: list[float] = []
     rig.clock.later(0.15, lambda: damped.extend(rig.damping))
     on: list[tuple[bool, bool]] = []
@@ -227,7 +214,7 @@ def test_a_bus_that_cannot_be_opened_does_not_keep_the_other_waiting(
     wire_format: WireFormat, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = TwoBusRig(wire_format=wire_format)
-    near, far = notes_of(rig)
+    near, far = rig.notes_of(), rig.notes_of()
     rig.first.refusal = BusError("no such device")
     other = Responder(rig.first)
     assert not let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: True)
@@ -242,7 +229,7 @@ def test_a_bus_that_cannot_be_opened_does_not_keep_the_other_waiting(
 
 def test_a_silent_bus_is_handed_over(capsys: pytest.CaptureFixture[str]) -> None:
     rig = TwoBusRig()
-    near, far = notes_of(rig)
+    near, far = rig.notes_of(), rig.notes_of()
     silence(rig.second)
     assert not let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: True)
     assert "a motor does not reply" in capsys.readouterr().out
@@ -288,20 +275,11 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
     assert taken == [FIRST, SECOND]
 
 
-def leave_on(rig: TwoBusRig) -> None:
-    """Leave the notes of a bridge that died with its watchdog, on both buses."""
-    for part in rig.arm.parts:
-        lock = BusLock(part.address, "a dead bridge")
-        own = [torque if joint in part.joints else 7.0 for joint, torque in enumerate(rig.carrying)]
-        lock.notes.note(drive_of(own))
-        lock.release()
-
-
 @pytest.mark.usefixtures("locks")
 @FORMATS
 def test_the_next_bridge_lets_the_whole_arm_down_from_the_notes_of_both_buses(wire_format: WireFormat) -> None:
     rig, log = TwoBusRig(wire_format=wire_format), list[str]()
-    leave_on(rig)
+    rig.leave_on()
     owned = OwnedBus(rig.arm, "the next bridge", log.append, rig.clock)
     owned.close()
     assert log[-1] == LET_DOWN[1]
@@ -311,7 +289,7 @@ def test_the_next_bridge_lets_the_whole_arm_down_from_the_notes_of_both_buses(wi
 @pytest.mark.usefixtures("locks")
 def test_an_arm_with_a_bus_that_cannot_be_opened_gets_a_watchdog_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, guarded = TwoBusRig(), list[tuple[bool, ...]]()
-    leave_on(rig)
+    rig.leave_on()
     rig.second.refusal = BusError("no such device")
 
     class Noted:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence
@@ -116,14 +115,6 @@ def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_brid
     OwnedBus(bridge.rig.arm, "the next bridge", bridge.log.append, bridge.clock).close()
     assert bridge.log[-1] == LET_DOWN[1]
     bridge.rig.assert_let_down()
-
-
-def test_a_watchdog_that_cannot_open_its_bus_hands_it_over(bridge: Bridge) -> None:
-    bridge.rig.wire.refusal = BusError("no such device")
-    bridge.at(1.0, bridge.die)
-    asked = bridge.clock.monotonic() + 20.0
-    assert bridge.guard(lambda: bridge.clock.monotonic() > asked) == 1
-    assert bridge.notes.drive == bridge.drive
 
 
 def test_a_descent_is_not_handed_over_while_the_motors_reply(bridge: Bridge) -> None:
