@@ -64,9 +64,17 @@ def bowing_trunk(times: np.ndarray) -> np.ndarray:
     return np.stack((roll, pitch, 0.3 * np.sin(0.9 * moving)), axis=1)
 
 
-def sampled(
-    trunk: Callable[[np.ndarray], np.ndarray], times: np.ndarray, span: float | np.ndarray, rate: float
-) -> Motion:
+def bow(angle: float, start: float, duration: float) -> Trunk:
+    """Return a trunk that bows by `angle` rad from `start` s on, in `duration` s with minimum jerk, and stays so."""
+
+    def trunk(times: np.ndarray) -> np.ndarray:
+        s = np.clip((times - start) / duration, 0.0, 1.0)
+        return np.outer(s**3 * (10.0 - 15.0 * s + 6.0 * s * s), (0.0, angle, 0.0))
+
+    return trunk
+
+
+def sampled(trunk: Trunk, times: np.ndarray, span: float | np.ndarray, rate: float) -> Motion:
     """Return the samples, taken at `times` s, of an IMU on a trunk that walks from 8 s on.
 
     span: s before each sample over which the gyroscope averages, one or (n,).
