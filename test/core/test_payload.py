@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,28 +13,18 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.kinematics import links_of
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.guidance import GUIDANCE
-from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.script import TrialScript
 
 from ..support.compensator_run import THETA, CompensatorRun, settings_with
 from .test_gravity_oracles import random_arm
-from .test_kinematics import NO_ROTORS, ROUNDING, with_rods
+from .test_kinematics import ROUNDING, with_rods
 
-NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
-MOST = (9.0, 18.0, 9.0, 9.0)  # Nm
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
-WORN = {"wearer_mass": tuple(LOAD.mass), "wearer_cog": tuple(LOAD.cog)}
 
 
 def test_the_gravity_torque_of_an_arm_with_a_load_agrees_with_mujoco():
@@ -59,19 +48,16 @@ def test_the_mass_matrix_gets_that_of_a_point_of_mass_as_pinocchio_computes_it(b
         arm = random_arm(rng)
         pin, model, _ = with_rods(arm)
         mass, x = rng.uniform(0.1, 5.0), rng.uniform(-0.1, 0.3)
-        before = links_of(ArmModel.from_moments(arm.length, arm.first_moment) if by_moments else arm)
-        bare = model.copy()
-        model.appendBodyToJoint(4, pin.Inertia(mass, np.zeros(3), np.zeros((3, 3))), _at(pin, arm.length[3] + x))
         known = ArmModel.from_moments(arm.length, arm.first_moment) if by_moments else arm
-        loaded = links_of(known.with_payload(mass, (x, 0.0, 0.0)))._replace(rotors=NO_ROTORS)
+        bare = model.copy()
+        at = pin.SE3(np.eye(3), np.array((arm.length[3] + x, 0.0, 0.0)))
+        model.appendBodyToJoint(4, pin.Inertia(mass, np.zeros(3), np.zeros((3, 3))), at)
+        loaded, before = links_of(known.with_payload(mass, (x, 0.0, 0.0))), links_of(known)
         for theta in rng.uniform(-3.0, 3.0, (5, 4)):
             added = [np.triu(pin.crba(each, each.createData(), theta)) for each in (model, bare)]
-            found = loaded.matrix(theta) - before._replace(rotors=NO_ROTORS).matrix(theta)
-            assert np.triu(found) == pytest.approx(added[0] - added[1], abs=ROUNDING)
-
-
-def _at(pin: Any, x: float) -> Any:
-    return pin.SE3(np.eye(3), np.array((x, 0.0, 0.0)))
+            assert np.triu(loaded.matrix(theta) - before.matrix(theta)) == pytest.approx(
+                added[0] - added[1], abs=ROUNDING
+            )
 
 
 def test_a_load_and_a_wearer_add_up_in_any_order_and_the_load_is_carried_in_full():
@@ -105,19 +91,6 @@ def test_an_impossible_load_is_refused_with_the_reason(values, message):
         settings_of(values_of(COMPENSATOR, values))
 
 
-def test_a_load_that_is_set_live_comes_and_goes_as_a_guided_change():
-    run = CompensatorRun()
-    run.cycle(1.5)
-    for mass in (2.0, 0.0):
-        run.compensator.apply(settings_with(payload_mass=mass))
-        assert run.cycle().damped
-        first = np.array(run.efforts[-1])
-        run.cycle(0.5)
-        assert np.abs(np.array(run.efforts[-1]) - first).max() <= 0.5 * GUIDANCE.rate + 1e-6
-        run.cycle(9.0)
-        assert run.efforts[-1] == pytest.approx(gravity_torque(settings_with(payload_mass=mass).arm, THETA))
-
-
 def speeds(acceleration: float, top: float, period: float = 0.01) -> bool:
     """Return whether a load is seen as dropped while the hand speeds up to `top` m/s, and stays so fast."""
     watch = DropWatch()
@@ -132,41 +105,6 @@ def test_a_dropped_load_is_known_by_the_hands_acceleration_and_a_light_one_by_it
     assert not speeds(5.0, 0.5)
     falling = DropWatch()
     assert not max(falling.step(0.01, -0.2 * n, 1.0) for n in range(20))
-
-
-def drop(mass: float, pose: tuple[float, ...]) -> tuple[OfflineTrial, Compensator, np.ndarray]:
-    """Drop a load of a relaxed wearer; return trial, compensator, and s, angles (4,) and speeds (4,) since then."""
-    arm = SimulatedArm(ArmConfig(wearer_mass=WORN["wearer_mass"], wearer_cog=WORN["wearer_cog"]))
-    arm.carry(mass)
-    arm.reset((0.0, 0.05, 0.05, 0.05))
-    motors = [JointMotor(MOTORS[name], n + 1) for n, name in enumerate(NAMES)]
-    device = SimulatedDevice(arm, [SimulatedMotor(motor, Firmware()) for motor in motors], "right")
-    settings = settings_with(side="right", robot=DEFAULT_LINKS, mode="zero_g", payload_mass=mass, **WORN)
-    steps = [{"move": list(pose), "over": 3.0}, {"hold": 1.0}, {"load": 0.0, "over": 3.0}]
-    script = TrialScript.parse({"name": "drop", "steps": steps})
-    compensator = Compensator(settings)
-    setup = ArmSetup(
-        "right", device, motors, Limits(JOINTS, max_effort=MOST, sign_check_torque=0.0), settings, 125.0, None
-    )
-    trial = OfflineTrial(setup, script, 4.0, compensator)
-    recording = trial.run()
-    start = recording.steps[2].start
-    keep = (recording.time > start - 0.01) & (recording.time < start + 3.0)
-    rows = np.column_stack((recording.time - start, recording.position, recording.velocity))[keep]
-    return trial, compensator, rows
-
-
-@pytest.mark.thorough
-def test_a_load_of_2_kg_that_is_dropped_moves_the_arm_little_and_its_torque_goes(monkeypatch):
-    trial, compensator, rows = drop(2.0, (0.0, 0.4, 0.2, 0.5))
-    assert trial.trouble == "" and compensator.dropped == 2.0
-    assert compensator.settings.arm.payload[0] == 0.0
-    assert np.abs(rows[:, 5:]).max() < 4.0
-    assert np.abs(rows[-1, 1:5] - rows[0, 1:5]).max() < 0.8
-    assert np.abs(rows[-1, 5:]).max() < GUIDANCE.calm
-    monkeypatch.setattr(DropWatch, "step", lambda *_: False)
-    _, _, unwatched = drop(2.0, (0.0, 0.4, 0.2, 0.5))
-    assert np.abs(unwatched[:, 1:5] - unwatched[0, 1:5]).max() > np.abs(rows[:, 1:5] - rows[0, 1:5]).max() + 0.3
 
 
 def test_the_lifting_of_a_load_is_no_drop():

@@ -83,7 +83,7 @@ def test_changes_during_changes_are_as_calm_as_one():
 
 
 class Leading:
-    """A hand that leads joints 2 and 4 to and fro at up to `speed` rad/s. torques: what it applied, (n, 4) Nm."""
+    """A hand that leads joints 2 and 4 to and fro at up to `speed` rad/s, 0 to hold them. torques: (n, 4) Nm so far."""
 
     def __init__(self, start: Sequence[float], speed: float) -> None:
         self.torques: list[np.ndarray] = []

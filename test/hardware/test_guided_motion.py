@@ -23,7 +23,7 @@ from exo_gravity.sim.virtual_wearer import VirtualWearer
 from ..support.copies import prepared
 from ..support.thorough import quick
 from .compensated_arm import CYCLE, PEAK, POSE, CompensatedArm
-from .test_guided_changes import CLAMPED, HALVED, ONE_G, RAISED, SAFE_SPEED, guided_arm
+from .test_guided_changes import CLAMPED, HALVED, ONE_G, RAISED, SAFE_SPEED, Leading, guided_arm
 
 HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
 UPRIGHT = TrunkReading(gravity_in_trunk(0.0, 0.0).tolist())
@@ -32,19 +32,6 @@ ZERO_G = {"mode": "zero_g"}
 
 def let_go(now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
     return (0.0,) * 4
-
-
-class Holding:
-    """A hand that holds the arm in `pose`."""
-
-    def __init__(self, pose: Sequence[float]) -> None:
-        self._pose, self._weight = np.array(pose), np.zeros(4)
-
-    def __call__(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
-        error = self._pose - theta
-        self._weight += np.array((0.12, 0.16, 0.15, 0.08)) * error
-        torque = np.array((60.0, 80.0, 60.0, 30.0)) * error - np.array((3.0, 6.0, 5.0, 2.0)) * velocity + self._weight
-        return [float(part) for part in torque]
 
 
 def put_down(arm: CompensatedArm) -> None:
@@ -60,7 +47,7 @@ def carry_again(arm: CompensatedArm) -> None:
 
 def test_an_empty_cuff_that_is_carried_again_rises_slowly():
     arm = guided_arm(pose=LEANING, limit=PEAK, has_wearer=False, mode="one_g")
-    arm.person.hand = Holding(LEANING)
+    arm.person.hand = Leading(LEANING, 0.0)
     put_down(arm)
     arm.change(**ZERO_G)
     arm.run(1.0)
@@ -81,18 +68,11 @@ class Imu:
         return self.reading
 
 
-@prepared
-def put_down_with_imu() -> tuple[CompensatedArm, Imu]:
-    """Return an arm that was carried and let down, and its IMU."""
+@pytest.mark.parametrize("roll", quick([30.0], [-30.0, 30.0]))
+def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
     imu = Imu()
     arm = CompensatedArm(HANGING, PEAK, has_wearer=False, imu=imu, rate=0.5 / CYCLE, mode="one_g")
     put_down(arm)
-    return arm, imu
-
-
-@pytest.mark.parametrize("roll", quick([30.0], [-30.0, 30.0]))
-def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
-    arm, imu = put_down_with_imu()
     for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
         imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
         arm.run(0.05)
@@ -167,7 +147,7 @@ def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(change
 def loaded(mass: float, pose: Sequence[float]) -> CompensatedArm:
     """Return a carried arm in `pose` with a load in its hand."""
     arm = guided_arm(pose=pose, limit=PEAK)
-    arm.person.hand = Holding(pose)
+    arm.person.hand = Leading(pose, 0.0)
     arm.device.arm.carry(mass)
     arm.change(payload_mass=mass)
     arm.run(7.0)
