@@ -34,11 +34,6 @@ class Replies:
         return next(count for count in range(1, 100) if self.take(torques))
 
 
-def replaced(joint, torque):
-    """`EFFORT`, with another torque of one joint."""
-    return tuple(torque if i == joint else asked for i, asked in enumerate(EFFORT))
-
-
 class OrdinaryMotors:
     """Four motors that reply one command old, behind a current loop, with noise; frames are lost both ways.
 
@@ -98,7 +93,7 @@ def test_a_motor_that_applies_nothing_is_noticed_within_60_ms_and_after_a_restar
         replies = Replies()
         assert not any(replies.take(EFFORT) for _ in range(100))
         replies.now += silence
-        count = replies.cycles_until_fault(replaced(joint, 0.0))
+        count = replies.cycles_until_fault([0.0 if i == joint else asked for i, asked in enumerate(EFFORT)])
         assert count * PERIOD <= 0.06
         assert replies.monitor.missing == tuple(i == joint for i in range(4))
         assert not silence or joint != 1 or count <= 2

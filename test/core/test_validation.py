@@ -11,7 +11,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, check_bridge, limits_of
+
+from ..support.safety_run import LIMITS
 
 
 def check(**given):
@@ -74,3 +76,20 @@ def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
 def test_a_motor_is_silent_after_50_ms_or_7_cycles_up_to_100_ms(rate, timeout):
     values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "rate": rate})
     assert limits_of(values).reply_timeout == pytest.approx(timeout)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("max_effort", (3.0, 9.0, 3.0)),
+        ("position_max", (0.0,) * 4),
+        ("driven_speed", math.inf),
+        ("command_timeout", 5.0),
+        ("sign_check_torque", math.nan),
+        ("joint_names", ("a", "a", "b", "c")),
+    ],
+)
+def test_an_impossible_limit_is_rejected_by_name(field, value):
+    with pytest.raises(ParameterError) as caught:
+        Limits(**{**vars(LIMITS), field: value})
+    assert caught.value.name == field
