@@ -52,8 +52,12 @@ def test_where_it_does_not_apply_the_exact_law_carries_the_arm_until_it_does_aga
     assert answer.fallback == "the springs reach to 1 rad"
     exact, _ = compensator.settings.torque(OUTSIDE, compensator.tilt.at(now), exact=True)
     assert answer.effort == pytest.approx(exact)
-    _, answer = held(compensator, now, INSIDE, FALLBACK_TIME + GUIDANCE.longest)
-    assert answer.effort == pytest.approx([0.5 * angle for angle in INSIDE]) and not answer.fallback
+    now, answer = held(compensator, now, INSIDE, FALLBACK_TIME - 2 * PERIOD)
+    assert answer.fallback == "the springs reach to 1 rad"
+    now, answer = held(compensator, now, INSIDE, 4 * PERIOD)
+    assert not answer.fallback
+    _, answer = held(compensator, now, INSIDE, GUIDANCE.longest)
+    assert answer.effort == pytest.approx([0.5 * angle for angle in INSIDE])
 
 
 def test_a_law_that_does_not_exist_is_refused_with_those_that_do():

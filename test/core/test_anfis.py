@@ -130,10 +130,6 @@ def test_text_that_is_not_a_law_is_rejected(text):
         AnfisLaw.load(text)
 
 
-def test_joint_1_gets_no_torque():
-    assert law().torque(ARM, INSIDE, UPRIGHT)[0] == 0.0
-
-
 def test_a_single_pose_agrees_with_the_arrays_scaled_by_the_arms_gravity_and_gain():
     arm = ArmModel(ARM.length, ARM.cog, ARM.mass, (1.0, 0.5, 1.5, 2.0), 4.9)
     expected = law().torques(np.array((INSIDE[1:],)))[0] * (0.5, 1.5, 2.0) * 0.5

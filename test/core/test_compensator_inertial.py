@@ -42,14 +42,13 @@ def test_the_arm_turns_with_a_trunk_that_turns_faster_and_faster():
     np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("changes", [{}, {"inertial": True, "use_imu": False}])
-def test_without_inertial_or_without_an_imu_only_the_tilt_counts(changes):
-    run = run_with(FORCE, (1.0, 2.0, 3.0), **changes)
-    np.testing.assert_allclose(run.efforts[-1], gravity_torque(ROBOT, THETA), rtol=1e-9)
-
-
-def test_without_measured_motion_the_tilt_counts():
-    run = run_with(None, inertial=True)
+@pytest.mark.parametrize(
+    ("force", "changes"),
+    [(FORCE, {}), (FORCE, {"inertial": True, "use_imu": False}), (None, {"inertial": True})],
+    ids=["not inertial", "without an IMU", "no motion measured"],
+)
+def test_without_inertial_an_imu_or_measured_motion_only_the_tilt_counts(force, changes):
+    run = run_with(force, (1.0, 2.0, 3.0), **changes)
     np.testing.assert_allclose(run.efforts[-1], gravity_torque(ROBOT, THETA), rtol=1e-9)
 
 

@@ -12,7 +12,6 @@ from exo_gravity.core.arm.gravity import exact_torque, mobile_torque, static_tor
 from exo_gravity.lab.inputs.references import gravload, pinocchio
 
 ROUNDING = 1e-12  # Nm
-DOWN = np.array((0.0, 0.0, 1.0))
 
 
 def random_arm(rng, at_link_ends=False):
@@ -76,22 +75,6 @@ def test_a_single_pose_in_plain_floats_agrees_with_the_arrays(law, side):
             mobile_torque: lambda on_axis=on_axis, tilt=tilt: paper_mobile_torque(arm, on_axis, tilt.beta, tilt.phi),
         }
         assert law(arm, theta.tolist(), tilt) == pytest.approx(arrays[law](), abs=ROUNDING)
-
-
-@pytest.mark.parametrize("law", ["exact", "static", "mobile"])
-def test_a_batch_of_poses_with_different_tilts_agrees_with_single_poses(law):
-    rng = np.random.default_rng(6)
-    count = 100
-    arm, theta, direction = random_arm(rng), random_poses(rng, count), random_directions(rng, count)
-    beta, phi = rng.uniform(-1.5, 1.5, (2, count))
-    torque = {
-        "exact": lambda pick: gravity_torque(arm, theta[pick], direction[pick]),
-        "static": lambda pick: paper_static_torque(arm, theta[pick]),
-        "mobile": lambda pick: paper_mobile_torque(arm, theta[pick], beta[pick], phi[pick]),
-    }[law]
-    whole = torque(slice(None))
-    for pick in range(count):
-        assert whole[pick] == pytest.approx(torque(pick), abs=ROUNDING)
 
 
 def eq2_to_eq5(arm, t1, t2, t3, t4):

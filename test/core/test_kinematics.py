@@ -131,10 +131,6 @@ def test_the_torque_takes_an_arm_of_slender_rods_along_with_its_base(side, monke
         np.testing.assert_allclose(left_behind(side, turning, theta, torque), 0.0, atol=1e-4)
 
 
-def test_without_the_torque_the_arm_is_left_behind():
-    assert np.abs(left_behind("left", (1.0, 1.0, 0.0), (0.0, 0.4, 0.5, 1.0), (0.0,) * 4)).max() > 0.5
-
-
 def test_an_arm_given_by_its_moments_needs_about_the_same():
     arm = ArmModel.from_moments(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)
     rng = np.random.default_rng(6)

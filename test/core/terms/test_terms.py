@@ -178,16 +178,6 @@ def test_whatever_the_terms_give_their_sum_is_bounded(sums):
         assert bool(terms.problem) is not math.isfinite(sum(total))
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.lists(st.tuples(four, four, st.sampled_from([0.001, 0.002, 0.01])), min_size=1, max_size=40))
-def test_all_terms_together_stay_bounded_in_any_state(states):
-    terms, now = Terms(NAMES, ALL, DEFAULT_LINKS), 1.0
-    for position, velocity, dt in states:
-        now += dt
-        torque = terms.torque(now, position, velocity)
-        assert all(abs(tau) <= limit for tau, limit in zip(torque, SUM.effort, strict=True))
-
-
 @pytest.mark.parametrize(
     ("chosen", "name"),
     [
