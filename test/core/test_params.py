@@ -112,9 +112,7 @@ def test_every_name_of_a47959f4_is_still_declared_or_refused_with_what_to_write(
     optional = (*COMMAND_PARAMETERS, *MODEL_PARAMETERS)
     tables = {**TABLES, "compensator": (*COMPENSATOR, *URDF, *optional)}
     declared = {node: {param.name: param for param in table} for node, table in tables.items()}
-    names_then = yaml.safe_load(
-        (Path(__file__).parents[1] / "data/parameters_a47959f4.yaml").read_text(encoding="utf-8")
-    )
+    names_then = yaml.safe_load(THEN.read_text(encoding="utf-8"))
     for node, names in names_then.items():
         for name in set(names) - declared[node].keys():
             assert GONE.keys() >= {name} and in_force(name, [0.25] * 8).keys() <= declared[node].keys()

@@ -51,9 +51,7 @@ class Arm:
 
     @property
     def support(self) -> float:
-        settings = self.compensator.settings
-
-        return settings.support_now
+        return self.compensator.settings.support_now
 
     @property
     def report(self) -> str:

@@ -17,16 +17,16 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
-from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import WeighingPhase
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.script import TrialScript
 
-NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
+from ..support.simulated_device import joints_of, make_device
+
 POSE = (0.0, 0.2, 0.0, 0.8)  # rad
 HANGING, ELSEWHERE = (0.0, 0.0, 0.0, 0.0), (0.0, 1.2, 0.0, 0.3)
 STILL = (0.0,) * 4
@@ -62,16 +62,14 @@ def weigh(mass: float, *after: dict[str, Any]) -> tuple[Weighing, str, np.ndarra
 
     after: what the wearer does in place of relaxing, from when they have brought the arm to POSE.
     """
-    arm = SimulatedArm(ArmConfig(wearer_mass=SETTINGS.wearer_mass, wearer_cog=SETTINGS.wearer_cog))
-    arm.carry(mass)
-    arm.reset((0.0, 0.05, 0.05, 0.05))
-    motors = [JointMotor(MOTORS[name], n + 1) for n, name in enumerate(NAMES)]
-    device = SimulatedDevice(arm, [SimulatedMotor(motor, Firmware()) for motor in motors], "right")
+    device = make_device(config=ArmConfig(wearer_mass=SETTINGS.wearer_mass, wearer_cog=SETTINGS.wearer_cog))
+    device.arm.carry(mass)
+    device.arm.reset((0.0, 0.05, 0.05, 0.05))
     steps = [{"move": list(POSE), "over": MOVE}, *(after or ({"hold": 20.0},))]
     limits = Limits(JOINTS, max_effort=SETTINGS.max_effort, sign_check_torque=0.0)
     compensator = Balance(SETTINGS, at=HELD)
     trial = OfflineTrial(
-        ArmSetup("right", device, motors, limits, SETTINGS, RATE, None),
+        ArmSetup("right", device, joints_of((MIT,) * 4), limits, SETTINGS, RATE, None),
         TrialScript.parse({"name": "weigh", "steps": steps}), 2.0, compensator,
     )  # fmt: skip
     recording = trial.run()

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A wearer who acts on the simulated arm: lifts, pushes, holds still, shakes, reaches, throws. `attach` lets them act.
+"""A wearer who acts on the simulated arm: lifts, shakes, reaches, throws. `attach` lets them act.
 
 A behaviour is a function of the time in s since it began and of the arm's true angles and velocities, (4,) rad and
 rad/s; it returns the wearer's torque (4,) in Nm on the joints. A behaviour remembers: make a new one for each arm.
@@ -56,11 +56,6 @@ def throw(joint: int, speed: float = 3.0, duration: float = 0.25) -> Behaviour:
     return lift(joint, speed, duration)
 
 
-def hold_still(duration: float = math.inf) -> Behaviour:
-    """A stiff hand that holds the arm where it is, and lets go after `duration` s."""
-    return hand(lambda since, start: [(angle, 0.0) for angle in start], duration)
-
-
 def reach(there: Joints, duration: float, period: float = 1.6) -> Behaviour:
     """Reach to the pose `there` (4,) rad and back, again and again, for `duration` s; period: s of both ways."""
 
@@ -70,11 +65,6 @@ def reach(there: Joints, duration: float, period: float = 1.6) -> Behaviour:
         return path_between(*ends, rest, period / 2)
 
     return hand(path, duration)
-
-
-def push(torque: Joints, duration: float) -> Behaviour:
-    """Push with `torque` (4,) Nm for `duration` s, whatever the arm does."""
-    return lambda since, theta, velocity: torque if since < duration else NO_TORQUE
 
 
 def shake(torque: Joints, duration: float, frequency: float = 2.0) -> Behaviour:

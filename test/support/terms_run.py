@@ -13,17 +13,17 @@ import numpy as np
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.compensation.terms.terms import Terms, TermSettings
-from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import ENTER
-from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
-from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from .active_wearer import Joints, attach
+from .simulated_device import joints_of, make_device
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
-MOTORS_OF_ARM = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
+MOTORS_OF_ARM = joints_of((MIT,) * 4)
 UPRIGHT = Tilt.of("right")
 COULOMB = (0.2, 0.4, 0.2, 0.2)  # Nm of the simulated arm, by default
 
@@ -69,7 +69,7 @@ class TermsRun:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        self.device = SimulatedDevice(SimulatedArm(self.config), [SimulatedMotor(motor) for motor in MOTORS_OF_ARM])
+        self.device = make_device(config=self.config)
         self.device.arm.reset(self.pose)
         self.terms = Terms(NAMES, self.settings, self.links)
         self.given = self.most_given = self.rubbed = self.worst_balance = 0.0

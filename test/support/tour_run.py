@@ -15,7 +15,7 @@ from exo_gravity.core.arm.gravity import NO_TORQUE, moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Station
-from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.moment_model import PapersMoments
@@ -26,11 +26,10 @@ from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedM
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from .active_wearer import attach
+from .simulated_device import joints_of
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
-MOTORS_AS_MOUNTED = tuple(
-    JointMotor(MOTORS[kind], number + 1) for number, kind in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"))
-)
+MOTORS_AS_MOUNTED = joints_of((MIT,) * 4)
 
 Disturb = Callable[[float, SimulatedDevice], Sequence[float] | None]
 

@@ -10,14 +10,15 @@ import numpy as np
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.from_file import trunk_imu
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.recording import Recording
-from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim import ArmConfig, ImuConfig
 from exo_gravity.sim.script import TrialScript
+
+from .simulated_device import joints_of, make_device
 
 FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad
@@ -31,7 +32,6 @@ JOINTS = ("rotation", "abduction", "flexion", "elbow")
 
 def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> OfflineTrial:
     """Return a trial: the arm is brought to POSE and let go, and 1 s later `steps` begin."""
-    motors = [JointMotor(MOTORS[name], n) for n, name in enumerate(("AK60-6", "AK80-9", "AK60-6", "AK60-6"), 1)]
     rated = (3.0, 9.0, 3.0, 3.0)
     limits = Limits(
         JOINTS,
@@ -41,11 +41,10 @@ def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> Offli
         rated,
         sign_check_torque=0.0,
     )
-    arm = SimulatedArm(ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
-    device = SimulatedDevice(arm, [SimulatedMotor(motor) for motor in motors])
+    device = make_device(config=ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
     trunk = trunk_imu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
     script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 2.0}, {"hold": 1.0}, *steps]})
-    setup = ArmSetup("right", device, motors, limits, Settings("right", ROBOT, **settings), RATE, trunk)
+    setup = ArmSetup("right", device, joints_of((MIT,) * 4), limits, Settings("right", ROBOT, **settings), RATE, trunk)
     return OfflineTrial(setup, script, 3.0)
 
 

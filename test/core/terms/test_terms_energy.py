@@ -65,7 +65,9 @@ class Case:
         return run
 
 
-CASES = [Case(0)]
+@pytest.fixture
+def case() -> Case:
+    return Case(0)
 
 
 def stiffest(links: ArmModel) -> tuple[float, ...]:
@@ -73,14 +75,12 @@ def stiffest(links: ArmModel) -> tuple[float, ...]:
     return tuple((0.999 * np.array(least_inertia(links_of(links))) / (4.0 * DELAY**2)).tolist())
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_friction_gives_less_than_the_joints_friction_takes(case):
     run = case.pushed(TermSettings(friction=Friction(0.85, case.identified, case.config.viscous_friction)))
     assert run.given > 0.3 * run.rubbed  # it does help
     assert run.worst_balance < 0.02
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 @pytest.mark.parametrize("friction_share", [0.0, 0.7])
 def test_inertia_gives_no_more_than_its_tank_and_the_joints_friction(case, friction_share):
     chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(friction_share, case.identified))
@@ -95,14 +95,12 @@ def test_inertia_10_ms_late_on_an_arm_with_little_friction_starts_no_limit_cycle
     assert run.worst_balance < 2.0 * INERTIA.tank
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_inertia_without_an_identified_friction_lives_on_its_tank(case):
     run = case.pushed(TermSettings(inertia=Inertia(0.8)))
     assert 0.05 < run.most_given < 2.5 * INERTIA.tank
     assert run.worst_balance < 2.0 * INERTIA.tank
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_strongest_damping_only_takes(case):
     least = np.array(least_inertia(links_of(case.links)))
     run = case.pushed(TermSettings(damping=Damping(tuple((0.999 * least / (2.0 * DELAY)).tolist()))))
@@ -110,7 +108,6 @@ def test_the_strongest_damping_only_takes(case):
     assert run.most_given < 0.01
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_stiffest_spring_gives_no_more_than_it_stored(case):
     limit = (1.0, 2.0, 1.0, 1.0)
     run = case.pushed(TermSettings(spring=Spring(stiffest(case.links), (0.0, 0.4, 0.4, 0.5), limit)))
@@ -118,7 +115,6 @@ def test_the_stiffest_spring_gives_no_more_than_it_stored(case):
     assert run.most_given < stored
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_the_stiffest_edges_of_a_workspace_return_no_more_than_they_took(case):
     edges = SoftLimits(np.subtract(POSE, 0.1), np.add(POSE, 0.1), stiffest(case.links))
     run = case.pushed(TermSettings(limits=edges))
@@ -126,7 +122,6 @@ def test_the_stiffest_edges_of_a_workspace_return_no_more_than_they_took(case):
     assert run.most_given < 0.05
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_a_coupling_gives_no_more_than_it_stored(case):
     coupling = Coupling((0.0, 0.0, -1.5, 3.0))
     run = case.pushed(TermSettings(coupling=coupling))
@@ -134,7 +129,6 @@ def test_a_coupling_gives_no_more_than_it_stored(case):
     assert run.most_given < 0.5 * 3.0 * gap**2 + 0.25
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
 def test_all_terms_together_let_the_arm_come_to_rest(case):
     half = tuple(0.5 * k for k in stiffest(case.links))
     case.pushed(
