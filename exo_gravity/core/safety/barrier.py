@@ -27,8 +27,8 @@ with others.
 "Without delay" is not quite true: current loop and velocity filter have time constants T1 and T2. A joint of inertia J
 vibrates if kd > J (1/T1 + 1/T2) (Routh-Hurwitz of J T1 T2 s^3 + J (T1 + T2) s^2 + J s + kd): the bare elbow, 0.0036 kg
 m^2, above 4.0 Nm s/rad with 8 and 1 ms, above 0.6 with 8 and 20 ms. No reading tells J, T1 or T2. So a joint that
-turns to and fro, faster than people shake, gets less of the damping that is asked for (`Vibration`). The brake of a
-joint that is driven stays.
+turns to and fro, faster than people shake, gets less of the damping that is asked for (`VibrationLimits`). The brake of
+a joint that is driven stays.
 """
 
 import math
@@ -59,7 +59,7 @@ class BarrierTuning:
 
 
 @dataclass(frozen=True)
-class Vibration:
+class VibrationLimits:
     """Which joint vibrates under its damping, and how that is lowered.
 
     Simulated: 0.0024 to 0.0136 kg m^2, behind 8 or 20 ms and 20 ms, at 100 and 250 Hz. Without this they go on at 2.6
@@ -73,7 +73,7 @@ class Vibration:
     recovery: float = 0.5  #: Nm s/rad a second; with 2.5 one of them goes on at 16
 
 
-BARRIER, VIBRATION = BarrierTuning(), Vibration()
+BARRIER, VIBRATION = BarrierTuning(), VibrationLimits()
 
 
 class Shaped(NamedTuple):
