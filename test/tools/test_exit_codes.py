@@ -51,7 +51,7 @@ WRONG = [
 ]
 WITHOUT = {  # by tool: the package, words that need it, and how it is installed
     "report": ("rosbags.typesys", ["b"], ".[report]"),
-    "budget": ("matplotlib.figure", ["--body-mass", "75", "--support", "0.068"], ".[report]"),
+    "budget": ("matplotlib.figure", ["--params", EXO, "--body-mass", "75"], ".[report]"),
     "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
     "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
     "doctor": ("rich", ["--seconds", "0"], "python3-rich"),
