@@ -1,7 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """launcher: starts one process per top-level key of the parameter file, and stops them all when one ends.
 
-A file with a parameter that a node of an arm or the IMU would refuse is refused before any starts.
+A file with a parameter that a node of an arm or the IMU would refuse is refused before any starts, and one whose arm a
+running can_bridge may carry.
 
 With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
 
@@ -17,7 +18,7 @@ from functools import partial
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
-from exo_gravity.lab.inputs.node_checks import check_nodes
+from exo_gravity.lab.inputs.node_checks import check_buses_are_free, check_nodes
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, planned, stop_on_signals
 from exo_gravity.tools.cli import require_ros
@@ -63,7 +64,9 @@ def main(args: Sequence[str] | None = None) -> None:
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
         nodes, names, _ = planned(path, options.only, more)
-        check_nodes({node: nodes[node] for node in names})
+        nodes = {node: nodes[node] for node in names}
+        check_nodes(nodes)
+        check_buses_are_free(nodes)
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():

@@ -16,6 +16,7 @@ from exo_gravity.hardware.ownership.bus_lock import (
     ATTEMPT_TIME,
     UNKNOWN_DRIVE,
     BusLock,
+    bridge_of,
     bus_name,
     is_asked_for,
     notes_file,
@@ -77,6 +78,15 @@ def test_a_bus_that_its_owner_releases_a_little_later_is_waited_for():
     lock, clock = lock_of("first"), VirtualClock()
     clock.later(0.9 * ATTEMPT_TIME, lock.release)
     BusLock(CAN0, "second", clock=clock).release()
+
+
+def test_the_bridge_that_holds_a_bus_is_named_to_who_does_not_want_it():
+    assert bridge_of(CAN0) == ""
+    lock = lock_of(FIRST)
+    assert bridge_of(CAN0) == FIRST
+    assert not is_asked_for(lock.socket)
+    lock.release()
+    assert bridge_of(CAN0) == ""
 
 
 @pytest.mark.parametrize("asks", [False, True])

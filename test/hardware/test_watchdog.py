@@ -20,7 +20,7 @@ import pytest
 
 from exo_gravity.core.errors import BusError
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.ownership.bus_lock import ArmLock, BusLock
+from exo_gravity.hardware.ownership.bus_lock import ArmLock, BusLock, bridge_of
 from exo_gravity.hardware.ownership.owned_bus import Watchdog
 
 from ..support.waiting import PATIENCE, wait_until
@@ -89,8 +89,10 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
 
 def test_the_arm_of_a_bridge_that_is_killed_is_let_down_by_the_watchdog_which_holds_its_bus_meanwhile(rig, carry):
     carrier = carry()
+    assert "/right/can_bridge" in bridge_of(rig.arm.address)
     carrier.kill()
     assert carrier.process.wait(PATIENCE) == -signal.SIGKILL
+    assert bridge_of(rig.arm.address) == ""
     with pytest.raises(BusError, match=rf"held by the watchdog \(PID {carrier.watchdog}\) of /right/can_bridge"):
         BusLock(rig.arm.address, "another")
     assert carrier.log().endswith("letting the arm down\nERROR the arm is down, its motors are off\n")

@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.lab import packages
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
@@ -126,6 +127,15 @@ WRONG = {  # a node, its changes, and what it would say itself
 def test_a_parameter_that_a_node_would_refuse_is_refused_before_any_starts(refused, node, changes, said):
     error = refused({node: changes})
     assert error.startswith(f"launcher: {node} ") and said in error
+
+
+def test_an_arm_that_a_running_bridge_may_carry_is_refused_before_any_node_starts(refused, tmp_path, monkeypatch):
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
+    channel = f"vcan{os.getpid()}"
+    lock = bus_lock.BusLock(("virtual", channel, {}), "/right/can_bridge (PID 7)")
+    error = refused({"/right/can_bridge": {"can": {"interface": "virtual", "channel": channel}}})
+    assert error.startswith(f"launcher: /right/can_bridge: CAN bus {channel} is held by /right/can_bridge (PID 7)")
+    lock.release()
 
 
 def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, monkeypatch):

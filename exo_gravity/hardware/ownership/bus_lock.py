@@ -39,6 +39,7 @@ FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK  # another user may have put a link or a p
 SHARED = stat.S_ISVTX | stat.S_IWOTH | stat.S_IXOTH
 # By the number of joints: the first fields of `DriveNotes`, written at once.
 NOTES = [struct.Struct(f"={3 + 2 * count}d") for count in range(MAX_JOINTS + 1)]
+CREDENTIALS = struct.Struct("=3i")  # PID, user and group of the process that listens on a socket; unix(7)
 UNKNOWN_DRIVE = Drive((), (), (), True)  # of motors that may be on
 
 
@@ -216,6 +217,16 @@ def borrowed(address: Address) -> Iterator[str]:
         return
     with lock:
         yield ""
+
+
+def bridge_of(address: Address) -> str:
+    """Return who holds the bus at `address`, '' if no process does, or only the watchdog of one that has ended."""
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.setblocking(False)
+        if asking.connect_ex(NAME + bus_name(address)):
+            return ""
+        process, *_ = CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+    return _holder(address) if Path(f"/proc/{process}").exists() else ""
 
 
 def is_asked_for(lock: socket.socket) -> bool:

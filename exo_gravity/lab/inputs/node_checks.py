@@ -13,15 +13,16 @@ from exo_gravity.core.compensation.settings import (
     urdf_settings_of,
     urdf_table,
 )
-from exo_gravity.core.errors import named
-from exo_gravity.core.motors.joint_motor import motors_of, traffic_of
+from exo_gravity.core.errors import BusError, named
+from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.arms import node_values, read_arm
-from exo_gravity.lab.inputs.parameter_file import Nodes, can_options
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages
 
 
 def check_nodes(nodes: Nodes) -> None:
@@ -54,6 +55,19 @@ def check_nodes(nodes: Nodes) -> None:
             values = node_values(nodes, node, compensator_table(given))
             with named(f"{node} "):
                 settings_of(values, lambda path: Path(path).read_text(encoding="utf-8"))
+
+
+def check_buses_are_free(nodes: Nodes) -> None:
+    """Raise BusError if a running can_bridge holds a bus of one of `nodes`, whose parameters are checked.
+
+    That can_bridge would refuse to start. But the compensator would already have sent its efforts, and two that send
+    to one arm let it down.
+    """
+    for node in stages(nodes)[0]:
+        values, options = node_values(nodes, node, CAN_BRIDGE), can_options(nodes[node])
+        for channel, (_, own) in buses_of(values["can.channel"], options, len(values["joint_names"])).items():
+            if holder := bridge_of((values["can.interface"], channel, own)):
+                raise BusError(f"{node}: CAN bus {channel} is held by {holder}, which may carry an arm: stop it first")
 
 
 def _of_urdf(given: Mapping[str, Any], table: Sequence[Param]) -> dict[str, Any]:
