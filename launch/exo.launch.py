@@ -35,6 +35,7 @@ from launch_ros.actions import Node
 
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.hardware.network import RANGE
+from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import (
@@ -198,6 +199,7 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         _check(context.argv)
     more = ["/panel"] if argument("panel") == "true" else []
     nodes, names, asking = planned(argument("params"), argument("only").split(), more)
+    check_start({node: nodes[node] for node in names})
     params, log_level = _written(nodes, names), argument("log_level")
     pushed = context.launch_configurations.get("ros_namespace", "")
     own = "/".join(filter(None, (pushed.strip("/"), argument("namespace").strip("/"))))

@@ -18,7 +18,7 @@ from functools import partial
 
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
-from exo_gravity.lab.inputs.node_checks import check_buses_are_free, check_nodes
+from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, planned, stop_on_signals
 from exo_gravity.tools.cli import require_ros
@@ -64,9 +64,7 @@ def main(args: Sequence[str] | None = None) -> None:
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
         nodes, names, _ = planned(path, options.only, more)
-        nodes = {node: nodes[node] for node in names}
-        check_nodes(nodes)
-        check_buses_are_free(nodes)
+        check_start({node: nodes[node] for node in names})
         launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():

@@ -48,7 +48,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     folder = Path(options.output).resolve() / session.folder(now) / f"{script.name}_{now:%Y%m%d_%H%M%S}"
     guided = options.attach == "guided" if options.attach else is_guided(params)
     if not options.attach:
-        check_bridges(params)
+        check_bridges(params, options.offline)
     trial = Trial(path, script, None if options.attach else params, guided, session, folder)
     tell: Callable[..., None] = _print_json if options.attach else lambda **values: None
     stopped = stop_on_signals()

@@ -57,12 +57,13 @@ def check_nodes(nodes: Nodes) -> None:
                 settings_of(values, lambda path: Path(path).read_text(encoding="utf-8"))
 
 
-def check_buses_are_free(nodes: Nodes) -> None:
-    """Raise BusError if a running can_bridge holds a bus of one of `nodes`, whose parameters are checked.
+def check_start(nodes: Nodes) -> None:
+    """Check what would keep one of `nodes` from its start: a parameter, or a running can_bridge that holds its bus.
 
-    That can_bridge would refuse to start. But the compensator would already have sent its efforts, and two that send
-    to one arm let it down.
+    A second can_bridge would refuse to start. But its compensator would already have sent efforts, and two that send to
+    one arm let it down. Raises ParameterError, BusError.
     """
+    check_nodes(nodes)
     for node in stages(nodes)[0]:
         values, options = node_values(nodes, node, CAN_BRIDGE), can_options(nodes[node])
         for channel, (_, own) in buses_of(values["can.channel"], options, len(values["joint_names"])).items():

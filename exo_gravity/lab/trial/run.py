@@ -24,7 +24,7 @@ from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.vocabulary import NONE
-from exo_gravity.lab.inputs.node_checks import check_nodes
+from exo_gravity.lab.inputs.node_checks import check_nodes, check_start
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, Stopping
@@ -60,13 +60,16 @@ def is_guided(params: Path) -> bool:
     return not any(node.endswith("/simulator") for node in load(params))
 
 
-def check_bridges(params: Path) -> None:
-    """Raise ParameterError unless the parameter file has a can_bridge, whose arm a trial follows, and its nodes fit."""
+def check_bridges(params: Path, is_offline: bool) -> None:
+    """Check that a parameter file has a can_bridge, whose arm a trial follows, and that its nodes can start.
+
+    is_offline: none does, so that another can_bridge may hold the bus. Raises ParameterError, BusError.
+    """
     nodes = load(params)
     if not stages(nodes)[0]:
         expected = f"a file with a can_bridge, whose arm a trial follows; it has {', '.join(nodes)}"
         raise ParameterError("params", str(params), expected)
-    check_nodes(nodes)
+    check_nodes(nodes) if is_offline else check_start(nodes)
 
 
 @dataclass(frozen=True)
