@@ -71,6 +71,16 @@ def test_efforts_may_be_late_for_a_moment_in_the_checks_as_while_the_arm_is_carr
     assert arm.machine.state is not State.CHECKING
 
 
+@pytest.mark.parametrize("stall", [0.004, 0.09, 0.2, 2.0])
+def test_a_turn_that_an_encoder_loses_while_the_loop_stands_still_in_the_proof_is_a_fault(stall):
+    arm = SafetyRun().enable().until(State.PROVING).cycle(0.05)
+    arm.now += stall
+    arm.changes[1].update(position=math.radians(40.0))
+    arm.cycle(0.1)
+    assert arm.fault_code == "position_jump"
+    arm.until_off()
+
+
 @pytest.mark.parametrize(("change", "code"), [({"error": 5}, "motor_error"), ({"temperature": 95}, "over_temperature")])
 def test_a_fault_during_the_checks_is_latched(change, code):
     arm = SafetyRun()

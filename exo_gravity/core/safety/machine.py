@@ -465,6 +465,7 @@ class SafetyMachine:
         if after is None:
             return
         self.state = after
+        self._readings.is_being_proven = after is State.PROVING
         self.pose.withdraw()
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:

@@ -94,6 +94,8 @@ class Readings:
         still has sent none.
     fault: what the newest readings show, or None.
     trusted: whether zeros and signs were proven, and the angles have been continuous since.
+    is_being_proven: whether the arm was seen to hang and its signs are being proven, set from outside: the angles must
+        be continuous from then on.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -102,6 +104,7 @@ class Readings:
         self.silent: Sequence[bool] = (True,) * count
         self.fault: Fault | None = None
         self.trusted = False
+        self.is_being_proven = False
         self._limits = limits
         self._newest = [-math.inf] * count  # s
         self._missed = [READING.missed] * count
@@ -166,7 +169,8 @@ class Readings:
         turned, silence = joint.position - last.position, joint.time - last.time
         is_jump = abs(turned) > CONTINUITY.jump + limits.max_velocity[i] * (joint.time - self._asked[i])
         is_turn = abs(turned - _expected(last, joint)) > limits.home_tolerance[i]
-        was_short = limits.reply_timeout < silence and (self.trusted or silence <= restart)
+        is_known = self.trusted or self.is_being_proven
+        was_short = limits.reply_timeout < silence and (is_known or silence <= restart)
         if is_jump or (is_turn and was_short):
             what = f"from {last.position:.3f} to {joint.position:.3f} rad in {1000.0 * (joint.time - last.time):.0f} ms"
             faults.append(Fault(FaultCode.POSITION_JUMP, f"{limits.joint_names[i]}: {what}"))
