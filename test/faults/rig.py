@@ -161,6 +161,8 @@ class Rig:
             assert probe.trigger("clear_fault").success
         probe.enable(True)  # without effect if autostart came first
         probe.wait_until(lambda: probe.state == stage)
+        if stage == "proving signs":  # which begins with motors that are still off
+            probe.wait_until(lambda: (newest := self.truth.newest()) is not None and bool(newest["on"].all()))
 
     def true_velocity(self, joint: int) -> float:
         """Return the newest velocity in rad/s of `joint` (0..)."""
