@@ -119,9 +119,10 @@ class BridgeServices:
         self._hindrance = hindrance
         self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._motors = tuple(motors)
-        for function in (self.enable, self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
-            kind, answer = SetBool if function == self.enable else Trigger, partial(self.answer, function)
-            node.create_service(kind, f"~/{function.__name__}", answer, qos_profile=MANY_REQUESTS)
+        serve = partial(node.create_service, qos_profile=MANY_REQUESTS)
+        serve(SetBool, "~/enable", partial(self.answer, self.enable))
+        for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
+            serve(Trigger, f"~/{function.__name__}", partial(self.answer, function))
 
     def enable(self, loop: ControlLoop, request: SetBool.Request) -> str:
         """Enable the arm, or let it down and disable it."""

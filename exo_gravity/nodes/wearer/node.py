@@ -159,11 +159,10 @@ class WearerNode(Node):
         try:
             settings = self._read(values)
         except (ParameterError, KeyError) as error:
-            has = (
-                "no parameter " if isinstance(error, KeyError) else ""
-            )  # of another version, or another program's node
+            # A KeyError: of another version, or another program's node.
+            what = f"no parameter {error}" if isinstance(error, KeyError) else error
             self._settings = None
-            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {has}{error}")
+            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {what}")
             return
         if settings is None:
             waiting = f"waiting for the arm's URDF on {values['urdf.topic']}"
