@@ -38,6 +38,7 @@ ROOMS = {
     "hardware": (
         "clock",
         "network",
+        "model_file",
         "can",
         "control_loop",
         "ownership",

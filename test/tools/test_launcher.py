@@ -21,10 +21,14 @@ import yaml
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.lab import packages
+from exo_gravity.lab.anfis_file import text_of
+from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
 from exo_gravity.tools.launcher import main
+
+from ..core.test_anfis import law
 
 NODES = Path(__file__).parents[2] / "exo_gravity" / "nodes"
 SIM = Path(__file__).parents[2] / "config" / "sim.yaml"
@@ -127,6 +131,14 @@ WRONG = {  # a node, its changes, and what it would say itself
 def test_a_parameter_that_a_node_would_refuse_is_refused_before_any_starts(refused, node, changes, said):
     error = refused({node: changes})
     assert error.startswith(f"launcher: {node} ") and said in error
+
+
+def test_a_model_in_the_home_folder_is_found_as_the_node_finds_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "model.json").write_text(text_of(law()))
+    nodes = load(SIM)
+    nodes["/right/compensator"] |= {"law": "anfis", "anfis_file": "~/model.json"}
+    check_nodes(nodes)
 
 
 def test_an_arm_that_a_running_bridge_may_carry_is_refused_before_any_node_starts(refused, tmp_path, monkeypatch):

@@ -29,6 +29,7 @@ from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
+from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.parameter_file import Nodes, load, node_of, packaged_config, recorded_parameters
 
@@ -66,7 +67,7 @@ class ConfiguredArm(AnyArm):
     def settings(self) -> Settings:
         """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
         with named(f"{self.namespace}/compensator "):
-            return settings_of(self.compensator, lambda path: Path(path).read_text(encoding="utf-8"))
+            return settings_of(self.compensator, read_model)
 
 
 OneArm = TypeVar("OneArm", bound=AnyArm)

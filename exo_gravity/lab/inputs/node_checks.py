@@ -2,7 +2,6 @@
 """The parameters of a file, checked as the nodes check them at their start."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from exo_gravity.core.compensation.laws import URDF_LAW
@@ -18,6 +17,7 @@ from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
@@ -54,7 +54,7 @@ def check_nodes(nodes: Nodes) -> None:
         elif name == "compensator":
             values = node_values(nodes, node, compensator_table(given))
             with named(f"{node} "):
-                settings_of(values, lambda path: Path(path).read_text(encoding="utf-8"))
+                settings_of(values, read_model)
 
 
 def check_start(nodes: Nodes) -> None:

@@ -4,12 +4,10 @@
 It is the paper's arm, or with `law: urdf` any serial arm, whose URDF comes from a file or from `robot_description`.
 """
 
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
@@ -29,6 +27,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, Reason, WeighingPhase, words
+from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
 from exo_gravity.nodes.ros.parameters import declare, given_to
@@ -36,9 +35,6 @@ from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread
 
 DESCRIPTION_TIMEOUT = 10.0  # s in which robot_description must arrive
 TICK = 0.01  # s between two messages of a fade
-# Bytes of an ANFIS model, which is read while the arm is carried: no tilt is taken meanwhile. train_anfis writes
-# 20,000; a million take 14 ms.
-LARGEST_FILE = 1_000_000
 
 JointReading = tuple[Sequence[float], Sequence[float] | None]  # positions (n,) rad, velocities (n,) rad/s if known
 Read = Callable[[dict[str, Any]], Settings]
@@ -53,7 +49,7 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm
     given = given_to(node)
     if given.get("law") != URDF_LAW:
         table = settings.compensator_table(given)
-        return table, declare(node, table), lambda values: settings.settings_of(values, _text), None
+        return table, declare(node, table), lambda values: settings.settings_of(values, read_model), None
     table = settings.urdf_table(given)
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
@@ -177,14 +173,6 @@ def _description(node: Node, values: dict[str, Any]) -> str:
             raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
         return str(message.data)
     return read_urdf(path)
-
-
-def _text(path: str) -> str:
-    """Return the text of a file. Raises OSError for a device or a pipe, and what else may not end soon."""
-    file = Path(os.path.expanduser(path))
-    if not (file.is_file() and 0 < file.stat().st_size <= LARGEST_FILE):  # the files of /proc tell no size
-        raise OSError(f"it must be a regular file of 1 to {LARGEST_FILE} bytes")
-    return file.read_text(encoding="utf-8")
 
 
 class JointStateInterface:
