@@ -10,7 +10,6 @@ Exit code 0: within rated torque everywhere. 1: beyond it somewhere. 2: wrong us
 import argparse
 import math
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 from exo_gravity.core.arm.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
@@ -18,9 +17,8 @@ from exo_gravity.core.numbers import one_float
 from exo_gravity.lab.arm_budget import ArmBudget, arm_budget, joint_figure, table_lines, verdict
 from exo_gravity.lab.budget import USUAL_TILT
 from exo_gravity.lab.inputs.arms import any_arms
+from exo_gravity.lab.report.html import png_of
 from exo_gravity.tools.cli import exit_code
-
-DPI = 150
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -53,9 +51,8 @@ def _run(options: argparse.Namespace) -> int:
     for arm in arms:
         for joint in range(len(arm.joints)):
             written.append(f"{arm.name.strip('/').replace('/', '_')}_joint_{joint + 1}.png")
-            picture = BytesIO()
-            joint_figure(arm, joint).savefig(picture, dpi=DPI)
-            (folder / written[-1]).write_bytes(picture.getvalue())  # at once: Ctrl-C leaves no half of a picture
+            picture = png_of(joint_figure(arm, joint))
+            (folder / written[-1]).write_bytes(picture)  # at once: Ctrl-C leaves no half of a picture
     masses = zip(("upper arm", "forearm", "hand"), wearer.segments, strict=True)
     segments = ", ".join(f"{name} {mass:.2f} kg at {cog:.3f} m" for name, (mass, cog) in masses)
     print(f"Wearer: {wearer.body_mass:g} kg, {wearer.sex}, table {wearer.table}: {segments}")
