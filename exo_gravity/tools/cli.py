@@ -42,12 +42,9 @@ def positive(text: str) -> int:
 def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
     """Return the exit code of `work`; where that raises an error, print it as one line and return 2.
 
-    Ctrl-C is 130, and a reader that has seen enough, as `head`, is 141, as shells say of both. What the terminal's
-    encoding lacks is printed as its code.
+    After Ctrl-C it is 130, and 141 where the reader of the output has ended, like `head`: the shell's codes for both.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    print_any_character()
     try:
         with extras(tool, extra):
             code = work()
@@ -66,8 +63,15 @@ def exit_code(tool: str, extra: str, work: Callable[[], int]) -> int:
         return 2
 
 
+def print_any_character() -> None:
+    """Print a character that the terminal's encoding lacks as its code, in place of an exception."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
 def _give_up_output() -> None:
-    """Drop what cannot be printed: Python would try again at its end, with a traceback and an exit code of its own."""
+    """Discard output that cannot be written. At exit Python would flush it again, and end with a traceback."""
     try:
         if sys.stdout:
             sys.stdout.flush()

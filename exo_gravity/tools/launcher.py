@@ -21,19 +21,15 @@ from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_mach
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, planned, stop_on_signals
-from exo_gravity.tools.cli import require_ros
+from exo_gravity.tools.cli import print_any_character, require_ros
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def print_line(node: str, line: str) -> None:
-    """Print one line of a node's log, with the time of day and the node's name.
-
-    A terminal may lack a character of it: a name of who holds control, say.
-    """
-    clock, encoding = datetime.now().time().isoformat("milliseconds"), sys.stdout.encoding or "utf-8"
-    text = f"{clock} {node.lstrip('/'):<18} {line}"
-    print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
+    """Print one line of a node's log, with the time of day and the node's name."""
+    clock = datetime.now().time().isoformat("milliseconds")
+    print(f"{clock} {node.lstrip('/'):<18} {line}", flush=True)
 
 
 def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
@@ -58,6 +54,7 @@ def main(args: Sequence[str] | None = None) -> None:
     """Entry point of the executable `launcher`."""
     options = _arguments(args)
     require_ros("launcher")
+    print_any_character()  # one that raised would end the reader of a node's log, and block the node
     stopping = stop_on_signals()
     try:
         more = ["/panel"] if options.panel else []
