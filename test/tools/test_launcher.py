@@ -26,6 +26,7 @@ from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
+from exo_gravity.tools.cli import print_any_character
 from exo_gravity.tools.launcher import main
 
 from ..core.test_anfis import law
@@ -117,9 +118,11 @@ def test_what_no_node_could_run_with_is_refused_by_name(refused, changes, named,
     assert error.startswith(f"launcher: {named}") and sentence in error
 
 
+SLOW = {"interface": "virtual", "channel": "slow", "options": {"bitrate": 250_000}}
 WRONG = {  # a node, its changes, and what it would say itself
     "a mass": ("/right/compensator", {"robot": {"mass": [585.0] * 4}}, "robot.mass = [585.0"),
     "a rate": ("/right/can_bridge", {"rate": 20.0}, "rate = 20.0: must be at least"),
+    "a slow bus": ("/right/can_bridge", {"rate": 400.0, "can": SLOW}, "Hz, the capacity of the CAN bus"),
     "a torque": ("/right/can_bridge", {"max_effort": [18.0] * 4}, "at most the motors' peak torque"),
     "a mounting": ("/imu", {"rotation_trunk_from_imu": [0.0] * 4}, "must be a unit quaternion"),
     "a model": ("/right/compensator", {"law": "anfis", "anfis_file": "none.json"}, "anfis_file = 'none.json'"),
@@ -356,6 +359,7 @@ def test_a_line_with_characters_that_the_terminal_lacks_is_printed(monkeypatch):
     """One that raises ends the reader, and a node whose log is not read stands still."""
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="ascii"))
+    print_any_character()
     launcher.print_line("/right/can_bridge", "Jos\xe9 holds control")
     assert written.getvalue().endswith(b"right/can_bridge   Jos\\xe9 holds control\n")
 

@@ -6,7 +6,7 @@ docs/safety_case.md compares the defaults with those of other systems.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from exo_gravity.core.motors.joint_motor import (
     REPLY_SHARE,
     JointMotor,
     JointSample,
+    Traffic,
     channels_of,
 )
 from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, for_joints
@@ -256,18 +257,17 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     return Limits(tuple(values["joint_names"]), **given)
 
 
-def check_bridge(
-    rate: float, motors: Sequence[JointMotor], limits: Limits, status_rate: float = MAX_STATUS_RATE
-) -> None:
+def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buses: Collection[Traffic] = ()) -> None:
     """Check the parameters of a `can_bridge` with control rate `rate` (Hz) against each other.
 
-    status_rate: status frames a second of V3 boards. Raises ParameterError that names both values.
+    buses: the traffic on each of its buses. Raises ParameterError that names both values.
     """
     timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": LOOP.frozen}
     name, shortest = min(timeouts.items(), key=lambda item: item[1])
     if rate * shortest < LOOP.periods - 1e-9:
         expected = f"at least {LOOP.periods / shortest:g} Hz: {name} = {shortest:g} s must span {LOOP.periods} periods"
         raise ParameterError("rate", rate, expected)
+    status_rate = min([bus.status_rate for bus in buses], default=MAX_STATUS_RATE)
     if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):
         expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"
         raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
@@ -275,3 +275,5 @@ def check_bridge(
     if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
         shown = [round(effort, 2) for effort in peak]
         raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")
+    for bus in buses:
+        bus.check(rate)

@@ -35,9 +35,8 @@ def check_nodes(nodes: Nodes) -> None:
         if name == "can_bridge":
             values = node_values(nodes, node, CAN_BRIDGE)
             with named(f"{node} "):
-                motors, limits = motors_of(values), limits_of(values)
-                for bus in traffic_of(values, can_options(given)).values():
-                    check_bridge(values["rate"], motors, limits, bus.status_rate)
+                buses = traffic_of(values, can_options(given)).values()
+                check_bridge(values["rate"], motors_of(values), limits_of(values), buses)
         elif name == "imu":
             values = node_values(nodes, node, IMU)
             settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")

@@ -108,9 +108,7 @@ class CanBridge(LifecycleNode):
         operation.refuse_simulated_time(self, self._arm.address[0])
         motors, limits = self._arm.motors, self._arm.limits
         traffic = traffic_of(values, self._arm.address[2])
-        for bus in traffic.values():
-            check_bridge(values["rate"], motors, limits, bus.status_rate)
-            bus.check(values["rate"])
+        check_bridge(values["rate"], motors, limits, traffic.values())
         self.loop: ControlLoop | None = None
         self._thread_priority = values["thread_priority"]
         self._owned: OwnedBus | None = None  # while configured
