@@ -184,7 +184,8 @@ class Launcher:
     on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
     starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
     in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
-    compensator of an arm share one. Raises ParameterError, MissingPackageError.
+    compensator of an arm share one. check(nodes): may refuse the nodes that are to start, by an exception. Raises
+    ParameterError, MissingPackageError.
     """
 
     def __init__(
@@ -196,8 +197,10 @@ class Launcher:
         namespace: str = "",
         log_level: str = "info",
         one_process: bool = False,
+        check: Callable[[Nodes], object] = lambda nodes: None,
     ) -> None:
         nodes, names, asking = planned(params, only, more)
+        check({node: nodes[node] for node in names})
         self._namespace, self._log_level = namespace, log_level
         #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
         self.params = _copy(

@@ -20,7 +20,7 @@ from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, planned, stop_on_signals
+from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
 from exo_gravity.tools.cli import print_any_character, require_ros
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -60,9 +60,8 @@ def main(args: Sequence[str] | None = None) -> None:
         more = ["/panel"] if options.panel else []
         path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
         namespace = f"/{space}" if space else ""
-        nodes, names, _ = planned(path, options.only, more)
-        check_start({node: nodes[node] for node in names})
-        launcher = Launcher(path, print_line, options.only, more, namespace, options.log_level, options.one_process)
+        nodes = path, print_line, options.only, more, namespace, options.log_level, options.one_process
+        launcher = Launcher(*nodes, check=check_start)
         keep_to_this_machine()
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +16,10 @@ from typing import IO
 import pytest
 from rich.console import Console
 
-from exo_gravity.core.errors import DataError
-from exo_gravity.lab.calibration.live import LiveTour, Person
+from exo_gravity.core.errors import BusError, DataError
+from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.lab.calibration.live import LiveTour, Person, run_tour
+from exo_gravity.lab.inputs.parameter_file import can_options, load, packaged_config
 
 
 @pytest.fixture
@@ -63,3 +67,16 @@ def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path
     assert tour.measured[0].speed == 0.1 and json.loads(record.read_text())["observation"] == values
     with pytest.raises(DataError, match=r"elbow: a hand; what was measured is kept in .*new.jsonl"):
         tour.complete(record)
+
+
+def test_no_tour_begins_on_an_arm_that_a_running_bridge_may_carry(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
+    channel = f"tour{os.getpid()}"
+    bridge = load(packaged_config("sim.yaml"))["/right/can_bridge"]
+    lock = bus_lock.BusLock(("virtual", channel, can_options(bridge)), "/right/can_bridge (PID 7)")
+    nodes = {"/right/can_bridge": {**bridge, "can.interface": "virtual", "can.channel": channel}}
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(BusError, match=r"held by /right/can_bridge \(PID 7\)"):
+        run_tour(argparse.Namespace(output=tmp_path / "new.yaml", record=None), nodes, print)
+    assert signal.getsignal(signal.SIGINT) is before
+    lock.release()

@@ -29,6 +29,7 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE, OF_BRIDGE, of_urdf
 from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, stop_on_signals
@@ -138,7 +139,8 @@ def tour_parameters(
 def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) -> LiveTour:
     """Run `nodes`, each with its parameters, until the tour is done or has failed; the arm is then down.
 
-    options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file.
+    options: output (the log goes into the same folder) and record. Raises ParameterError for a wrong file, and
+    BusError while another can_bridge holds the bus.
     """
     tour, last_errors = LiveTour(), dict[str, str]()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
@@ -154,14 +156,16 @@ def run_tour(options: argparse.Namespace, nodes: Mapping[str, Any], say: Say) ->
         if line.startswith(("FATAL ", "ERROR ")):
             last_errors[node] = line.partition(" ")[2]
 
-    with tempfile.TemporaryDirectory() as folder, options.output.with_suffix(".log").open("a", 1) as log:
+    with contextlib.ExitStack() as stack:
+        for number, handler in handlers.items():
+            stack.callback(signal.signal, number, handler)
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        log = stack.enter_context(options.output.with_suffix(".log").open("a", 1))
         path = Path(folder, "params.yaml")
         path.write_text(text_of(nodes), encoding="utf-8")
-        launcher = Launcher(path, on_line)
+        launcher = Launcher(path, on_line, check=check_start)
         with asking_on_terminal(launcher.asking, say):
             dead = launcher.run(ending)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
     if dead:
         node, code = dead
         tour.trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, 'see the log')}"
