@@ -304,7 +304,7 @@ class Joint:
         return None
 
 
-HANDS = {  # rad/s at a time in s, Nm of friction, and what the wearer is told
+HANDS = {  # joint speed (rad/s) over time (s), friction (Nm), and the message to the wearer
     "moves it before it is pushed": (lambda now: 0.5 if 0.2 < now < 0.3 else 0.0, 10.0, ""),
     "keeps moving it": (lambda now: 1.0 if now % 0.5 > 0.25 else 0.0, 10.0, "hold still"),
     "shakes it": (lambda now: (0.2 if now % 0.04 < 0.02 else -0.2) if now > 0.3 else 0.0, 0.3, ""),

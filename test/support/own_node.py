@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A node of a test, in a context of its own."""
+"""A node for a test, in its own ROS context."""
 
 from __future__ import annotations
 

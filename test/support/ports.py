@@ -40,8 +40,8 @@ def own_domain() -> int:
 def own_ports() -> Iterator[int]:
     """Return every second port of this process's block, again and again; the ones between are free too.
 
-    Ports with notes of motors that may be on are skipped. Whoever takes such a bus first lets an arm down, and a
-    watchdog whose simulated motors are gone may still wait for them there.
+    Ports whose notes say that motors may be on are skipped. The next owner of such a bus would first let an arm down,
+    and a watchdog may still be waiting there for simulated motors that are gone.
     """
     first = FIRST_PORT + BLOCK * _claim("ports", BLOCKS)[0]
     return filter(_is_free, itertools.cycle(range(first, first + BLOCK, 2)))

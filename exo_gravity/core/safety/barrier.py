@@ -24,11 +24,11 @@ Damping is bounded, too: kd times the newest speed stays within `max_effort`, or
 wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
 with others.
 
-"Without delay" is not quite true: current loop and velocity filter have time constants T1 and T2. A joint of inertia J
-vibrates if kd > J (1/T1 + 1/T2) (Routh-Hurwitz of J T1 T2 s^3 + J (T1 + T2) s^2 + J s + kd): the bare elbow, 0.0036 kg
-m^2, above 4.0 Nm s/rad with 8 and 1 ms, above 0.6 with 8 and 20 ms. No reading tells J, T1 or T2. So a joint that
-turns to and fro, faster than people shake, gets less of the damping that is asked for (`VibrationLimits`). The brake of
-a joint that is driven stays.
+The motor's damping is delayed after all, by its current loop (time constant T1) and its velocity filter (T2). A joint
+of inertia J is unstable if kd > J (1/T1 + 1/T2) (Routh-Hurwitz of J T1 T2 s^3 + J (T1 + T2) s^2 + J s + kd): the bare
+elbow, 0.0036 kg m^2, above 4.0 Nm s/rad with 8 and 1 ms, above 0.6 with 8 and 20 ms. J, T1 and T2 are not known. So
+when a joint oscillates faster than people can shake it, its damping is reduced (`VibrationLimits`). The brake of a
+driven joint is not.
 """
 
 import math
@@ -60,10 +60,11 @@ class BarrierTuning:
 
 @dataclass(frozen=True)
 class VibrationLimits:
-    """Which joint vibrates under its damping, and how that is lowered.
+    """When a joint vibrates under its damping, and how far its damping is then reduced.
 
-    Simulated: 0.0024 to 0.0136 kg m^2, behind 8 or 20 ms and 20 ms, at 100 and 250 Hz. Without this they go on at 2.6
-    to 27 rad/s, with up to 33 J in one stretch; with it they reach 15 rad/s once, with 0.5 J, and then at most 3.
+    Simulated joints of 0.0024 to 0.0136 kg m^2, with T1 of 8 or 20 ms and T2 of 20 ms, at 100 and 250 Hz: without this
+    they oscillate on at 2.6 to 27 rad/s, with up to 33 J in one stretch; with it they reach 15 rad/s once, with 0.5 J,
+    and then 3 at most.
     """
 
     speed: float = 0.3  #: rad/s, each way; seven codes of the velocity. With 0.5 they reach 22, with 1.0 J
@@ -96,7 +97,7 @@ class Barrier:
         self._asked = [0.0] * len(self._peak)  # Nm s/rad, that neither rises nor falls at once
         self._slow = [0.0] * len(self._peak)  # rad/s, the speed low-passed by BARRIER.lead
         self._brake = [0.0] * len(self._peak)  # Nm s/rad
-        self._steady = [math.inf] * len(self._peak)  # Nm s/rad, under which a joint does not vibrate
+        self._steady = [math.inf] * len(self._peak)  # Nm s/rad, the most that a joint gets of what is asked for
         self._way = [1.0] * len(self._peak)  # 1 or -1, in which a joint was last faster than VIBRATION.speed
         self._since = [math.inf] * len(self._peak)  # s since it has turned
         self._given = [0.0] * len(self._peak)  # Nm s/rad, last
@@ -193,7 +194,7 @@ class Barrier:
         return tuple(self._brake)
 
     def _watch(self, dt: float, joints: Sequence[JointSample]) -> None:
-        """Lower the damping that a joint may get if it vibrates under what it gets, and let it rise again."""
+        """Reduce the damping limit of each joint that vibrates, and let the limits rise again."""
         for i, joint in enumerate(joints):
             self._steady[i] += VIBRATION.recovery * dt
             self._since[i] += dt

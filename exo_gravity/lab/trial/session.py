@@ -38,7 +38,7 @@ class Session:
 def check_text(name: str, text: Any) -> str:
     """Return `text`; raise ParameterError unless it is a text of at most 1000 characters.
 
-    Half of a character, which a browser's field leaves of an emoji that it cuts, cannot be sent to a page or a node.
+    A browser's field may cut an emoji in half. The half (a lone surrogate) cannot be encoded, so it is refused.
     """
     if not isinstance(text, str) or len(text) > LONGEST or "\0" in text or re.search("[\ud800-\udfff]", text):
         raise ParameterError(name, text, f"a text of at most {LONGEST} whole characters")

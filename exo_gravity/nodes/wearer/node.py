@@ -141,7 +141,7 @@ class WearerNode(Node):
     def _follow_compensator(self) -> None:
         """Read the compensator's parameters if they may have changed."""
         answers = 0
-        with suppress(ValueError):  # of a status by another program
+        with suppress(ValueError):  # another program may publish a status of that name
             answers = int(self._statuses.within(COMPENSATOR_SILENCE, self._status_name).get("answers", "0"))
         if answers < self._answers:  # silent, or restarted: it may have other parameters
             self._compensator.refresh()
