@@ -32,7 +32,6 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -46,13 +45,12 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration import identification
 from exo_gravity.lab.calibration.imu import mounting_turn
 from exo_gravity.lab.calibration.moment_model import PapersMoments
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
+from exo_gravity.lab.calibration.poses import Itinerary, guess_for
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.calibration.tour import DURATION, Tour
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -153,14 +151,20 @@ class Device:
         arm.reset(np.zeros(len(self.turn)))
         return arm
 
-    def tours(self, poses: int, temperature: float, loaded: bool) -> list[Observation]:
-        """Return what a tour shows of the arm with motors at `temperature` degC; loaded: and one with the weight."""
-        found = self._tour(poses, temperature, (0.0, 0.0), self.stand)
-        return found + self._tour(poses, temperature, WEIGHT, self.leant) if loaded else found
+    def tours(
+        self, poses: int, temperature: float, loaded: bool, earlier: Sequence[Observation] = ()
+    ) -> list[Observation]:
+        """Return what tours show of the arm with motors at `temperature` degC.
+
+        loaded: also one with the weight. earlier: what others have shown.
+        """
+        found = self._tour(poses, temperature, (0.0, 0.0), self.stand, earlier)
+        return found + self._tour(poses, temperature, WEIGHT, self.leant, found) if loaded else found
 
     def _tour(
-        self, poses: int, temperature: float, load: tuple[float, float], stand: tuple[float, float]
-    ) -> list[Observation]:
+        self, poses: int, temperature: float, load: tuple[float, float], stand: tuple[float, float],
+        earlier: Sequence[Observation],
+    ) -> list[Observation]:  # fmt: skip
         mass, lever = load
         worn: dict[str, Any] = {"wearer_mass": (0.0, 0.0, 0.0, mass), "wearer_cog": (0.0, 0.0, 0.0, lever)}
         device = SimulatedDevice(self.arm(**worn), [SimulatedMotor(motor) for motor in self.motors])
@@ -170,8 +174,7 @@ class Device:
         let_hang(device)
         limits = Limits(ARM.joint_names, max_effort=MAX_EFFORT, sign_check_torque=0.0)
         tilt = Tilt.of(device.side, *stand)
-        expected = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-        guess = TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), expected, tilt)
+        guess = guess_for(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), tilt, load, earlier)
         tour = Tour(limits, guess, Itinerary(limits, poses, DURATION), RATE, load)
         fault = Player(tour, device, ASSUMED, limits, RATE, tilt).play().fault
         if not tour.done:
@@ -240,7 +243,7 @@ def outcome(seed: int) -> Outcome:
     try:
         cold = device.tours(SCALE_POSES, COLD, loaded=True)
         if "warm motors" in device.effects:
-            temperature, warm = WARM, device.tours(SCALE_POSES, WARM, loaded=False)
+            temperature, warm = WARM, device.tours(SCALE_POSES, WARM, loaded=False, earlier=cold)
         with patch.object(identification, "possible_extras", lambda rows: ()):
             before, _ = device.judged(cold, temperature, np.zeros(len(ASSUMED)))
         return Outcome(seed, device.effects, "", before, *device.judged(cold + warm, temperature, device.measured))

@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.calibration.tour import Player
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, moments_of
+from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Station
@@ -19,9 +19,8 @@ from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.moment_model import PapersMoments
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess
+from exo_gravity.lab.calibration.poses import Itinerary, guess_for
 from exo_gravity.lab.calibration.tour import Tour
-from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -55,8 +54,7 @@ class TourRun:
         device = SimulatedDevice(SimulatedArm(self.truth), [SimulatedMotor(motor) for motor in self.motors])
         device.pitch, device.roll = self.tilt
         tilt = Tilt.of("right", *self.tilt)
-        moments = moments_of(self.assumed) + load_moments(self.assumed.length.tolist(), *self.load)
-        guess = TorqueGuess(PapersMoments(self.assumed, keeps_tilt=True), moments, tilt)
+        guess = guess_for(PapersMoments(self.assumed, keeps_tilt=True), tilt, self.load)
         tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
         player = Player(tour, device, MOTORS_AS_MOUNTED, self.limits, self.rate, tilt, self._disturb)
         self.device, self.log = device, player.log

@@ -18,8 +18,8 @@ from exo_gravity.core.compensation.settings import Settings, robot_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.live import observations_in
 from exo_gravity.lab.calibration.poses import Itinerary
+from exo_gravity.lab.calibration.record import observations_in
 from exo_gravity.lab.calibration.tours import checked, moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
@@ -153,7 +153,7 @@ def test_a_record_of_an_earlier_tour_is_read_and_another_file_is_refused(tmp_pat
     (one,) = warmed(Device(8), 30.0, 0.0)[:1]
     record = tmp_path / "cold.jsonl"
     record.write_text(json.dumps({"observation": one._asdict()}, default=np.ndarray.tolist) + "\n")
-    assert observations_in(record)[0].temperature == [30.0] * 4
+    assert observations_in(record, 4)[0].temperature == [30.0] * 4
     with pytest.raises(DataError, match=r"must be the record \(.jsonl\) of a tour"):
-        observations_in(packaged_config("sim.yaml"))
+        observations_in(packaged_config("sim.yaml"), 4)
     assert configured_arm(packaged_config("sim.yaml")).can_bridge["torque_scale_slope"] == [0.0] * 4

@@ -54,6 +54,7 @@ class TrackerTuning:
     soft_frequency: float = 8.0  #: rad/s, the most once a motor has vibrated,
     soft_stiffness: float = 5.0  #: Nm/rad, of inertia times its square, the most once it has vibrated again
     softer: float = 0.7  #: of the frequency, each time that a motor vibrates still
+    slowest: float = 0.1  #: rad/s: the speed falls to it with a frequency below soft_frequency
     least_frequency: float = 2.5  #: rad/s: 0.6 kg m^2 on 150 Nm/rad oscillate with 5, at 10 Hz (measured)
     least_stiffness: float = 1.2  #: Nm/rad: with less, a light joint hardly follows against its friction (measured)
     #: times the frequency, where the low-pass filter of lowered gains begins: three of them in a row cost 35 degrees
@@ -123,7 +124,7 @@ class Station(NamedTuple):
 class Line:
     """The motion from `start` to `end`, (n,) rad; the joint with the longest way turns at `speed` rad/s at most.
 
-    duration: s. way: (n,), in which each joint turns, -1, 0 or 1.
+    duration: s. way: (n,), in which each joint turns, -1, 0 or 1. speed: rad/s, of the joint with the longest way.
     """
 
     def __init__(self, start: np.ndarray, end: np.ndarray, speed: float = MOTION.speed) -> None:
@@ -131,21 +132,21 @@ class Line:
         way = np.asarray(end, dtype=float) - self._start
         self._length = float(np.abs(way).max())
         self._heading, self.way = way / self._length if self._length else way, np.sign(way)
-        self._speed = min(speed, MOTION.speed, math.sqrt(self._length * MOTION.acceleration))
-        self._ramp = self._speed / MOTION.acceleration
-        self.duration = self._length / self._speed + self._ramp if self._length else 0.0
+        self.speed = min(speed, MOTION.speed, math.sqrt(self._length * MOTION.acceleration))
+        self._ramp = self.speed / MOTION.acceleration
+        self.duration = self._length / self.speed + self._ramp if self._length else 0.0
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return position (n,) rad and velocity (n,) rad/s at `time` s after the start."""
         time = min(max(time, 0.0), self.duration)
         rising, falling = min(time, self._ramp), max(0.0, time - self.duration + self._ramp)
-        travelled = MOTION.acceleration * (rising**2 - falling**2) / 2 + self._speed * (time - rising)
+        travelled = MOTION.acceleration * (rising**2 - falling**2) / 2 + self.speed * (time - rising)
         return self._start + travelled * self._heading, MOTION.acceleration * (rising - falling) * self._heading
 
     def is_measured(self, time: float) -> bool:
         """Return whether the motion is in its middle, within `window` of the half length at steady speed."""
         is_steady = self._ramp <= time <= self.duration - self._ramp
-        return is_steady and abs(time - self.duration / 2.0) * self._speed <= MOTION.window * self._length / 2.0
+        return is_steady and abs(time - self.duration / 2.0) * self.speed <= MOTION.window * self._length / 2.0
 
 
 def average(sweeps: Sequence[Sweep]) -> tuple[Observation, np.ndarray]:
@@ -281,6 +282,7 @@ class Tracker:
         # The path does not wait for a joint that is ahead: it would not come back against its friction.
         behind = float(np.where(self._line.way, self.error * self._line.way, np.abs(self.error)).max())
         pace = max(0.0, min(1.0, (TRACKER.stop_error - behind) / (TRACKER.stop_error - TRACKER.slow_error)))
+        pace = min(pace, self._fastest() / self._line.speed) if self._line.duration else pace
         self._time += pace * dt
         if self._samples is not None and self._line.is_measured(self._time):
             # The effort of the last cycle brought the arm here.
@@ -306,6 +308,15 @@ class Tracker:
     def speed(self) -> np.ndarray:
         """The mean speeds (n,) of the joints in rad/s."""
         return self._vibration.speed
+
+    def _fastest(self) -> float:
+        """Return the speed in rad/s at which the arm may be moved.
+
+        It falls with the lowest natural frequency: so does the rate at which the integral part follows a torque that
+        differs from what was expected.
+        """
+        share = float(self._frequency.min()) / TRACKER.soft_frequency if self._is_soft.any() else 1.0
+        return max(TRACKER.slowest, min(1.0, share) * MOTION.speed)
 
     def _watch_vibration(self, dt: float, velocity: Vector, inertia: np.ndarray) -> None:
         """Lower the gains of joints whose motors vibrate, without a step of what they hold.

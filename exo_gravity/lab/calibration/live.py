@@ -94,15 +94,6 @@ class LiveTour:
         return self.measured
 
 
-def observations_in(record: Path) -> list[Observation]:
-    """Return what a tour wrote to its `record`. Raises DataError if it is not one."""
-    try:
-        lines = record.read_text(encoding="utf-8").splitlines()
-        return [Observation(**json.loads(line)["observation"]) for line in lines]
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{record}: {error}: must be the record (.jsonl) of a tour of this arm") from None
-
-
 def tour_parameters(
     params: Path, arm: AnyArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
 ) -> dict[str, Any]:

@@ -2,8 +2,9 @@
 """Which poses the calibration visits: given ones, or the most informative ones that the motors can hold.
 
 What holds the arm is expected with a mean and a standard deviation for every pose. Each joint has moments of its own,
-in the Nm that its motor is commanded: its unknown torque scale is then part of them. They start from the parameter
-file's arm with a wide uncertainty, and every measured pose narrows it (a Kalman update).
+in the Nm that its motor is commanded: its unknown torque scale is then part of them. Beside them it has an offset and a
+spring: a cable carries as much as a light forearm. They start from the parameter file's arm with a wide uncertainty,
+and every measured pose narrows it (a Kalman update), also those of an earlier tour.
 """
 
 import math
@@ -14,7 +15,7 @@ import numpy as np
 
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import MOTION, Line, Station
+from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.core.safety.limits import WALL, Limits
@@ -28,7 +29,10 @@ class Prior:
 
     share: float = 0.4  #: of a moment: masses and torque scales that are each off by 30 %
     moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
-    unexplained: float = 0.05  #: Nm: standard deviation of what no moment explains
+    load_share: float = 0.25  #: of the moments of a known weight, in commanded Nm: torque scales that are off by 30 %
+    offset: float = 0.05  #: Nm, of a motor, or where a cable is slack
+    spring: float = 0.09  #: Nm/rad: cables of up to 0.15
+    unexplained: float = 0.05  #: Nm: standard deviation of what none of these explains
     #: of a joint: 30 % off in mass, centre of gravity and torque scale are 0.38 to 2.4 in one link, less in a whole arm
     strength: tuple[float, float] = (0.5, 2.0)
 
@@ -74,7 +78,7 @@ class TorqueGuess:
     """The commanded torque that holds the arm, as far as it is known.
 
     model: of the arm.
-    moments: (k,) kg m, with the load.
+    moments: (k,) kg m, without a weight.
     tilt: of the trunk or the stand.
 
     strength: (n,), of each joint, the commanded torque by that of the file's arm: its masses and its torque scale.
@@ -82,45 +86,70 @@ class TorqueGuess:
 
     def __init__(self, model: MomentModel, moments: Vector, tilt: Tilt) -> None:
         moments = np.asarray(moments, dtype=float)
-        deviation = PRIOR.share * np.abs(moments) + PRIOR.moment
+        deviation = np.append(PRIOR.share * np.abs(moments) + PRIOR.moment, (PRIOR.offset, PRIOR.spring))
         self.model = model
         self.tilt = tilt
-        self._mean = np.tile(moments, (model.count, 1))  # of each joint
+        self._mean = np.tile(np.append(moments, (0.0, 0.0)), (model.count, 1))  # of each joint: moments, offset, spring
         self._covariance = np.tile(np.diag(deviation**2), (model.count, 1, 1))
-        self._hold = model.holding(self._mean)
         self._start, self.strength = moments, np.ones(model.count)
         rows = np.moveaxis(along_axes(model, model.suggested), -1, 0)
         self._rows = rows.reshape(-1, *rows.shape[2:])  # gravity from three sides, in all suggested poses
+        self._update()
 
     @property
     def common_moments(self) -> np.ndarray:
         """The moments (k,) in kg m as the joints show them; M_n of the paper's arm is that of joint n."""
-        return self.model.common(self._mean)
+        return self.model.common(self._moments)
 
     def torque(self, theta: Sequence[float]) -> Torque:
         """Return the expected torque (n,) in Nm at `theta` (n,) rad, in plain floats for the control loop."""
-        return self._hold(theta, self.tilt)
+        gravity = self._hold(theta, self.tilt)
+        return tuple(own + at + k * angle for own, (at, k), angle in zip(gravity, self._springs, theta, strict=True))
 
     def torques(self, theta: np.ndarray, direction: Vector | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return the expected torque and its standard deviation, both (m, n) Nm, at `theta` (m, n) rad.
 
         direction: (3,), gravity's unit vector in the base frame; by default as at present.
         """
-        rows = self.model.rows(theta, self.model.down(self.tilt) if direction is None else np.asarray(direction))
+        rows = self._sensitivity(theta, direction)
         mean = np.einsum("njk,jk->nj", rows, self._mean)
         variance = np.einsum("njk,jkl,njl->nj", rows, self._covariance, rows)
         return mean, np.sqrt(np.maximum(variance, 0.0))
 
-    def learn(self, theta: Vector, effort: Vector, spread: Vector) -> None:
-        """Take a measured torque `effort` (n,) Nm at `theta` (n,) rad, with its standard error `spread` (n,) Nm."""
-        rows = self.model.rows(np.array([theta]), self.model.down(self.tilt))[0]
+    def learn(self, theta: Vector, effort: Vector, spread: Vector, direction: Vector | None = None) -> None:
+        """Take a measured torque `effort` (n,) Nm at `theta` (n,) rad, with its standard error `spread` (n,) Nm.
+
+        direction: as for `torques`.
+        """
+        rows = self._sensitivity(np.array([theta]), direction)[0]
         for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
             covariance = self._covariance[joint]
             gain = covariance @ row / (row @ covariance @ row + error**2 + PRIOR.unexplained**2)
             self._mean[joint] += gain * (torque - row @ self._mean[joint])
             self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
-        self._hold = self.model.holding(self._mean)
-        at_start, now = self._rows @ self._start, np.einsum("njk,jk->nj", self._rows, self._mean)
+        self._update()
+
+    def hang(self, load: Vector) -> None:
+        """Expect a weight, too; load: (k,) kg m, its moments."""
+        known = len(self._start)
+        self._start = self._start + load
+        self._mean[:, :known] += load
+        self._covariance[:, range(known), range(known)] += (PRIOR.load_share * np.asarray(load)) ** 2
+        self._update()
+
+    @property
+    def _moments(self) -> np.ndarray:
+        return self._mean[:, :-2]
+
+    def _sensitivity(self, theta: np.ndarray, direction: Vector | None) -> np.ndarray:
+        """Return the torque (m, n, k + 2) per unit of moments, offset and spring."""
+        rows = self.model.rows(theta, self.model.down(self.tilt) if direction is None else np.asarray(direction))
+        return np.concatenate((rows, np.ones_like(rows[..., :1]), theta[..., None]), axis=-1)
+
+    def _update(self) -> None:
+        """Take over the mean."""
+        self._hold, self._springs = self.model.holding(self._moments), self._mean[:, -2:].tolist()
+        at_start, now = self._rows @ self._start, np.einsum("njk,jk->nj", self._rows, self._moments)
         least = len(self._rows) * PRIOR.unexplained**2  # of a joint that carries nothing
         strength = (np.sum(now * at_start, axis=0) + least) / (np.sum(at_start**2, axis=0) + least)
         self.strength = np.clip(strength, *PRIOR.strength)
@@ -134,6 +163,22 @@ class TorqueGuess:
         other: with 1 kg and the arm abducted, joints 1 and 3 together carry 1 kg m^2, but 0.005 against each other.
         """
         return self.strength[:, None] * self.model.matrix(theta, self._start, load)
+
+
+def guess_for(
+    model: MomentModel, tilt: Tilt, load: tuple[float, float] = (0.0, 0.0), earlier: Sequence[Observation] = ()
+) -> TorqueGuess:
+    """Return what is known of an arm before a tour.
+
+    load: a weight in kg, and its distance from the last joint in m.
+    earlier: what other tours of it showed, of which those without a weight count.
+    """
+    guess = TorqueGuess(model, model.moments, tilt)
+    for one in earlier:
+        if not one.load_mass:
+            guess.learn(one.theta, one.effort, one.spread, one.direction)
+    guess.hang(model.load(*load))
+    return guess
 
 
 class Itinerary:

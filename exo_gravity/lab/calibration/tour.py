@@ -10,6 +10,7 @@ efforts.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,8 @@ from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
+from exo_gravity.lab.calibration.record import observations_in
 from exo_gravity.lab.controllers import SampleController
 
 # Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it
@@ -286,6 +288,7 @@ CALIBRATOR = (
     Param("tour.friction", False, "sweep the hanging arm at several speeds, then a few chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on the last link", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the last joint", (0.0, MAX_LENGTH), "m", fixed=True),
+    Param("tour.earlier", "", "record (.jsonl) of an earlier tour, whose poses without a weight are known", fixed=True),
 )
 # Of an arm from a URDF: the paper's has its wearer in first_moment and off_axis.
 WORN = (
@@ -326,7 +329,8 @@ def tour_of(values: Mapping[str, Any]) -> Tour:
     limits = Limits(tuple(values["joint_names"]), **given_limits)
     worn = (values["tour.wearer_mass"], values["tour.wearer_cog"]) if is_urdf else ()
     model = urdf_moments(values, worn) if is_urdf else _papers_moments(values)
-    guess = TorqueGuess(model, model.moments + model.load(*load), Tilt.of(side_of(values)))
+    earlier = observations_in(Path(values["tour.earlier"]), model.count) if values["tour.earlier"] else []
+    guess = guess_for(model, Tilt.of(side_of(values)), load, earlier)
     given = friction_stations(limits) if values["tour.friction"] else ()
     count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])

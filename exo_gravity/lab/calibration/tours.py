@@ -9,6 +9,7 @@ import argparse
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,11 @@ from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES
 from exo_gravity.lab.calibration import live
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
-from exo_gravity.lab.calibration.live import Say, observations_in, tour_parameters
+from exo_gravity.lab.calibration.live import Say, tour_parameters
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
+from exo_gravity.lab.calibration.record import observations_in
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tour import urdf_moments
@@ -62,9 +64,15 @@ MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis":
 
 def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
-    earlier = observations_in(options.earlier) if options.earlier else []
+    earlier = observations_in(options.earlier, len(arm.joint_names)) if options.earlier else []
     places = places_of(options)
-    return moments_from(arm, earlier + tour_observations(options, arm, say, {"tour.poses": options.poses}), places)
+    changes = {"tour.poses": options.poses, **_knowing(options.earlier)}
+    return moments_from(arm, earlier + tour_observations(options, arm, say, changes), places)
+
+
+def _knowing(record: Path | None) -> dict[str, Any]:
+    """Return the parameters of a tour of an arm that an earlier one has shown."""
+    return {"tour.earlier": str(record.absolute())} if record else {}
 
 
 def places_of(options: argparse.Namespace) -> Places:
@@ -102,16 +110,16 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     if mass * lever < LEAST_MOMENT:
         raise ParameterError("mass times lever", mass * lever, f"at least {LEAST_MOMENT:g} kg m")
     places = places_of(options)
-    earlier = observations_in(options.earlier) if options.earlier else []
+    earlier = observations_in(options.earlier, len(arm.joint_names)) if options.earlier else []
     poses = {"tour.poses": SCALE_POSES}
-    bare = tour_observations(options, arm, say, poses)
+    bare = tour_observations(options, arm, say, {**poses, **_knowing(options.earlier)})
     if options.bag:
         weighed = [one._replace(load_mass=mass, load_lever=lever) for one in bare]
         needed = _needed(arm, model, bare)
         bare = [one._replace(effort=effort) for one, effort in zip(bare, needed, strict=True)]
     else:
         hang = _request(arm, mass, lever)
-        changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever}
+        changes = {**poses, "tour.load_mass": mass, "tour.load_lever": lever, **_knowing(options.record)}
         weighed = tour_observations(options, arm, say, changes, hang)
     return moments_from(arm, earlier + bare + weighed, places)
 

@@ -19,7 +19,7 @@ from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import PapersMoments
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, measurable
+from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, guess_for, measurable
 from exo_gravity.lab.calibration.tour import Tour
 from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm
@@ -252,7 +252,7 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
 def test_the_mass_matrix_of_an_arm_under_a_weight_is_in_the_torque_that_each_motor_is_commanded():
     """A joint whose inertia was taken for a tenth of the true one went 0.12 rad off its path."""
     model, scales = PapersMoments(DEFAULT_LINKS, keeps_tilt=True), (0.7, 1.1, 1.3, 0.8)
-    guess = TorqueGuess(model, WEIGHED, Tilt.of("right", 0.07, 0.2))
+    guess = guess_for(model, Tilt.of("right", 0.07, 0.2), WEIGHT)
     poses = candidates(LIMITS, guess.model)
     rows = guess.model.rows(poses[:6], guess.tilt.direction)
     for theta, effort in zip(poses[:6], rows @ WEIGHED / scales, strict=True):
