@@ -33,7 +33,7 @@ def test_an_unseen_cause_has_a_bound_of_its_own():
     dropped = Event(1.0, "payload_dropped", {})
     assert bound_of(case_of(Event(0.0, "disable", {})), clamped=False) == Bound(0.6, 0.3)
     assert bound_of(case_of(dropped), clamped=True).speed == 2.9
-    assert bound_of(replace(case_of(dropped), rate=100.0), clamped=True).speed == 4.3
+    assert bound_of(replace(case_of(dropped), rate=100.0), clamped=True).speed == 7.0
 
 
 def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_as_a_lost_load():
@@ -63,6 +63,16 @@ def test_nothing_bounds_what_a_lost_load_leaves_while_no_command_reaches_the_mot
     silent, dropped = Event(1.0, "bus_silent", {"duration": 0.5}), Event(1.4, "payload_dropped", {})
     assert bound_of(case_of(silent, dropped), clamped=False).speed == math.inf
     assert bound_of(case_of(silent, dropped._replace(time=1.6)), clamped=False).speed == 2.9
+    resists = Event(0.2, "resist", {"duration": 1.0})  # until the motor's push is all that moves the joint
+    assert bound_of(case_of(silent, resists), clamped=False).speed == math.inf
+    assert bound_of(case_of(silent, resists._replace(values={"duration": 2.0})), clamped=False).speed == 1.5
+
+
+def test_an_arm_may_lag_behind_a_trunk_that_turns_while_its_torques_are_late_or_clamped():
+    lean, late = Event(1.0, "lean", {"lean": 0.5, "duration": 0.5}), Event(1.1, "efforts_late", {"duration": 0.2})
+    assert bound_of(case_of(lean), clamped=False) == Bound(turning=True)
+    assert bound_of(case_of(lean, late), clamped=False) == bound_of(case_of(lean), clamped=True)
+    assert bound_of(case_of(lean, late), clamped=False).speed == 2.9
 
 
 def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_slowly():
