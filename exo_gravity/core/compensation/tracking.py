@@ -61,7 +61,7 @@ class TrackerTuning:
     #: where the gain is 1, and leave 3 % of it at twice the frequency that the filter begins with
     filtered_from: float = 10.0
     filter_order: int = 3  #: of first-order filters in a row
-    swing: float = 0.1  #: rad/s off a motor's mean speed, on both sides: four steps of its 12 bits
+    swing: float = 0.07  #: rad/s off a motor's mean speed, on both sides: three steps of its 12 bits
     mean_speed: float = 0.04  #: s, time constant of that mean
     slowest_swing: float = 0.06  #: s from one side to the other; the controller's own motion is slower
     swings: int = 6  #: in a row, which are a vibration: a joint that leaves its friction swings twice

@@ -172,11 +172,26 @@ class PapersMoments:
         return self.gravity * turned_by(axes, turns, moments, link, np.tri(self.count, dtype=bool).T)
 
     def holding(self, moments: np.ndarray) -> Holder:
-        """Return the exact law in plain floats, of an arm for each joint."""
-        along, across = np.maximum(moments[:, :JOINT_COUNT], 0.0), moments[:, JOINT_COUNT:]
+        """Return the exact law in plain floats, of an arm for each joint, less that of what is below 0 of its M1..M4.
+
+        An arm has none below 0, but a joint may seem to, until more poses are known.
+        """
+        along, across = moments[:, :JOINT_COUNT], moments[:, JOINT_COUNT:]
+        arms = self._arms(np.maximum(along, 0.0), across)
+        below = self._arms(np.maximum(-along, 0.0), np.zeros_like(across))
+
+        def hold(theta: Sequence[float], tilt: Tilt) -> Torque:
+            pairs = enumerate(zip(arms, below, strict=True))
+            return tuple(
+                exact_torque(arm, theta, tilt)[n] - exact_torque(less, theta, tilt)[n] for n, (arm, less) in pairs
+            )
+
+        return hold
+
+    def _arms(self, along: np.ndarray, across: np.ndarray) -> list[ArmModel]:
+        """Return the arms with M1..M4 (n, 4) and W, Z, Y3, Y4 (n, 4), in kg m."""
         pairs = zip(along, across, strict=True)
-        arms = [ArmModel.from_moments(self.length, *pair, gravity=self.gravity) for pair in pairs]
-        return lambda theta, tilt: tuple(exact_torque(arm, theta, tilt)[joint] for joint, arm in enumerate(arms))
+        return [ArmModel.from_moments(self.length, *pair, gravity=self.gravity) for pair in pairs]
 
     def common(self, moments: np.ndarray) -> np.ndarray:
         """Return the mean of the joints; M_n is that of joint n."""
