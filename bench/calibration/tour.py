@@ -20,6 +20,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
+from exo_gravity.lab.calibration.record import line_of
 from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, side_of, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
@@ -105,6 +106,8 @@ def run_tour(players: list[Player], prepare: Callable[[Player], None] = lambda p
         players.append(player)
         prepare(player)
         fault, tour = player.play().fault, player.tour
+        with options.record.open("a", encoding="utf-8") as file:
+            file.writelines(f"{line_of(one)}\n" for one in tour.measured)
         trouble = tour.trouble or ("" if tour.done else fault.reason if fault else "the tour did not end")
         return LiveTour(list(tour.measured), trouble, tour.done)
 

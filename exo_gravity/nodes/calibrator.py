@@ -15,7 +15,6 @@ import threading
 import time
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
@@ -25,6 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN
+from exo_gravity.lab.calibration.record import line_of
 from exo_gravity.lab.calibration.tour import calibrator_table, side_of, tour_of
 from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
@@ -126,13 +126,13 @@ class CalibratorNode(Node):
 
     def _report(self) -> None:
         tour, trouble = self._tour, self._tour.trouble or self._trouble
-        events: list[dict[str, Any]] = [{"observation": one._asdict()} for one in tour.measured[self._printed :]]
-        self._printed += len(events)
+        lines = [line_of(one) for one in tour.measured[self._printed :]]
+        self._printed += len(lines)
         progress = tour.progress if self._began else f"waiting for the arm to be carried: {self._bridge_message}"
         reported = {"progress": progress, "trouble": trouble, "done": tour.done}
-        events += [{key: value} for key, value in reported.items() if value != self._reported[key]]
+        lines += [json.dumps({key: value}) for key, value in reported.items() if value != self._reported[key]]
         self._reported = reported
-        sys.stdout.writelines(json.dumps(event, default=np.ndarray.tolist) + "\n" for event in events)
+        sys.stdout.writelines(f"{line}\n" for line in lines)
         sys.stdout.flush()
         level = ERROR if trouble else OK if self._began else WARN
         working = NodeState.MEASURING if self._began else NodeState.WAITING

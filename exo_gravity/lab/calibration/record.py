@@ -4,8 +4,15 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
+
+
+def line_of(observation: Observation) -> str:
+    """Return the line of an observation, without its end."""
+    return json.dumps({"observation": observation._asdict()}, default=np.ndarray.tolist)
 
 
 def observations_in(record: Path, joints: int) -> list[Observation]:

@@ -13,7 +13,7 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.kinematics import LinkInertia
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, average
+from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, average
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
@@ -247,6 +247,39 @@ def test_the_expected_torque_learns_scale_and_moments_of_each_joint():
     assert np.abs(before[0] - torque).max() > 0.4 and np.abs(mean - torque).max() < 0.1
     assert np.all(deviation <= before[1] + 1e-9)
     np.testing.assert_allclose(guess.torque(poses[0].tolist()), mean[0], atol=1e-9)
+
+
+def test_what_is_expected_in_the_loop_is_what_is_added_to_the_result_also_where_a_moment_seems_to_be_negative():
+    """Moments below 0 counted as 0 in the loop only: a cable made 0.39 Nm of error in one pose."""
+    guess = guess_of(tilt=Tilt.of("right", 0.1, 0.2))
+    poses = candidates(LIMITS, guess.model)[:20]
+    for theta in poses[:3]:
+        guess.learn(theta, -gravity_torque(DEFAULT_LINKS, theta, guess.tilt.direction), (0.003,) * 4)
+    assert np.min(guess.common_moments[:4]) < -0.01
+    in_loop = [guess.torque(theta) for theta in poses.tolist()]
+    np.testing.assert_allclose(in_loop, guess.torques(poses)[0], atol=1e-9)
+
+
+def test_a_tour_begins_with_what_earlier_ones_have_shown_of_the_arm_without_a_weight():
+    model, tilt, cable = PapersMoments(DEFAULT_LINKS, keeps_tilt=True), Tilt.of("right", 0.1), np.full(4, 0.1)
+    poses = candidates(LIMITS, model)[:40]
+
+    def needed(load=(0.0, 0.0)):
+        moments = 1.3 * MOMENTS + load_moments(DEFAULT_LINKS.length.tolist(), *load)
+        return model.rows(poses, tilt.direction) @ moments / SCALES + cable * poses
+
+    seen = [
+        Observation(theta, tilt.direction, effort, (0.2,) * 4, (0.003,) * 4)
+        for theta, effort in zip(poses[:8], needed(), strict=False)
+    ]
+    weighed = [one._replace(effort=one.effort + 5.0, load_mass=1.0, load_lever=0.3) for one in seen]
+    bare, heavy = (guess_for(model, tilt, load, seen + weighed) for load in ((0.0, 0.0), WEIGHT))
+    assert np.abs(bare.torques(poses)[0] - needed()).max() < 0.1
+    off, expected = np.abs(heavy.torques(poses)[0] - needed(WEIGHT)), heavy.torques(poses)[1]
+    assert (
+        np.all(off < 3.0 * expected)
+        and 0.3 < off.max() < np.abs(guess_for(model, tilt, WEIGHT).torques(poses)[0] - needed(WEIGHT)).max()
+    )
 
 
 def test_the_mass_matrix_of_an_arm_under_a_weight_is_in_the_torque_that_each_motor_is_commanded():
