@@ -8,17 +8,14 @@ the virtual wearer performs.
 import json
 import threading
 from collections import deque
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, is_fd
 from exo_gravity.core.trunk.imu_checks import ImuSample
 from exo_gravity.core.vocabulary import words
@@ -39,14 +36,6 @@ with extras("simulator", "sim"):
     from exo_gravity.sim.trunk_motion import TrunkState
 
 TRUNK_SPEED = 0.5  # rad/s at which the trunk turns to a new tilt
-
-
-def script_of(path: str) -> TrialScript | None:
-    """Return the script in a YAML file, None if `path` is empty. Raises ParameterError."""
-    try:
-        return TrialScript.parse(yaml.safe_load(Path(path).read_text(encoding="utf-8"))) if path else None
-    except (OSError, yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ParameterError("trial", path, f"a readable script file ({error})") from None
 
 
 class Simulator(Node):
@@ -111,7 +100,7 @@ class Simulator(Node):
 
     def _script_of(self, path: str) -> TrialScript | None:
         """Return the script in a file for this arm, None if `path` is empty. Raises ParameterError."""
-        script = script_of(path)
+        script = TrialScript.read(path) if path else None
         if script:
             script.check(len(self._device.motors))
         return script

@@ -134,8 +134,8 @@ class Recordings:
             return "a trial starts when every arm is active"
         path = self.trials[name]
         try:
-            script = TrialScript.parse(yaml.safe_load(path.read_text(encoding="utf-8")))
-        except (OSError, yaml.YAMLError, ParameterError) as error:
+            script = TrialScript.read(path)
+        except ParameterError as error:
             return f"{path}: {error}"
         if problem := self._occupied():
             return problem

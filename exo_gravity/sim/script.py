@@ -10,9 +10,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from exo_gravity.core.arm.arm_data import MAX_PAYLOAD
 from exo_gravity.core.errors import ParameterError
@@ -72,12 +74,33 @@ class Step:
         raise ParameterError(where, entry, expected)
 
 
+class _Loader(yaml.SafeLoader):
+    """Refuses a key that is given twice, of which YAML's own loader takes the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice", node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 @dataclass(frozen=True)
 class TrialScript:
     """A named list of steps."""
 
     name: str
     steps: tuple[Step, ...]
+
+    @classmethod
+    def read(cls, path: str | Path) -> "TrialScript":
+        """Return the script in a YAML file. Raises ParameterError."""
+        try:
+            content = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
+        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
+            reason = " ".join(str(error).split())
+            raise ParameterError("trial", str(path), f"a readable YAML file ({reason})") from None
+        return cls.parse(content)
 
     @classmethod
     def parse(cls, content: Any) -> "TrialScript":

@@ -50,3 +50,22 @@ def test_an_invalid_entry_is_named(content, name):
     with pytest.raises(ParameterError) as caught:
         TrialScript.parse(content)
     assert caught.value.name == name
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (b"name: x\nsteps:\n  - {hold: 1.0}\nsteps:\n  - {hold: 2.0}\n", "steps is given twice"),
+        (b"name: x\nsteps: [{hold: 1.0, hold: 30.0}]\n", "hold is given twice"),
+        (b"\xff\xfe", "decode"),
+        (b"[" * 5000, "depth"),
+        (None, "No such file"),
+    ],
+)
+def test_a_file_that_says_something_twice_or_cannot_be_read_is_refused(text, why, tmp_path):
+    path = tmp_path / "trial.yaml"
+    if text is not None:
+        path.write_bytes(text)
+    with pytest.raises(ParameterError, match=why) as caught:
+        TrialScript.read(path)
+    assert caught.value.name == "trial" and str(path) in str(caught.value)

@@ -5,8 +5,6 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import yaml
-
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
@@ -33,11 +31,7 @@ def read_script(name: str) -> tuple[Path, TrialScript]:
     if name not in packaged and not name.endswith((".yaml", ".yml")):
         raise ParameterError("trial", name, f"{', '.join(packaged)} or a YAML file with a script")
     path = packaged.get(name, Path(name))
-    try:
-        return path.resolve(), TrialScript.parse(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise ParameterError("trial", name, f"a readable YAML file ({reason})") from None
+    return path.resolve(), TrialScript.read(path)
 
 
 def analysed(bag: "Bag", script: TrialScript, guided: bool, trouble: str) -> tuple["Report", str]:
