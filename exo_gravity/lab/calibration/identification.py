@@ -5,8 +5,9 @@ The commanded effort that holds the arm in a pose is, without friction, which av
 
     effort = (torque(moments + load) + spring theta) / scale + offset
 
-where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint, and a slope of its
-scale over the motor's temperature, are identified only where the poses ask for them (`pose_fit.asked_for`).
+where torque is the arm's regressor (moment_model.py) times its moments. A spring across a joint is identified only
+where the poses ask for it (`pose_fit.asked_for`), and a slope of its scale over the motor's temperature where the arm
+was seen cold and warm.
 
 The places of the joints are unknowns, too, as small turns: about a joint's axis, which is an error of its encoder's
 zero, and across it, which is an axis askew. A turn shows where the joints beyond turn about another axis. The zero of

@@ -10,9 +10,10 @@ linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinati
 show: those whose standard error exceeds `NATURAL`. Angles and turns are known to some degrees before: what the poses do
 not show of them stays within that, and is part of the errors.
 
-Further unknowns, the extras, are 0 unless the poses ask for them: a spring across each joint in Nm/rad (where it is
-slack is part of the offset), and the slope of each scale over the motor's temperature. `asked_for` decides by an
-information criterion, so that an arm without springs loses no exactness to them.
+Two further unknowns of each joint, the extras, may be 0. A spring across it, in Nm/rad (where it is slack is part of
+the offset), is 0 unless the poses ask for it: `asked_for` decides by an information criterion, so that an arm without
+springs loses no exactness to them. The slope of its scale over the motor's temperature is fitted from every arm that
+was seen cold and warm, within what magnets lose: every motor has one.
 
 Errors are larger in some joints than the observations state (gear friction is not the same in every pose), so each
 joint gets a factor of its own, estimated from its residuals and pooled with the others where poses are few.
@@ -86,7 +87,7 @@ class Fit:
 
     least_spread: float = 0.003  #: Nm; about half a code of an AK motor's 12-bit torque
     #: of torque: error of all sweeps of a joint in one tour, which their scatter does not show
-    common_error: float = 0.002
+    common_error: float = 0.001
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
@@ -103,6 +104,7 @@ class Fit:
     #: Nm, and this share of the peak effort: a smaller error does no harm, nor does a hand cause it
     least_outlier: float = 0.03
     share_of_peak: float = 0.01  #: of the effort, likewise
+    slope_error: float = 0.001  #: 1/K: magnets lose 0.001 to 0.002, and the file's slope is corrected
     least_warming: float = 5.0  #: K between the coldest and the warmest pose, from which a slope can show
     hidden: float = 0.1  #: share of an unknown, in combinations that are not known, from which it is not known itself
 
@@ -232,7 +234,8 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, places: Pla
     if model.shows_tilt:
         turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
     turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]
-    anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, turns, product / EXACT))
+    slopes = unit[at.slope] / FIT.slope_error
+    anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, slopes, turns, product / EXACT))
     along, sigma = along_axes(model, theta), np.hypot(spread, FIT.least_spread)
     turned = model.turned(theta)[..., : model.turns]
     temperature = temperatures(observations)
@@ -338,25 +341,27 @@ def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
 
 
 def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows, Solution]]) -> tuple[int, ...]:
-    """Return which of the extras `among` the poses ask for, as `fit` (`robust` or `final`) judges them.
+    """Return which of the extras `among` are fitted: all slopes, and the springs that the poses ask for.
 
-    Backwards: the one that explains least goes, until each one lowers the sum of squares by more than the extended
-    criterion of J. Chen and Z. Chen, Biometrika 95 (2008): ln of the number of efforts (Schwarz's), plus 2 ln of the
-    number of candidates. A spring that would push is none. None stays that hides another unknown.
+    As `fit` (`robust` or `final`) judges them, backwards: the spring that explains least goes, until each one lowers
+    the sum of squares by more than the extended criterion of J. Chen and Z. Chen, Biometrika 95 (2008): ln of the
+    number of efforts (Schwarz's), plus 2 ln of the number of candidates. A spring that would push is none. None stays
+    that hides another unknown.
     """
     at = rows.layout
-    left, penalty = list(among), math.log(rows.effort.size) + 2.0 * math.log(len(at.extras))
-    is_shown = fit(rows.with_extras(()))[1].hidden <= FIT.hidden if left else np.ones(at.count, dtype=bool)
-    while left:
-        solution = fit(rows.with_extras(left))[1]
-        value, variance = solution.unknowns[left], np.diag(solution.covariance)[left]
-        pushes = (value < 0.0) & (np.array(left) < at.spring.stop)
-        gain = np.where(pushes | (solution.hidden[left] > FIT.hidden), 0.0, value**2 / np.maximum(variance, 1e-30))
+    springs, slopes = [n for n in among if n < at.spring.stop], [n for n in among if n >= at.slope.start]
+    penalty = math.log(rows.effort.size) + 2.0 * math.log(at.joints)
+    is_shown = fit(rows.with_extras(slopes))[1].hidden <= FIT.hidden if springs else np.ones(at.count, dtype=bool)
+    while springs:
+        solution = fit(rows.with_extras(springs + slopes))[1]
+        value, variance = solution.unknowns[springs], np.diag(solution.covariance)[springs]
+        is_none = (value < 0.0) | (solution.hidden[springs] > FIT.hidden)
+        gain = np.where(is_none, 0.0, value**2 / np.maximum(variance, 1e-30))
         least = int(np.argmin(gain))
         if gain[least] > penalty and not np.any(is_shown & (solution.hidden > FIT.hidden)):
             break
-        del left[least]
-    return tuple(left)
+        del springs[least]
+    return (*springs, *slopes)
 
 
 def possible_extras(rows: Rows) -> tuple[int, ...]:
