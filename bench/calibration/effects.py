@@ -44,7 +44,7 @@ from exo_gravity.core.numbers import COVER
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration import identification
 from exo_gravity.lab.calibration.imu import mounting_turn
-from exo_gravity.lab.calibration.moment_model import PapersMoments
+from exo_gravity.lab.calibration.moment_model import GRID, PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, guess_for
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.calibration.tour import DURATION, Tour
@@ -73,7 +73,7 @@ OFF = ASKEW = np.radians(1.5)  # rad, the largest error of a zero, and of the di
 BACK_AND_FORTH, SIDEWAYS = (0.05, 0.09), (0.19, 0.22)
 REST = (-0.3, 0.8)  # rad, where a cable is slack
 STIFFNESS_ERROR = 0.1  # standard error of `joint_stiffness`, as a share of it
-POSES = np.array((-0.8, 0.3, -0.2, 0.2)), np.array((0.8, 1.3, 1.2, 1.4))  # rad
+LOW, HIGH = np.radians([(angles[0], angles[-1]) for angles in GRID]).T  # rad, poses for which the band is stated
 NEW_POSES = 300
 LEAN = 0.15  # rad, standard deviation of the trunk's pitch and roll in these
 MEDIAN, LARGE = 0.01, 0.025  # of peak: limits of the median and of the 95th percentile
@@ -211,7 +211,7 @@ class Device:
         assumed = [scale_at(*motor, temperature) for motor in zip(given["torque_scale"], slope, at, strict=True)]
         strength = np.divide([motor.scale_at(temperature) for motor in self.motors], assumed)
         device, random, bridge = self.arm(), np.random.default_rng(1000), ARM.can_bridge
-        poses = random.uniform(*POSES, (NEW_POSES, len(ASSUMED)))
+        poses = random.uniform(LOW, HIGH, (NEW_POSES, len(ASSUMED)))
         shown = poses + self.zero - np.multiply(bridge["direction"], np.subtract(given["zero"], bridge["zero"]))
         mounting = Rotation.from_rotvec(mounting_turn(result.identified)[2])
         needed = resting_torque if device.config.elastic else _needed
