@@ -29,10 +29,11 @@ class Prior:
 
     share: float = 0.4  #: of a moment: masses and torque scales that are each off by 30 %
     moment: float = 0.02  #: kg m, in addition: off-axis moments of which the file knows nothing
-    load_share: float = 0.25  #: of the moments of a known weight, in commanded Nm: torque scales that are off by 30 %
+    load_share: float = 0.2  #: of the torque of a known weight, as commanded: torque scales that are off by 30 %
     offset: float = 0.05  #: Nm, of a motor, or where a cable is slack
     spring: float = 0.09  #: Nm/rad: cables of up to 0.15
-    unexplained: float = 0.05  #: Nm: standard deviation of what none of these explains
+    unexplained: float = 0.05  #: Nm: standard deviation of what none of these explains,
+    angle: float = 0.03  #: rad, and of the direction in which it pulls: zeros and axes that are off
     #: of a joint: 30 % off in mass, centre of gravity and torque scale are 0.38 to 2.4 in one link, less in a whole arm
     strength: tuple[float, float] = (0.5, 2.0)
 
@@ -94,6 +95,7 @@ class TorqueGuess:
         self._start, self.strength = moments, np.ones(model.count)
         rows = np.moveaxis(along_axes(model, model.suggested), -1, 0)
         self._rows = rows.reshape(-1, *rows.shape[2:])  # gravity from three sides, in all suggested poses
+        self._size = self._typical()  # Nm
         self._update()
 
     @property
@@ -122,9 +124,10 @@ class TorqueGuess:
         direction: as for `torques`.
         """
         rows = self._sensitivity(np.array([theta]), direction)[0]
-        for joint, (row, torque, error) in enumerate(zip(rows, effort, spread, strict=True)):
+        unexplained = np.hypot(PRIOR.unexplained, PRIOR.angle * self._size)
+        for joint, (row, torque, error) in enumerate(zip(rows, effort, np.hypot(spread, unexplained), strict=True)):
             covariance = self._covariance[joint]
-            gain = covariance @ row / (row @ covariance @ row + error**2 + PRIOR.unexplained**2)
+            gain = covariance @ row / (row @ covariance @ row + error**2)
             self._mean[joint] += gain * (torque - row @ self._mean[joint])
             self._covariance[joint] = covariance - np.outer(gain, row @ covariance)
         self._update()
@@ -133,8 +136,9 @@ class TorqueGuess:
         """Expect a weight, too; load: (k,) kg m, its moments."""
         known = len(self._start)
         self._start = self._start + load
+        self._size = self._typical()
         self._mean[:, :known] += load
-        self._covariance[:, range(known), range(known)] += (PRIOR.load_share * np.asarray(load)) ** 2
+        self._covariance[:, :known, :known] += PRIOR.load_share**2 * np.outer(load, load)  # one scale for all moments
         self._update()
 
     @property
@@ -145,6 +149,10 @@ class TorqueGuess:
         """Return the torque (m, n, k + 2) per unit of moments, offset and spring."""
         rows = self.model.rows(theta, self.model.down(self.tilt) if direction is None else np.asarray(direction))
         return np.concatenate((rows, np.ones_like(rows[..., :1]), theta[..., None]), axis=-1)
+
+    def _typical(self) -> np.ndarray:
+        """Return the torque (n,) in Nm of the file's arm, root mean square over all poses."""
+        return np.asarray(np.sqrt(np.mean((self._rows @ self._start) ** 2, axis=0)))
 
     def _update(self) -> None:
         """Take over the mean."""

@@ -43,10 +43,12 @@ RAISED = 4  # chosen poses of a tour for friction: they show what depends on the
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
 # What stops a tour.
-MAX_ERROR = 0.12  # rad between a joint and the slow reference
+MAX_ERROR = 0.12  # rad between a joint and the slow reference,
+MAX_SOFT_ERROR = 0.18  # and under gains that were lowered because motors vibrated
 FASTEST = 1.0  # rad/s of a joint; a light joint that leaves its friction reaches 0.5
 MAX_VIBRATIONS = 10  # of a motor, under the lowest gains
-MAX_CORRECTION = 0.5  # Nm, of the controllers, in addition to what is unknown of weight and friction
+# Nm, of the controllers, in addition to what is unknown of weight and friction; under lowered gains
+MAX_CORRECTION, MAX_SOFT_CORRECTION = 0.5, 1.0
 DEVIATIONS = 3.0  # of the expected torque
 UNKNOWN_FRICTION = 1.0  # Nm, until it is measured
 PERSISTENCE = 0.25  # s for which a torque must be unexplained
@@ -135,10 +137,10 @@ class Tour:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         tracker = self._tracker
         joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
-        reason = VIBRATED if tracker.is_soft.any() else HAND
+        reason, most = (VIBRATED, MAX_SOFT_ERROR) if tracker.is_soft.any() else (HAND, MAX_ERROR)
         for name, behind, speed, vibrations in joints:
-            if not abs(behind) <= MAX_ERROR:
-                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {MAX_ERROR:g}: {reason}"
+            if not abs(behind) <= most:
+                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}: {reason}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
             if vibrations > MAX_VIBRATIONS:
@@ -151,7 +153,8 @@ class Tour:
             most = f"max_effort = {self._most[i]:g} Nm"
             return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
         torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
-        limit = MAX_CORRECTION + DEVIATIONS * self._uncertain + slide
+        own = MAX_SOFT_CORRECTION if self._tracker.is_soft.any() else MAX_CORRECTION
+        limit = own + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
