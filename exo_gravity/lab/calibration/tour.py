@@ -57,6 +57,7 @@ MAX_GAP = 0.1  # s between two joint states; as long as can_bridge's longest tim
 LONGEST_CHOICE = 30.0  # s for which the arm is held while the next pose is chosen
 MAX_TILT = 0.1  # rad by which the stand or the trunk may tilt during the tour
 HAND = "a hand is on the arm, or the joint is blocked"
+HELD = "is a hand on the arm?"
 VIBRATED = (
     "motors vibrated, as behind elastic joints, and the gains that stop this are too low for this file: correct "
     "its masses and torque_scale, hang no weight, or stiffen the joint"
@@ -150,15 +151,16 @@ class Tour:
     def _wrong_torque(self, dt: float) -> str:
         """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
         for i in np.flatnonzero(self._tracker.saturated > SATURATION):
+            why = f": {VIBRATED}" if self._tracker.is_soft.any() else ""
             most = f"max_effort = {self._most[i]:g} Nm"
-            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{why}"
         torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
-        own = MAX_SOFT_CORRECTION if self._tracker.is_soft.any() else MAX_CORRECTION
+        own, why = (MAX_SOFT_CORRECTION, VIBRATED) if self._tracker.is_soft.any() else (MAX_CORRECTION, HELD)
         limit = own + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
-            return f"{self._limits.joint_names[i]}: {beyond}: is a hand on the arm?"
+            return f"{self._limits.joint_names[i]}: {beyond}: {why}"
         return ""
 
     def plan(self) -> None:
