@@ -87,7 +87,7 @@ class Fit:
 
     least_spread: float = 0.003  #: Nm; about half a code of an AK motor's 12-bit torque
     #: of torque: error of all sweeps of a joint in one tour, which their scatter does not show
-    common_error: float = 0.001
+    common_error: float = 0.0005
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
@@ -97,7 +97,7 @@ class Fit:
     axis_error: float = 0.0107
     scale_error: float = 0.15  #: of a torque scale of which nothing is known; users report 0.75
     huber: float = 2.0  #: standard errors beyond which a residual's weight falls
-    pooling: float = 6.0  #: degrees of freedom with which all joints together inform the error of each
+    pooling: float = 2.0  #: degrees of freedom with which all joints together inform the error of each
     steps: int = 40  #: of Gauss-Newton, at most
     #: sum of squares that a pose causes, from which it is left out: of good poses, one in 500,000
     outlier: float = 32.0

@@ -38,7 +38,7 @@ from exo_gravity.lab.controllers import SampleController
 # tips over: with 1 kg, and motors 17 % stronger than the file says, it swung out to 0.9 rad before the tour began.
 WAITING_SHARE = 0.5
 MAX_FAILURES = 3  # pairs of sweeps in which a joint may stick: each shows the controller more of its friction
-MAX_SKIPPED = 2  # poses in which a joint may stick
+MAX_SKIPPED = 4  # poses in which a joint may stick
 RAISED = 4  # chosen poses of a tour for friction: they show what depends on the torque
 STEADY_SPEED = 0.05  # rad/s of a sweep, from which on its friction is that of the motion between poses
 REFRESH_PERIOD = 0.1  # s between two estimates of the mass matrix, and of how uncertain the expected torque is
