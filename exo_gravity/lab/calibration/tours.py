@@ -280,8 +280,8 @@ def _lines(arm: AnyArm, found: Identified) -> Iterator[str]:
 
 
 def row(values: np.ndarray) -> str:
-    """Return numbers with three digits, and 'unknown' for those that are not finite."""
-    return " ".join(f"{value:.3g}" if np.isfinite(value) else "unknown" for value in values)
+    """Return numbers with three digits, none below 1e-9, and 'unknown' for those that are not finite."""
+    return " ".join(f"{round(value, 9):.3g}" if np.isfinite(value) else "unknown" for value in values.tolist())
 
 
 def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
