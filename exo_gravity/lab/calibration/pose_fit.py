@@ -344,13 +344,12 @@ def asked_for(rows: Rows, among: Sequence[int], fit: Callable[[Rows], tuple[Rows
     """Return which of the extras `among` are fitted: all slopes, and the springs that the poses ask for.
 
     As `fit` (`robust` or `final`) judges them, backwards: the spring that explains least goes, until each one lowers
-    the sum of squares by more than the extended criterion of J. Chen and Z. Chen, Biometrika 95 (2008): ln of the
-    number of efforts (Schwarz's), plus 2 ln of the number of candidates. A spring that would push is none. None stays
-    that hides another unknown.
+    the sum of squares by more than ln of the number of efforts (G. Schwarz, Ann. Statist. 6, 1978). A spring that would
+    push is none. None stays that hides another unknown.
     """
     at = rows.layout
     springs, slopes = [n for n in among if n < at.spring.stop], [n for n in among if n >= at.slope.start]
-    penalty = math.log(rows.effort.size) + 2.0 * math.log(at.joints)
+    penalty = math.log(rows.effort.size)
     is_shown = fit(rows.with_extras(slopes))[1].hidden <= FIT.hidden if springs else np.ones(at.count, dtype=bool)
     while springs:
         solution = fit(rows.with_extras(springs + slopes))[1]
