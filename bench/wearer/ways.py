@@ -31,6 +31,7 @@ from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Tissue, Wearer
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER, Vector
 from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.moments import regressor
@@ -163,12 +164,24 @@ def seen_of(worn: Worn) -> Seen:
     return Seen(np.array(left), np.array(covered), np.array(share_covered), np.array(bands), bool(worn.refusals))
 
 
-def seen_by_effect(seed: int) -> list[Seen]:
-    """Return what was seen of the wearer of `seed` with each of EFFECTS."""
-    return [seen_of(draw(seed, effect)) for effect in EFFECTS]
+def seen_by_effect(seed: int) -> list[Seen | None]:
+    """Return what was seen of the wearer of `seed` with each of EFFECTS; None where no calibration came of it."""
+    return [_seen_with(seed, effect) for effect in EFFECTS]
 
 
-def tables(found: Sequence[Sequence[Seen]]) -> str:
+def _seen_with(seed: int, effect: str) -> Seen | None:
+    try:
+        return seen_of(draw(seed, effect))
+    except DataError:
+        return None
+
+
+def told(seen: Sequence[Seen | None]) -> str:
+    """Return the line of one device."""
+    return " ".join(f"{one.left[NOW]:.1%}" if one else "refused" for one in seen)
+
+
+def tables(found: Sequence[Sequence[Seen | None]]) -> str:
     """Return both tables of all devices, with a row for each effect."""
     count = len(found)
     lines = [
@@ -177,7 +190,8 @@ def tables(found: Sequence[Sequence[Seen]]) -> str:
     ]  # fmt: skip
     others = ["", "| wearer | | torque covered, joints 1 to 4, % | share covered | half its band, points | refused |"]
     others.append("|---|---|---|---|---|---|")
-    for effect, column in zip(EFFECTS, zip(*found, strict=True), strict=True):
+    for effect, whole in zip(EFFECTS, zip(*found, strict=True), strict=True):
+        column = [seen for seen in whole if seen]
         left = 100.0 * np.array([seen.left for seen in column])
         cells = [f"{np.median(way):.1f}, {way.max():.1f}" for way in left.T]
         lines.append(f"| {effect} | {' | '.join(cells)} |")
@@ -185,16 +199,16 @@ def tables(found: Sequence[Sequence[Seen]]) -> str:
             covered = 100.0 * np.mean([seen.covered[number] for seen in column], axis=0)
             inside = sum(bool(seen.share_covered[number]) for seen in column)
             band = 100.0 * np.median([seen.band[number] for seen in column])
-            refused = str(sum(seen.refused for seen in column)) if number else ""
+            refused = str(sum(seen is None or seen.refused for seen in whole)) if number else ""
             shown = " ".join(f"{value:.0f}" for value in covered)
-            others.append(f"| {effect} | {when} | {shown} | {inside} of {count} | {band:.0f} | {refused} |")
+            others.append(f"| {effect} | {when} | {shown} | {inside} of {len(column)} | {band:.0f} | {refused} |")
     return "\n".join([*lines, *others])
 
 
 def main() -> int:
     """Run the study; print its tables, and write them."""
     options = options_of("bench.wearer.ways", "Ways to find a wearer's passive arm.", Path("build/ways"))
-    found = part_by_part("ways", seen_by_effect, options.seeds, lambda one: " ".join(f"{s.left[NOW]:.1%}" for s in one))
+    found = part_by_part("ways", seen_by_effect, options.seeds, told)
     text = tables(found)
     print(text)
     options.output.parent.mkdir(parents=True, exist_ok=True)
