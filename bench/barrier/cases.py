@@ -115,7 +115,7 @@ class Case:
     @property
     def duration(self) -> float:
         """How many s after the event are judged."""
-        return TrialScript.parse({"name": self.name, "steps": list(self.after)}).duration
+        return TrialScript.parse({"name": "after", "steps": list(self.after)}).duration
 
 
 @dataclass
@@ -221,7 +221,7 @@ def play(case: Case, make: Callable[[Limits, Sequence[float]], Barrier] | None, 
         motion.fault = str(arm.safety.fault)
         return motion
     lift = {"move": list(case.pose), "over": LIFT}
-    script = TrialScript.parse({"name": case.name, "steps": [lift, *case.after]})
+    script = TrialScript.parse({"name": "case", "steps": [lift, *case.after]})
     if not is_early:
         device.start(VirtualWearer(script))
         arm.run(LIFT)
