@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,7 @@ from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.numbers import COVER
+from exo_gravity.lab.calibration import pose_fit
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments, along_axes
 from exo_gravity.lab.calibration.pose_fit import FIT, Places
@@ -57,16 +60,17 @@ def test_moments_of_random_devices_are_right_to_2_percent_or_their_errors_which_
 
 
 @pytest.mark.thorough
-def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share():
-    found = []
+def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tour_share(monkeypatch):
+    error, found = 0.005, []  # so large that without it in the covariance 0.83 would be covered
+    monkeypatch.setattr(pose_fit, "FIT", replace(FIT, common_error=error))
     for device in map(Device, range(200, 210)):
-        factor = 1.0 + FIT.common_error * device.rng.normal(size=(2, 4))
+        factor = 1.0 + error * device.rng.normal(size=(2, 4))
         observations = [
             one._replace(effort=device.offset + (one.effort - device.offset) * factor[int(one.load_mass > 0.0)])
             for one in device.tour(bare=8, weighed=8)
         ]
         found.append((device, identify(observations, PAPERS)))
-    assert share_covered(found) >= 0.90  # it is small beside what zeros and axes leave open
+    assert 0.90 <= share_covered(found) <= 0.99
 
 
 def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak(devices):
