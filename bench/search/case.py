@@ -280,9 +280,7 @@ def bound_of(case: Case, clamped: bool) -> Bound:
         if event.name == "encoder_slip" and is_started_after(case, event):
             bounds.append(ASKED)
     bounds += [MOVED_UNREACHED] * is_moved_unreached(case)
-    if any(KINDS[event.name].bound == TURNING for event in case.events):
-        is_behind = clamped or any(event.name in LATE for event in case.events)
-        bounds += [TURNED_AHEAD] * is_behind
+    bounds += [TURNED_AHEAD] * is_turned_ahead(case, clamped)
     bounds += [LOST_AT_100_HZ] * (case.rate == min(RATES) and any(bound is LOAD_LOST for bound in bounds))
     return Bound(*map(max, zip(*bounds, strict=True)))
 
@@ -303,6 +301,12 @@ def is_started_after(case: Case, event: Event) -> bool:
     one that is lighter than they say.
     """
     return any(later.name in STARTS for later in case.events if later.time > event.time)
+
+
+def is_turned_ahead(case: Case, clamped: bool) -> bool:
+    """Return whether the trunk turns while torques are `clamped`, or come late."""
+    is_late = clamped or any(event.name in LATE for event in case.events)
+    return is_late and any(KINDS[event.name].bound == TURNING for event in case.events)
 
 
 def is_moved_unreached(case: Case) -> bool:

@@ -190,8 +190,8 @@ def tables(found: Sequence[Sequence[Seen | None]]) -> str:
     ]  # fmt: skip
     others = ["", "| wearer | | torque covered, joints 1 to 4, % | share covered | half its band, points | refused |"]
     others.append("|---|---|---|---|---|---|")
-    for effect, whole in zip(EFFECTS, zip(*found, strict=True), strict=True):
-        column = [seen for seen in whole if seen]
+    for effect, wearers in zip(EFFECTS, zip(*found, strict=True), strict=True):
+        column = [seen for seen in wearers if seen]
         left = 100.0 * np.array([seen.left for seen in column])
         cells = [f"{np.median(way):.1f}, {way.max():.1f}" for way in left.T]
         lines.append(f"| {effect} | {' | '.join(cells)} |")
@@ -199,7 +199,7 @@ def tables(found: Sequence[Sequence[Seen | None]]) -> str:
             covered = 100.0 * np.mean([seen.covered[number] for seen in column], axis=0)
             inside = sum(bool(seen.share_covered[number]) for seen in column)
             band = 100.0 * np.median([seen.band[number] for seen in column])
-            refused = str(sum(seen is None or seen.refused for seen in whole)) if number else ""
+            refused = str(sum(seen is None or seen.refused for seen in wearers)) if number else ""
             shown = " ".join(f"{value:.0f}" for value in covered)
             others.append(f"| {effect} | {when} | {shown} | {inside} of {len(column)} | {band:.0f} | {refused} |")
     return "\n".join([*lines, *others])

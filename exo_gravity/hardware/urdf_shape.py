@@ -23,7 +23,7 @@ class Skeleton(NamedTuple):
     axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
     ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
     moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, the largest first moment about each joint of masses off the links
+    beside: np.ndarray  #: (n,) kg m, the largest first moment about each joint of the masses beside the links
 
 
 class UrdfShape:

@@ -92,11 +92,9 @@ class TorqueGuess:
         self.tilt = tilt
         self._mean = np.tile(np.append(moments, (0.0, 0.0)), (model.count, 1))  # of each joint: moments, offset, spring
         self._covariance = np.tile(np.diag(deviation**2), (model.count, 1, 1))
-        self._start, self.strength = moments, np.ones(model.count)
         rows = np.moveaxis(along_axes(model, model.suggested), -1, 0)
         self._rows = rows.reshape(-1, *rows.shape[2:])  # gravity from three sides, in all suggested poses
-        self._size = self._typical()  # Nm
-        self._update()
+        self._begin(moments)
 
     @property
     def common_moments(self) -> np.ndarray:
@@ -135,11 +133,9 @@ class TorqueGuess:
     def hang(self, load: Vector) -> None:
         """Expect a weight, too; load: (k,) kg m, its moments."""
         known = len(self._start)
-        self._start = self._start + load
-        self._size = self._typical()
         self._mean[:, :known] += load
         self._covariance[:, :known, :known] += PRIOR.load_share**2 * np.outer(load, load)  # one scale for all moments
-        self._update()
+        self._begin(self._start + load)
 
     @property
     def _moments(self) -> np.ndarray:
@@ -150,16 +146,18 @@ class TorqueGuess:
         rows = self.model.rows(theta, self.model.down(self.tilt) if direction is None else np.asarray(direction))
         return np.concatenate((rows, np.ones_like(rows[..., :1]), theta[..., None]), axis=-1)
 
-    def _typical(self) -> np.ndarray:
-        """Return the torque (n,) in Nm of the file's arm, root mean square over all poses."""
-        return np.asarray(np.sqrt(np.mean((self._rows @ self._start) ** 2, axis=0)))
+    def _begin(self, moments: np.ndarray) -> None:
+        """Take `moments` (k,) in kg m for those of the file's arm with its weight."""
+        self._start, self._at_start = moments, self._rows @ moments  # kg m, and the Nm that they need
+        self._size = np.sqrt(np.mean(self._at_start**2, axis=0))  # (n,) Nm, what a joint usually carries
+        self._update()
 
     def _update(self) -> None:
         """Take over the mean."""
         self._hold, self._springs = self.model.holding(self._moments), self._mean[:, -2:].tolist()
-        at_start, now = self._rows @ self._start, np.einsum("njk,jk->nj", self._rows, self._moments)
+        now = np.einsum("njk,jk->nj", self._rows, self._moments)
         least = len(self._rows) * PRIOR.unexplained**2  # of a joint that carries nothing
-        strength = (np.sum(now * at_start, axis=0) + least) / (np.sum(at_start**2, axis=0) + least)
+        strength = (np.sum(now * self._at_start, axis=0) + least) / (np.sum(self._at_start**2, axis=0) + least)
         self.strength = np.clip(strength, *PRIOR.strength)
 
     def matrix(self, theta: Sequence[float], load: tuple[float, float]) -> np.ndarray:

@@ -138,10 +138,10 @@ class Tour:
             return f"the trunk tilted by {moved:.2f} rad during the measurement, the limit is {MAX_TILT:g}"
         tracker = self._tracker
         joints = zip(self._limits.joint_names, tracker.error, tracker.speed, tracker.vibrations, strict=True)
-        reason, most = (VIBRATED, MAX_SOFT_ERROR) if tracker.is_soft.any() else (HAND, MAX_ERROR)
+        most = MAX_SOFT_ERROR if tracker.is_soft.any() else MAX_ERROR
         for name, behind, speed, vibrations in joints:
             if not abs(behind) <= most:
-                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}: {reason}"
+                return f"{name}: {abs(behind):.2f} rad off its path, the limit is {most:g}{self._because(HAND)}"
             if not abs(speed) <= FASTEST:
                 return f"{name}: {speed:.2f} rad/s, the limit is {FASTEST:g}: it slipped or was pushed"
             if vibrations > MAX_VIBRATIONS:
@@ -151,17 +151,21 @@ class Tour:
     def _wrong_torque(self, dt: float) -> str:
         """Return which joint is saturated, or needs a torque that neither weight nor friction explains, or ''."""
         for i in np.flatnonzero(self._tracker.saturated > SATURATION):
-            why = f": {VIBRATED}" if self._tracker.is_soft.any() else ""
             most = f"max_effort = {self._most[i]:g} Nm"
-            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{why}"
+            return f"{self._limits.joint_names[i]}: saturated: the pose needs more than {most}{self._because()}"
         torque, slide = self._tracker.correction, np.where(self._friction, 0.5 * self._friction, UNKNOWN_FRICTION)
-        own, why = (MAX_SOFT_CORRECTION, VIBRATED) if self._tracker.is_soft.any() else (MAX_CORRECTION, HELD)
+        own = MAX_SOFT_CORRECTION if self._tracker.is_soft.any() else MAX_CORRECTION
         limit = own + DEVIATIONS * self._uncertain + slide
         self._unexplained = np.where(np.abs(torque) > limit, self._unexplained + dt, 0.0)
         for i in np.flatnonzero(self._unexplained > PERSISTENCE):
             beyond = f"{torque[i]:.2f} Nm beyond its weight and friction, the limit is {limit[i]:.2f}"
-            return f"{self._limits.joint_names[i]}: {beyond}: {why}"
+            return f"{self._limits.joint_names[i]}: {beyond}{self._because(HELD)}"
         return ""
+
+    def _because(self, usual: str = "") -> str:
+        """Return what ended the tour, after a colon: vibration if it has lowered the gains, else the `usual` reason."""
+        reason = VIBRATED if self._tracker.is_soft.any() else usual
+        return f": {reason}" if reason else ""
 
     def plan(self) -> None:
         """Choose the next pose if one is due. It takes 0.1 s and more: not on the thread of `step`.
@@ -224,9 +228,8 @@ class Tour:
                 self._skipped += 1
                 if self._skipped > MAX_SKIPPED:
                     name, least = self._limits.joint_names[int(np.argmin(share))], float(np.min(share))
-                    why = f": {VIBRATED}" if self._tracker.is_soft.any() else ""
                     what = f"it follows {least:.0%} of a slow motion, must be {MOTION.followed:.0%}"
-                    self.trouble = f"{name}: it sticks: {what}{why}"
+                    self.trouble = f"{name}: it sticks: {what}{self._because()}"
                 return
         self._keep(station, sweeps)
 
