@@ -113,7 +113,7 @@ setup(
         (f"share/{package_name}/config", glob("config/*.yaml")),
         (f"share/{package_name}/config/arms", glob("config/arms/*.urdf")),
         (f"share/{package_name}/config/trials", glob("config/trials/*.yaml")),
-        (f"share/{package_name}/config/sros2", glob("config/sros2/*.xml")),
+        (f"share/{package_name}/config/sros2", glob("config/sros2/*.py")),
         (f"share/{package_name}/config/rviz", glob("config/rviz/*.rviz")),
         (f"share/{package_name}/config/plotjuggler", glob("config/plotjuggler/*.xml")),
         (f"share/{package_name}/config/foxglove", glob("config/foxglove/*.json")),

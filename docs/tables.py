@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import argparse
 import re
+import runpy
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.errors import ParameterError
@@ -33,7 +33,7 @@ from exo_gravity.sim.motors.firmware import FIRMWARES, FIRST_SPECIAL, SHUT_OFF_A
 from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent
-POLICY = DOCS.parent / "config" / "sros2" / "policy.xml"  # a test compares it with the running nodes
+POLICY = DOCS.parent / "config" / "sros2" / "policy.py"  # a test compares it with the running nodes
 TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
@@ -244,20 +244,13 @@ def topic_table() -> str:
 
     Raises ValueError for a topic that docs/topics.md does not describe.
     """
-    nodes: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for profile in ElementTree.parse(POLICY).iter("profile"):
-        if profile.get("ns") == "/right" or profile.get("node") == "operator":
-            continue  # both arms have the same topics; the operator may read them all
-        for group in profile.iter("topics"):
-            way = "publish" if "publish" in group.attrib else "subscribe"
-            for topic in group:
-                nodes[re.sub("^/(left|right)/", "", str(topic.text)), way].add(f"`{profile.get('node')}`")
-    topics = sorted({topic for topic, _ in nodes} - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
+    topics = runpy.run_path(str(POLICY))["TOPICS"]
     described = set(re.findall(r"^\| `([\w/]+)` \| \w+_msgs/", TOPICS.read_text(encoding="utf-8"), re.MULTILINE))
-    if missing := set(topics) - described:
+    if missing := topics.keys() - EVERY_NODES - described:
         raise ValueError(f"{TOPICS}: must describe {', '.join(sorted(missing))}")
     rows = [
-        (f"`{name}`", *(", ".join(sorted(nodes[name, way])) for way in ("publish", "subscribe"))) for name in topics
+        (f"`{name}`", *(", ".join(sorted(f"`{node.rpartition('/')[2]}`" for node in way)) for way in topics[name]))
+        for name in sorted(topics.keys() - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
     ]
     return markdown(("topic", "published by", "subscribed by"), rows)
 

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""config/sros2/policy.xml against the running nodes: what each publishes, subscribes to, serves and calls.
+"""config/sros2/policy.py against the running nodes: what each publishes, subscribes to, serves and calls.
 
 The nodes are those of config/sim_both.yaml with a wearer for each arm, a recorder, robot_model, the panel, and an outer
 loop for each arm; the bridges are not enabled.
@@ -8,6 +8,7 @@ These tests do not show that DDS enforces the policy, which takes a middleware b
 
 from __future__ import annotations
 
+import runpy
 import time
 import xml.etree.ElementTree as ElementTree
 
@@ -25,32 +26,16 @@ from ..support.launched_nodes import LaunchedNodes
 from ..support.node_thread import NodeThread
 from ..support.own_node import own_node
 
-POLICY = CONFIG / "sros2" / "policy.xml"
-RULES = {"topics": ("topic", {"publish", "subscribe"}), "services": ("service", {"reply", "request"})}
-NODES = (
-    "/imu", "/panel", "/recorder", "/robot_model",
-    *(
-        f"/{arm}/{node}"
-        for arm in ("left", "right") for node in ("can_bridge", "compensator", "wearer", "simulator", "outer_loop")
-    ),
-)  # fmt: skip
+SCRIPT = runpy.run_path(str(CONFIG / "sros2" / "policy.py"))
+POLICY = SCRIPT["policy"]()
+NODES = [enclave for enclave in POLICY if enclave != "/operator"]
+ARMS = ("left", "right")
 NO_RULES = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
 
 
 def reads(nodes):
     """Return the services by which the parameters of these nodes are read."""
     return {f"{node}/{service}" for node in nodes for service in ("get_parameters", "list_parameters")}
-
-
-def read_policy():
-    """Return the policy as {enclave: {'publish': names, 'subscribe': ..., 'reply': ..., 'request': ...}}."""
-    policy = {}
-    for enclave in ElementTree.parse(POLICY).getroot().iter("enclave"):
-        rules = policy[enclave.get("path")] = {kind: set() for kind in NO_RULES}
-        for entry in enclave.find("profiles/profile"):
-            for kind in entry.attrib:
-                rules[kind] |= {item.text for item in entry}
-    return policy
 
 
 def graph_of(node, name):
@@ -111,7 +96,7 @@ def session(tmp_path_factory, request):
     nodes = all_nodes(folder, request.param)
     for started in (nodes, *loops):
         started.start()
-    expected = lasting_rules(read_policy().get), set(NODES) - {"/recorder"}
+    expected = lasting_rules(POLICY.get), set(NODES) - {"/recorder"}
     found, end = None, time.monotonic() + 90.0
     with own_node("observer") as (observer, _):
         while found != expected and time.monotonic() < end:  # the tests below show the difference
@@ -128,56 +113,49 @@ def session(tmp_path_factory, request):
 
 @pytest.mark.thorough
 def test_a_node_may_do_exactly_what_it_does(session):
-    policy, (found, parameters_read) = read_policy(), session
-    arms = [f"/{arm}/{node}" for arm in ("left", "right") for node in ("can_bridge", "compensator")]
+    found, parameters_read = session
+    arms = [f"/{arm}/{node}" for arm in ARMS for node in ("can_bridge", "compensator")]
     requests = {node: found[node]["request"] for node in NODES if not node.endswith("wearer")}
     requests["/recorder"] = reads(parameters_read)
     for node in NODES:
         for kind in ("publish", "subscribe", "reply"):
-            assert policy[node][kind] == found[node][kind], (node, kind)
-        assert policy[node]["request"] == requests.get(node, policy[node]["request"]), node
+            assert POLICY[node][kind] == found[node][kind], (node, kind)
+        assert POLICY[node]["request"] == requests.get(node, POLICY[node]["request"]), node
         if node.endswith(("can_bridge", "compensator", "simulator", "loop", "imu")):
             assert not requests[node], node
     assert requests["/robot_model"] == reads(arms)
 
 
-@pytest.mark.parametrize("arm", ["left", "right"])
+@pytest.mark.parametrize("arm", ARMS)
 def test_a_wearer_may_read_the_parameters_of_its_own_compensator_and_bridge(arm):
-    nodes = (f"/{arm}/{node}" for node in ("compensator", "can_bridge"))
-    assert read_policy()[f"/{arm}/wearer"]["request"] == reads(nodes)
+    assert POLICY[f"/{arm}/wearer"]["request"] == reads([f"/{arm}/compensator", f"/{arm}/can_bridge"])
 
 
-def test_the_operator_may_call_every_service_and_subscribe_to_every_topic():
-    policy = read_policy()
-    operator = policy.pop("/operator")
-    assert operator["request"] == set().union(*(rules["reply"] for rules in policy.values()))
-    assert operator["subscribe"] == set().union(*(rules["publish"] for rules in policy.values()))
+def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on():
+    for topic, node in (
+        ("effort_commands", "compensator"),
+        ("assist_efforts", "outer_loop"),
+        ("support_request", "wearer"),
+    ):
+        for arm in ARMS:
+            publishers = [name for name, rules in POLICY.items() if f"/{arm}/{topic}" in rules["publish"]]
+            assert publishers == [f"/{arm}/{node}"]
 
 
-@pytest.mark.parametrize("arm", ["left", "right"])
-@pytest.mark.parametrize(
-    ("topic", "node"),
-    [("effort_commands", "compensator"), ("assist_efforts", "outer_loop"), ("support_request", "wearer")],
-)
-def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on(arm, topic, node):
-    publishers = [name for name, rules in read_policy().items() if f"/{arm}/{topic}" in rules["publish"]]
-    assert publishers == [f"/{arm}/{node}"]
-
-
-def test_the_file_has_the_structure_of_an_access_control_policy_of_version_0_2_0():
-    root = ElementTree.parse(POLICY).getroot()
+def test_the_text_is_an_access_control_policy_of_version_0_2_0_with_these_rules():
+    root = ElementTree.fromstring(SCRIPT["text_of"](POLICY))
     assert (root.tag, root.attrib, [child.tag for child in root]) == ("policy", {"version": "0.2.0"}, ["enclaves"])
+    read = {}
     for enclave in root[0]:
-        (profiles,) = enclave
-        (profile,) = profiles
-        assert (enclave.tag, profiles.tag, profile.tag) == ("enclave", "profiles", "profile")
+        ((profile,),) = enclave
+        assert (enclave.tag, enclave[0].tag, profile.tag) == ("enclave", "profiles", "profile")
         assert f"{profile.get('ns').rstrip('/')}/{profile.get('node')}" == enclave.get("path")
-        for rule in profile:
-            item, kinds = RULES[rule.tag]
-            assert set(rule.attrib) <= kinds and set(rule.attrib.values()) == {"ALLOW"}
-            assert len(rule) and {child.tag for child in rule} == {item}
-
-
-def test_every_name_is_absolute_and_without_wildcards():
-    names = [name for rules in read_policy().values() for kind in rules.values() for name in kind]
+        rules = read[enclave.get("path")] = {kind: set() for kind in NO_RULES}
+        for group in profile:
+            ((kind, allowed),) = group.attrib.items()
+            item = {"publish": "topic", "subscribe": "topic", "reply": "service", "request": "service"}[kind]
+            assert allowed == "ALLOW" and group.tag == f"{item}s" and {child.tag for child in group} == {item}
+            rules[kind] |= {child.text for child in group}
+    assert read == POLICY
+    names = [name for rules in read.values() for kind in rules.values() for name in kind]
     assert all(name.startswith("/") and not set(name) & set("*?[]~ \n") for name in names)

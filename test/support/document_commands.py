@@ -17,7 +17,7 @@ CALL = "ros2 service call /right/can_bridge"
 # test/nodes/ros2_launch.py types them.
 ROS2 = {
     "SHARE=$(ros2 pkg prefix --share exo_gravity)": "",
-    "POLICY=$(ros2 pkg prefix --share exo_gravity)/config/sros2/policy.xml": "",
+    "python3 $(ros2 pkg prefix --share exo_gravity)/config/sros2/policy.py > policy.xml": "",
     "ros2 lifecycle set /right/can_bridge configure": "Transitioning successful",
     "ros2 lifecycle set /right/can_bridge activate": "Transitioning successful",
     "ros2 topic echo /diagnostics": "name: right/can_bridge",
