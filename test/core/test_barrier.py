@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.barrier.cases import INNOCENT, WRONG, Case, play
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier, Shaped
@@ -16,7 +15,6 @@ from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
-from ..support.thorough import quick
 
 NOTHING = (0.0,) * 4
 WHOLE = (1.0,) * 4
@@ -35,32 +33,6 @@ def joints(**changes: float) -> list[JointSample]:
 def shaped(effort: tuple[float, ...] = NOTHING, **changes: float) -> Shaped:
     """Return what joints get after a second in which they read `changes`."""
     return barrier().shape(1.0, joints(**changes), effort, WHOLE, NOTHING, NOTHING)
-
-
-def named(name: str) -> Case:
-    return next(case for case in (*WRONG, *INNOCENT) if case.name.startswith(name))
-
-
-MISTAKES = [("out of the cuff, rated", 2.9), ("out of the cuff, peak", 2.9), ("clamped, arm abducted", 1.9)]
-
-
-@pytest.mark.parametrize(("name", "most"), quick(MISTAKES[1:2], MISTAKES))
-def test_whatever_drives_an_arm_by_mistake_does_not_throw_it(name, most):
-    motion = play(named(name), None)
-    assert motion.time and motion.fault == ""
-    assert motion.driven < most
-
-
-def test_an_arm_whose_imu_is_wrong_by_30_degrees_is_not_carried():
-    assert "torque_while_hanging" in play(named("IMU"), None).fault
-
-
-@pytest.mark.thorough
-def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_nothing():
-    lie = play(named("a wrong speed"), None)
-    assert lie.speed < 0.02 and lie.rate < 5.0
-    reach = play(named("elbow at 1"), None)
-    np.testing.assert_allclose(reach.torque, reach.forward, atol=0.02)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
