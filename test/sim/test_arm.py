@@ -7,11 +7,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import off_axis_of
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
+
+from ..support.calibration_device import off_axis_of
 
 UPRIGHT = (0.0, 0.0, 1.0)
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad

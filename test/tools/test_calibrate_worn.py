@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.calibration.tour import run_tour
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.lab.calibration import live
@@ -20,6 +19,7 @@ from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.tools import calibrate
 
+from ..support.calibration_device import run_tour
 from ..support.ports import own_ports
 from ..support.urdf_oracle import WornMujocoArm
 
@@ -81,7 +81,7 @@ def test_a_tour_of_a_worn_arm_finds_its_wearer(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, without_pictures: None
 ) -> None:
     worn, output = Worn.of(name, tmp_path), tmp_path / "new.yaml"
-    monkeypatch.setattr(live, "run_tour", run_tour([]))
+    monkeypatch.setattr(live, "run_tour", run_tour)
     assert calibrate.main(command(worn, output)) == 0
     assert worn.left(output) < LEFT < 0.1 < worn.left(worn.params)
 

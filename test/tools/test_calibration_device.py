@@ -20,8 +20,8 @@ from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.tools import calibrate
 
+from ..support.calibration_device import MOTORS_AS_MOUNTED, TourRun, fixed
 from ..support.synthetic_bags import messages, tilt, write_bag
-from ..support.tour_run import MOTORS_AS_MOUNTED, TourRun, fixed
 
 ARM = configured_arm(packaged_config("sim.yaml"))
 MASS = DEFAULT_LINKS.mass * (1.2, 0.8, 1.15, 0.85)

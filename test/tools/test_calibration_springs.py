@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import LENGTH, PAPERS, Device
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
@@ -25,7 +24,7 @@ from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm
 
-from ..support.tour_run import TourRun
+from ..support.calibration_device import LENGTH, PAPERS, Device, TourRun
 from .test_calibration_solve import ARM, value
 
 CABLES = {"spring_stiffness": (0.15,) * 4, "spring_rest": (0.2, 0.4, 0.3, 0.6)}

@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from bench.calibration.tour import player_of
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
@@ -32,6 +31,7 @@ from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from ...support.calibration_device import player_of
 from ...support.chains import random_chain
 from ...support.thorough import quick
 from ...support.urdf_oracle import MujocoArm, WornMujocoArm

@@ -15,8 +15,8 @@ from exo_gravity.core.compensation.tracking import TRACKER, Line, Station, Track
 from exo_gravity.sim import ArmConfig, SimulatedDevice
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from ...support.calibration_device import MOTORS_AS_MOUNTED, TourRun, fixed
 from ...support.thorough import quick
-from ...support.tour_run import MOTORS_AS_MOUNTED, TourRun, fixed
 
 TWO = Station((0.1, 0.5, 0.6, 0.7)), Station((0.0, 0.9, 0.9, 0.4))
 PLAY = 0.0175  # rad, 1 degree

@@ -6,13 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import PAPERS, Device
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, with_mounting
 from exo_gravity.lab.calibration.tours import moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
+
+from ...support.calibration_device import PAPERS, Device
 
 ARM = configured_arm(packaged_config("sim.yaml"))
 DOWN = np.array(Tilt.of("right", 0.05, 0.21).direction)  # a stand that leans to the arm's side

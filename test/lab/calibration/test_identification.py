@@ -8,18 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import (
-    CANDIDATES,
-    CODE,
-    LEANING,
-    LENGTH,
-    PAPERS,
-    UPRIGHT,
-    WEIGHT,
-    Device,
-    best,
-    off_axis_of,
-)
 from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
@@ -32,6 +20,19 @@ from exo_gravity.lab.calibration.pose_fit import FIT, Places
 from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+
+from ...support.calibration_device import (
+    CANDIDATES,
+    CODE,
+    LEANING,
+    LENGTH,
+    PAPERS,
+    UPRIGHT,
+    WEIGHT,
+    Device,
+    best,
+    off_axis_of,
+)
 
 
 @pytest.fixture(scope="module")

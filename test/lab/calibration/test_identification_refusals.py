@@ -6,12 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.calibration.random_device import LEANING, PAPERS, Device, best
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.identification import check_physical, identify
 from exo_gravity.lab.calibration.pose_fit import layout_of
 from exo_gravity.lab.calibration.poses import missing_pose
 from exo_gravity.lab.moments import regressor
+
+from ...support.calibration_device import LEANING, PAPERS, Device, best
 
 SLIPS = {
     "one pose": {2: (0, 0, 0.3, 0)},

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -25,8 +26,8 @@ from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
+from ...support.calibration_device import MOTORS_AS_MOUNTED, NAMES, TourRun, fixed
 from ...support.thorough import quick
-from ...support.tour_run import MOTORS_AS_MOUNTED, NAMES, TourRun, assert_close_to_device, fixed
 
 LIMITS = Limits(NAMES, sign_check_torque=0.0)
 POSE = Station((0.1, 0.5, 0.6, 0.7))
@@ -329,7 +330,12 @@ def test_chosen_poses_are_within_the_limits_and_can_be_held(guess):
 def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
     moments = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-    assert_close_to_device(LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever)), arm, tolerance)
+    inertia = LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever))
+    for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
+        arm.reset(theta)
+        true = np.zeros((4, 4))
+        mujoco.mj_fullM(arm.model, arm.data, true)
+        np.testing.assert_allclose(inertia.matrix(theta), true, atol=tolerance)
 
 
 def test_the_sweeps_of_a_chosen_pose_and_the_way_home_with_a_weight_need_no_more_than_the_motors_may_give():
