@@ -1,12 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Draws docs/states.svg: the states of an arm, from the machine's table of transitions.
 
-`python docs/states.py` renews it. A transition without a route, a route without a transition, and an arrow that passes
-behind the box of another state are errors.
+`python docs/states.py` renews it; with `--check` it only fails where the picture differs. A transition without a route,
+a route without a transition, and an arrow that passes behind the box of another state are errors.
 """
 
 from __future__ import annotations
 
+import sys
 from collections import defaultdict
 from itertools import pairwise
 from pathlib import Path
@@ -134,4 +135,7 @@ def drawing() -> str:
 
 
 if __name__ == "__main__":
-    PICTURE.write_text(drawing(), encoding="utf-8")
+    if "--check" not in sys.argv:
+        PICTURE.write_text(drawing(), encoding="utf-8")
+    elif PICTURE.read_text(encoding="utf-8") != drawing():
+        raise SystemExit("docs/states.svg differs from the transitions; run python docs/states.py")

@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The documents' programs print what they show, and the documents' commands exist.
 
-`.ci/house.py`, which `make lint` runs, checks links, paths and tables.
+`.ci/house.py`, which `make lint` runs, checks links and paths; `docs/tables.py --check` the tables.
 """
 
 import contextlib
