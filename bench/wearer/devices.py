@@ -19,7 +19,6 @@ import numpy as np
 
 from bench.calibration.device import COULOMB, CURRENT_NOISE, LARGEST_OFFSET, SPREAD, VISCOUS
 from bench.calibration.random_device import LEANING, LENGTH, PAPERS, UPRIGHT, Device, off_axis_of
-from bench.motion_monitor import MOTOR_NAMES
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.gravity import moments_of
@@ -44,6 +43,7 @@ from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from .strapped_arm import StrappedArm
 
+MOTOR_NAMES = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
 STRIBECK = 0.05  # Nm
 LEANT = Tilt.of("right", -0.15, 0.22).direction  # the stand while the weight hangs
 MOUNTING = math.radians(1.2)  # of the IMU, before the weight of the arm corrects it

@@ -21,8 +21,8 @@ with the lateness. Lost frames alone hardly make a motor late (READING.late): wi
 neither of two reaches at 3 rad/s was braked.
 
 Damping is bounded, too: kd times the newest speed stays within `max_effort`, or tau if that is more, so that neither a
-wearer's jerk nor a fall makes a motor brake with more than it may drive. `make study NAME=barrier` compares the rule
-with others.
+wearer's jerk nor a fall makes a motor brake with more than it may drive. `test/core/test_barrier.py`
+plays both.
 
 The motor's damping is delayed after all, by its current loop (time constant T1) and its velocity filter (T2). A joint
 of inertia J is unstable if kd > J (1/T1 + 1/T2) (Routh-Hurwitz of J T1 T2 s^3 + J (T1 + T2) s^2 + J s + kd): the bare
