@@ -20,12 +20,17 @@ def record(
     seed: int = 0,
     upright: float = 2.0,
     posture: tuple[float, float] = (0.0, 0.0),
+    late: float = 0.0,
 ) -> ImuRecord:
-    """Return 2 s upright, a bow in 1.5 s that leans sideways by `lean` rad, 2 s bowed, back, and 2 s upright."""
-    time = np.arange(0.0, upright + 7.0, 1.0 / RATE)
+    """Return 2 s upright, a bow in 1.5 s that leans sideways by `lean` rad, 2 s bowed, back, and 2 s upright.
+
+    late: s by which the bow follows the lean.
+    """
+    time = np.arange(0.0, upright + 7.0 + late, 1.0 / RATE)
     s = np.interp(time, np.cumsum((0.0, upright, 1.5, 2.0, 1.5, 2.0)), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
     share = s * s * (3.0 - 2.0 * s)
-    pitch, roll = posture[0] + bow * share, posture[1] + lean * share
+    delayed = np.interp(time - late, time, share)
+    pitch, roll = posture[0] + bow * delayed, posture[1] + lean * share
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
     rates = np.gradient(pitch, time), np.gradient(roll, time)
     samples = [imu.sample(TrunkState(*row)) for row in zip(pitch, roll, *rates, strict=True)]

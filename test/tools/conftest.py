@@ -1,11 +1,61 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pages without pictures."""
+"""The commands as a user runs them, within the test's process, on packaged parameter files that a test changes."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
 import pytest
+import yaml
 
 from exo_gravity.lab.report import html
+
+from ..support import CONFIG
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def text(self) -> str:
+        """All that it printed."""
+        return self.out + self.err
+
+
+@pytest.fixture
+def run_tool(capsys: pytest.CaptureFixture[str]) -> Callable[..., Ended]:
+    """A function that runs a command with these words."""
+
+    def run(tool: str, *words: object) -> Ended:
+        try:
+            code = import_module(f"exo_gravity.tools.{tool}").main([*map(str, words)])
+        except SystemExit as ended:
+            code = ended.code
+        return Ended(code or 0, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def params_with(tmp_path: Path) -> Callable[..., Path]:
+    """A function that writes a packaged file with other values, {node: {parameter: value}}, and without some nodes."""
+
+    def write(name: str, changes: Mapping[str, Mapping[str, Any]] | None = None, without: Iterable[str] = ()) -> Path:
+        content = yaml.safe_load((CONFIG / name).read_text())
+        for node, values in (changes or {}).items():
+            content.setdefault(node, {"ros__parameters": {}})["ros__parameters"].update(values)
+        path = tmp_path / "params.yaml"
+        path.write_text(yaml.safe_dump({node: entry for node, entry in content.items() if node not in without}))
+        return path
+
+    return write
 
 
 @pytest.fixture

@@ -1,5 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""calibrate imu from recordings, through the command line."""
+"""The mounting of an IMU: from records of a person who stands, bows and stands, and by `calibrate imu` from recordings.
+
+The records are those of the simulated IMU.
+"""
 
 from __future__ import annotations
 
@@ -13,43 +16,112 @@ from scipy.spatial.transform import Rotation
 from vqf import VQF
 
 from exo_gravity.core.arm.tilt import angle_between, rotation_matrix
-from exo_gravity.lab.calibration.imu import ImuRecord
-from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.tools.calibrate import main
+from exo_gravity.core.errors import DataError
+from exo_gravity.lab.calibration.imu import ImuRecord, mounting, six_rests
+from exo_gravity.lab.inputs.parameter_file import load
 
-from ..support.imu_records import record, rests
-from ..support.synthetic_bags import START, STORE, write_bag
+from ..support import CONFIG
+from ..support.imu_records import RATE, record, rests
+from ..support.synthetic_bags import START, STORE, header, serialised, write_bag
 
 IMU, TOPIC = "sensor_msgs/msg/Imu", "/imu/data_raw"
 MOUNTED = np.array((0.1, -0.2, 0.6, 0.768))
 MOUNTED /= np.linalg.norm(MOUNTED)
+STRAIGHT = np.array((0.0, 0.0, 0.0, 1.0))
+SCALE, BIAS = np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))
 
 
-def imu_entry(
-    time: float, rate: np.ndarray, force: np.ndarray, orientation: np.ndarray | None = None, unknown: float = 0.0
-) -> tuple[str, int, bytes]:
-    """Return type, stamp and bytes of a message; unknown: first entry of the covariances of rate and force."""
-    types = STORE.types
-    stamp = START + round(time * 1e9)
-    header = types["std_msgs/msg/Header"](
-        stamp=types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="imu"
-    )
-    vector, covariance = types["geometry_msgs/msg/Vector3"], np.full(9, unknown)
-    quaternion = (0.0, 0.0, 0.0, 1.0) if orientation is None else orientation
-    message = types[IMU](
-        header, types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
-        np.full(9, -1.0 if orientation is None else 0.0),
-        vector(*map(float, rate)), covariance, vector(*map(float, force)), covariance,
-    )  # fmt: skip
-    return IMU, stamp, bytes(STORE.serialize_cdr(message, IMU))
+def angle_of(found: object, expected: np.ndarray) -> float:
+    """Return the angle in rad between two mountings."""
+    error = rotation_matrix(found) @ rotation_matrix(expected).T
+    return math.acos(max(-1.0, min(1.0, (np.trace(error) - 1.0) / 2.0)))
+
+
+def joined(*records: ImuRecord) -> ImuRecord:
+    """Return records one after the other."""
+    rate, force = (np.concatenate([one[column] for one in records]) for column in (1, 2))
+    return ImuRecord(np.arange(len(rate)) / RATE, rate, force)
+
+
+# From a record
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_any_mounting_is_found_within_its_stated_error(seed: int) -> None:
+    quaternion = np.random.default_rng(seed).standard_normal(4)
+    quaternion /= np.linalg.norm(quaternion)
+    found = mounting(record(quaternion, seed=seed))
+    assert angle_of(found.quaternion, quaternion) < min(math.radians(1.5), 2.0 * np.linalg.norm(found.error))
+    assert found.bow == pytest.approx(0.7, abs=0.03)
+    assert found.quaternion[3] >= 0.0 and np.linalg.norm(found.quaternion) == pytest.approx(1.0)
+
+
+def test_three_bows_are_averaged_and_a_bias_of_the_gyroscope_does_no_harm() -> None:
+    bows = [record(STRAIGHT, lean=lean, seed=seed) for seed, lean in enumerate((0.09, -0.05, -0.04))]
+    one, together = mounting(bows[0]), mounting(joined(*bows))
+    assert (one.bows, together.bows) == (1, 3)
+    assert angle_of(one.quaternion, STRAIGHT) > 0.08 and angle_of(together.quaternion, STRAIGHT) < 0.02
+    assert together.error[2] < one.error[2]
+    shifted = bows[0]._replace(angular_velocity=bows[0].angular_velocity + np.array((0.03, -0.02, 0.01)))
+    assert mounting(shifted).quaternion == pytest.approx(one.quaternion, abs=1e-3)
+
+
+def test_a_crooked_posture_is_part_of_the_result_and_a_lean_counts_into_its_error() -> None:
+    straight, leaning = (mounting(record(STRAIGHT, lean=lean)) for lean in (0.0, 0.09))
+    assert leaning.error[2] > straight.error[2]
+    crooked = mounting(record(STRAIGHT, posture=(0.05, 0.0)))
+    assert angle_of(crooked.quaternion, STRAIGHT) == pytest.approx(0.05, abs=0.015)
+
+
+def test_six_rests_show_scale_and_bias_of_the_accelerometer() -> None:
+    scale, bias, remainder = six_rests(rests(6, SCALE, BIAS))
+    assert scale == pytest.approx(SCALE, abs=1e-3) and bias == pytest.approx(BIAS, abs=5e-3)
+    assert remainder < 0.01
+    with pytest.raises(DataError, match="on 5 different sides, must be 6"):
+        six_rests(rests(5, SCALE, BIAS))
+
+
+def scaled(taken: ImuRecord, rate: float = 1.0, force: float = 1.0) -> ImuRecord:
+    return ImuRecord(taken.time, rate * taken.angular_velocity, force * taken.acceleration)
+
+
+GOOD = record(STRAIGHT)
+TIME = np.arange(0.0, 5.0, 0.01)
+SHAKEN = np.stack([np.sin(40.0 * TIME + phase) for phase in (0, 1, 2)], axis=1)
+USELESS = {  # what a record shows of no mounting, and what is said of it
+    "a small bow": (record(STRAIGHT, bow=0.2), "the bow was 1[12] degrees, must be 20 or more"),
+    "a lean, then a bow": (record(STRAIGHT, lean=0.5, late=0.7), "not about one axis"),
+    "never upright": (record(STRAIGHT, upright=0.0), "must begin and end upright"),
+    "wrong signs": (scaled(GOOD, rate=-1.0), "check units and signs"),
+    "rates in degrees": (scaled(GOOD, rate=57.3), "."),
+    "forces in g": (scaled(GOOD, force=0.102), "shows 0.10 g, must be 1"),
+    "never still": (ImuRecord(TIME, SHAKEN, 9.81 * SHAKEN), "never still"),
+    "silent": (ImuRecord(TIME[:3], SHAKEN[:3], SHAKEN[:3]), "3 IMU samples"),
+}
+
+
+@pytest.mark.parametrize(("taken", "sentence"), USELESS.values(), ids=USELESS)
+def test_a_record_that_shows_no_mounting_is_refused(taken: ImuRecord, sentence: str) -> None:
+    with pytest.raises(DataError, match=sentence):
+        mounting(taken)
+
+
+# From a recording, by the command
 
 
 def bag_of(
     folder: Path, samples: ImuRecord, orientation: np.ndarray | None = None, unknown: float = 0.0, topic: str = TOPIC
 ) -> Path:
-    reported = [None] * len(samples.time) if orientation is None else orientation
-    rows = zip(*samples, reported, strict=True)
-    return write_bag(folder, ((topic, *imu_entry(*row, unknown)) for row in rows))
+    """Write a bag of an IMU; unknown: first entry of the covariances of rate and force."""
+    quaternion, vector = (STORE.types[f"geometry_msgs/msg/{kind}"] for kind in ("Quaternion", "Vector3"))
+    reported = np.tile(STRAIGHT, (len(samples.time), 1)) if orientation is None else orientation
+    known, covariance = np.full(9, -1.0 if orientation is None else 0.0), np.full(9, unknown)
+    content = []
+    for time, rate, force, turned in zip(*samples, reported, strict=True):
+        stamp = START + round(time * 1e9)
+        fields = (quaternion(*turned.tolist()), known, vector(*rate.tolist()), covariance, vector(*force.tolist()))
+        content.append((topic, IMU, stamp, serialised(IMU, header(stamp, "imu"), *fields, covariance)))
+    return write_bag(folder, content)
 
 
 def reported(samples: ImuRecord, kind: str) -> np.ndarray:
@@ -61,9 +133,11 @@ def reported(samples: ImuRecord, kind: str) -> np.ndarray:
     return {"true": filtered, "filled in": upright, "zeros": 0.0 * filtered, "of other axes": turned}[kind]
 
 
-def calibrate(tmp_path: Path, *arguments: str) -> int:
-    params = str(packaged_config("exo.yaml"))
-    return main(["imu", "--params", params, "--output", str(tmp_path / "new.yaml"), *arguments])
+@pytest.fixture
+def calibrate(run_tool, tmp_path):
+    """A function that runs `calibrate imu` on bags; it returns how it ended."""
+    words = ("calibrate", "imu", "--params", CONFIG / "exo.yaml", "--output", tmp_path / "new.yaml")
+    return lambda *bags: run_tool(*words, *bags)
 
 
 def is_found(tmp_path: Path) -> bool:
@@ -73,71 +147,52 @@ def is_found(tmp_path: Path) -> bool:
     return all(angle_between(axis, column) < math.radians(1.5) for axis, column in zip(np.eye(3), error, strict=True))
 
 
-def test_the_mounting_goes_into_the_new_file_and_onto_the_page(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bag = bag_of(tmp_path / "bag", record(MOUNTED))
-    assert calibrate(tmp_path, "--bag", str(bag)) == 0 and is_found(tmp_path)
+def test_the_mounting_goes_into_the_new_file_and_onto_the_page_and_six_rests_beside_it(tmp_path, calibrate) -> None:
+    bow, sides = bag_of(tmp_path / "bag", record(MOUNTED)), bag_of(tmp_path / "rests", rests(6, SCALE, BIAS))
+    ended = calibrate("--bag", bow, "--rests", sides)
+    assert ended.code == 0 and is_found(tmp_path)
     text = (tmp_path / "new.yaml").read_text(encoding="utf-8")
     assert "calibrate imu: ±1.0 1.0" in text and "# x, y, z, w, from a calibration" in text
+    assert "accelerometer: true = scale (shown - bias), scale 1.02" in text
     assert "Calibrated." in (tmp_path / "new.html").read_text(encoding="utf-8")
-    assert "rotation_trunk_from_imu" in capsys.readouterr().out
+    assert "rotation_trunk_from_imu" in ended.out and "scale 1.02" in ended.out
 
 
-@pytest.mark.parametrize(
-    ("kind", "unknown", "problem"),
-    [
-        ("true", 0.0, ""),
-        ("zeros", 0.0, ""),
-        ("zeros", -1.0, ""),
-        ("filled in", 0.0, "its orientation_covariance\\[0\\] must be -1"),
-        (
-            "of other axes",
-            0.0,
-            "the reported orientation, which `imu` would use, is [34] degrees from the accelerometer",
-        ),
-    ],
-)
-def test_the_orientation_that_imu_will_use_is_judged(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, unknown: float, problem: str
-) -> None:
+OTHER_AXES = "the reported orientation, which `imu` would use, is [34] degrees from the accelerometer"
+ORIENTATIONS = [  # the kind, the first entry of the other covariances, and what is wrong with it
+    ("true", 0.0, ""),
+    ("zeros", 0.0, ""),
+    ("zeros", -1.0, ""),
+    ("filled in", 0.0, r"its orientation_covariance\[0\] must be -1"),
+    ("of other axes", 0.0, OTHER_AXES),
+]
+
+
+@pytest.mark.parametrize(("kind", "unknown", "problem"), ORIENTATIONS)
+def test_the_orientation_that_imu_will_use_is_judged(tmp_path, calibrate, kind, unknown, problem) -> None:
     samples = record(MOUNTED)
-    bag = bag_of(tmp_path / "bag", samples, reported(samples, kind), unknown)
-    assert calibrate(tmp_path, "--bag", str(bag)) == (1 if problem else 0)
-    assert re.search(problem, capsys.readouterr().err)
+    ended = calibrate("--bag", bag_of(tmp_path / "bag", samples, reported(samples, kind), unknown))
+    assert ended.code == (1 if problem else 0) and re.search(problem, ended.err)
 
 
-def test_an_imu_that_reports_its_orientation_and_no_rate_is_calibrated(tmp_path: Path) -> None:
+def test_an_imu_that_reports_its_orientation_and_no_rate_is_calibrated(tmp_path, calibrate) -> None:
     samples = record(MOUNTED)
-    still = samples._replace(angular_velocity=np.zeros_like(samples.angular_velocity))
-    bag = bag_of(tmp_path / "bag", still, reported(samples, "true"))
-    assert calibrate(tmp_path, "--bag", str(bag)) == 0 and is_found(tmp_path)
-
-
-def test_six_rests_are_shown_and_noted_in_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bow = bag_of(tmp_path / "bow", record(MOUNTED))
-    sides = bag_of(tmp_path / "rests", rests(6, np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))))
-    assert calibrate(tmp_path, "--bag", str(bow), "--rests", str(sides)) == 0
-    assert "scale 1.02" in capsys.readouterr().out
-    assert "accelerometer: true = scale (shown - bias), scale 1.02" in (tmp_path / "new.yaml").read_text("utf-8")
+    bag = bag_of(tmp_path / "bag", scaled(samples, rate=0.0), reported(samples, "true"))
+    assert calibrate("--bag", bag).code == 0 and is_found(tmp_path)
 
 
 SLOW = ImuRecord(*(values[::10] for values in record(MOUNTED)))
+REFUSED = {
+    "a small bow": (record(MOUNTED, bow=0.2), TOPIC, "not calibrated: the bow was 11 degrees"),
+    "slow samples": (SLOW, TOPIC, "samples a second must be 20 or more; they come at 10 Hz"),
+    "another topic": (SLOW, "/other", "no samples of /imu/data_raw (sensor_msgs/msg/Imu); its topics: /other"),
+}
 
 
-@pytest.mark.parametrize(
-    ("samples", "topic", "sentence"),
-    [
-        (record(MOUNTED, bow=0.2), TOPIC, "not calibrated: the bow was 11 degrees"),
-        (SLOW, TOPIC, "samples a second must be 20 or more; they come at 10 Hz"),
-        (SLOW, "/other", "no samples of /imu/data_raw (sensor_msgs/msg/Imu); its topics: /other"),
-    ],
-    ids=["a small bow", "slow samples", "another topic"],
-)
+@pytest.mark.parametrize(("samples", "topic", "sentence"), REFUSED.values(), ids=REFUSED)
 def test_a_recording_that_shows_nothing_is_refused_and_nothing_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], samples: ImuRecord, topic: str, sentence: str
+    tmp_path, calibrate, samples, topic, sentence
 ) -> None:
-    bag = bag_of(tmp_path / "bag", samples, topic=topic)
-    assert calibrate(tmp_path, "--bag", str(bag)) == 1
-    assert sentence in capsys.readouterr().err
+    ended = calibrate("--bag", bag_of(tmp_path / "bag", samples, topic=topic))
+    assert ended.code == 1 and sentence in ended.err
     assert list(tmp_path.glob("new.*")) == []

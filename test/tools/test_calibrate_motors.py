@@ -9,6 +9,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import can
@@ -27,9 +28,9 @@ from exo_gravity.lab.calibration.motors import HandMotion, MotorSearch
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.tools.calibrate import main
 
 from ..support.simulated_device import SPECS
+from .conftest import Ended
 
 JOINTS = ("rotation", "abduction", "upper arm", "elbow")  # names of this test's joints
 IDS = 31
@@ -129,75 +130,66 @@ def value(result: CalibrationResult, name: str) -> object:
 @pytest.mark.parametrize("seed", range(4))
 def test_every_id_direction_and_zero_is_found(tmp_path: Path, seed: int) -> None:
     arm = Arm(seed)
+    arm.detour = [-0.5, 0.0, 0.0, 0.0]  # both ways at first
     result = arm.calibrate(tmp_path)
     assert result.refusals == () and {change.node for change in result.changes} == {"/right/can_bridge"}
     assert value(result, "can_id") == arm.ids
     assert value(result, "direction") == arm.directions
     assert value(result, "zero") == pytest.approx(arm.zeros, abs=0.001)
     assert "not checked after a power-up" in result.changes[3].note
+    assert any("turned both ways: move the joint in one direction only" in str(line) for line in arm.said)
 
 
-def test_a_jig_gives_the_zero_at_its_own_angles(tmp_path: Path) -> None:
-    arm, jig = Arm(4), (0.0, 30.0, 0.0, 90.0)
+def test_a_jig_gives_the_zero_at_its_own_angles_and_another_position_range_scales_it(arm: Arm, tmp_path: Path) -> None:
+    jig = (0.0, 30.0, 0.0, 90.0)
     arm.motions["bring the arm to 0 30 0 90 deg, hands off, until it is still"] = np.radians(jig).tolist()
     result = arm.calibrate(tmp_path, jig)
     assert value(result, "zero") == pytest.approx(arm.zeros, abs=0.001)
     assert "measured at 0 30 0 90 deg" in result.changes[3].note
-
-
-def test_the_zero_of_a_motor_with_another_position_range_is_scaled_by_it(arm: Arm, tmp_path: Path) -> None:
     result = arm.calibrate(tmp_path, position_range=[12.56, 0.0, 12.5, 0.0])
     assert value(result, "zero") == pytest.approx(arm.zeros * (1.0048, 1.0, 1.0, 1.0), abs=0.001)
 
 
-def test_a_silent_motor_and_a_problem_of_the_bus_are_reported_before_anything_is_asked(
-    arm: Arm, tmp_path: Path
+@pytest.mark.parametrize(("wire_format", "is_told"), [(MIT.name, False), (MIT_V3.name, True)])
+def test_a_board_in_servo_mode_cannot_be_told_from_a_v3_board_and_the_person_is_told_so(
+    arm: Arm, tmp_path: Path, wire_format: str, is_told: bool
 ) -> None:
+    arm.wire_format = wire_format
+    assert value(arm.calibrate(tmp_path), "wire_format") == [wire_format] * 4
+    assert (motors.SERVO_MODE in arm.said) is is_told
+
+
+def moving_elbow(arm: Arm, pose: list[float]) -> None:
+    arm.motions["elbow"] = pose
+
+
+def silent(arm: Arm) -> None:
     arm.silent, arm.problems = {arm.ids[3]}, ("ID 3: several replies to one command",)
-    others = ", ".join(map(str, sorted(arm.ids[:3])))
-    missing = f"IDs that answer: {others}. An arm has 4 motors: check power"
-    with pytest.raises(DataError, match=f"ID 3: several replies to one command; {missing}"):
-        arm.calibrate(tmp_path)
-    assert arm.requests == []
 
 
-def test_a_board_in_servo_mode_cannot_be_told_from_a_v3_board_and_the_person_is_told_so(tmp_path: Path) -> None:
-    for wire_format, is_told in ((MIT.name, False), (MIT_V3.name, True)):
-        arm = Arm(6)
-        arm.wire_format = wire_format
-        result = arm.calibrate(tmp_path)
-        assert value(result, "wire_format") == [wire_format] * 4
-        assert (motors.SERVO_MODE in arm.said) is is_told
-
-
-@pytest.mark.parametrize(
-    ("motion", "sentence"),
-    [
-        ([0.0, 0.0, 0.0, 0.1], "elbow: no motor turned by 10 degrees; motor {ids[3]} by 5."),
-        ([0.0, 0.5, 0.0, 0.6], "elbow: motors {ids[3]} and {ids[1]} both turned, by 34 and 29 degrees"),
-        ([0.0, 0.6, 0.0, 0.0], "elbow: motor {ids[1]} turned, which is that of abduction"),
-    ],
-)
-def test_an_unclear_motion_is_asked_for_again_and_then_refused(
-    arm: Arm, tmp_path: Path, motion: list[float], sentence: str
-) -> None:
-    arm.motions["elbow"] = motion
-    with pytest.raises(DataError, match=re.escape(sentence.format(ids=arm.ids))):
-        arm.calibrate(tmp_path)
-    assert sum(request.startswith("elbow") for request in arm.requests) == 3
-
-
-def test_a_joint_moved_both_ways_is_asked_for_again(arm: Arm, tmp_path: Path) -> None:
-    arm.detour = [-0.5, 0.0, 0.0, 0.0]
-    result = arm.calibrate(tmp_path)
-    assert any("turned both ways: move the joint in one direction only" in str(line) for line in arm.said)
-    assert value(result, "direction") == arm.directions
-
-
-def test_an_arm_that_swings_gives_no_zero(arm: Arm, tmp_path: Path) -> None:
+def shaken(arm: Arm) -> None:
     arm.shaking = 0.05
-    with pytest.raises(DataError, match=r"^elbow moved by .* the arm must be still$"):
+
+
+# What is wrong with the arm, how often the person is asked to move the elbow, and what is said.
+REFUSED = {
+    "a silent motor": (silent, 0, r"ID 3: several replies to one command; IDs that answer: [\d, ]+\. An arm has 4 mot"),
+    "too little": (partial(moving_elbow, pose=[0.0, 0.0, 0.0, 0.1]), 3, r"elbow: no motor turned .*; motor {3} by 5\."),
+    "two": (partial(moving_elbow, pose=[0, 0.5, 0, 0.6]), 3, "motors {3} and {1} both turned, by 34 and 29 degrees"),
+    "another": (partial(moving_elbow, pose=[0, 0.6, 0, 0]), 3, "elbow: motor {1} turned, which is that of abduction"),
+    "a swing": (shaken, 1, "^elbow moved by .* the arm must be still$"),
+}
+
+
+@pytest.mark.parametrize(("wrong", "asked", "sentence"), REFUSED.values(), ids=REFUSED)
+def test_an_arm_that_shows_nothing_clear_is_refused_an_unclear_motion_after_three_requests(
+    arm: Arm, tmp_path: Path, wrong: Callable[[Arm], None], asked: int, sentence: str
+) -> None:
+    wrong(arm)
+    with pytest.raises(DataError, match=sentence.format(*arm.ids)):
         arm.calibrate(tmp_path)
+    assert sum(request.startswith("elbow") for request in arm.requests) == asked
+    assert bool(arm.requests) == bool(asked)
 
 
 def test_a_zero_that_survives_a_power_up_is_noted_and_one_that_does_not_is_refused(arm: Arm, tmp_path: Path) -> None:
@@ -230,52 +222,40 @@ def device_on(channel: str, arm: Arm) -> Iterator[SimulatedDevice]:
         thread.join()
 
 
-@pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> Arm:
-    """An arm whose person the command line asks; it scans few IDs, on a computer that may be busy."""
-    monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))  # test_bus_scan.py scans all
-    monkeypatch.setattr(motors, "HAND", HandMotion(silence=10.0))
-    arm = Arm(15)
-    monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
-    return arm
-
-
-def test_motors_on_two_buses_are_found_and_the_channel_of_each_joint_is_written(
-    tmp_path: Path, held: Arm, capsys: pytest.CaptureFixture[str]
-) -> None:
-    near, far = (f"{name}-{os.getpid()}" for name in ("near", "far"))  # the lock of a bus holds on the whole computer
-    params, output = params_of(tmp_path, f"{near}, {far}, {far}, {far}"), tmp_path / "new.yaml"
-    with device_on(f"{far},{near},{near},{far}", held) as device:
-        assert main(["motors", "--params", str(params), "--output", str(output)]) == 0
-        assert not device.powered
-    assert f"on {near} and {far}" in capsys.readouterr().out
-    found = configured_arm(output, "right")
-    assert found.can_bridge["can.channel"] == f"{far},{near},{near},{far}"
-    assert [motor.can_id for motor in found.motors] == held.ids
-
-
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [("near", "near"), ("near,far,far,far", "far,near,near,far")],
+    ids=["one bus", "two buses"],
+)
 def test_the_command_line_describes_the_device_in_the_new_file_or_says_why_not(
-    tmp_path: Path, held: Arm, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, run_tool: Callable[..., Ended], monkeypatch: pytest.MonkeyPatch, given: str, found: str
 ) -> None:
-    arm, channel = held, f"calibrate-motors-{os.getpid()}"
-    params, output = params_of(tmp_path, channel), tmp_path / "new.yaml"
-    command = ["motors", "--params", str(params), "--output", str(output)]
-    with device_on(channel, arm) as device:
+    monkeypatch.setattr(BusScan.scan, "__defaults__", (range(1, IDS),))  # test_bus_scan.py scans all
+    monkeypatch.setattr(motors, "HAND", HandMotion(silence=10.0))  # the computer may be busy
+    arm, output = Arm(15), tmp_path / "new.yaml"
+    monkeypatch.setattr(Person, "wait", lambda person, request, watch: arm.wait(request, watch))
+    # The lock of a bus holds on the whole computer.
+    given, found = (re.sub(r"\w+", lambda name: f"{name[0]}-{os.getpid()}", channels) for channels in (given, found))
+    words = ("calibrate", "motors", "--params", params_of(tmp_path, given), "--output", output)
+    with device_on(found, arm) as device:
         device.bus_silent = True
-        assert main(command) == 1 and not output.exists() and not output.with_suffix(".html").exists()
-        assert "calibrate: not calibrated: IDs that answer: none." in capsys.readouterr().err
-        lock = BusLock(("virtual", channel, {}), "/right/can_bridge (PID 4711)")
-        assert main(command) == 1
-        assert "held by /right/can_bridge (PID 4711)" in capsys.readouterr().err
+        silent = run_tool(*words)
+        assert silent.code == 1 and not output.exists() and not output.with_suffix(".html").exists()
+        assert "calibrate: not calibrated: IDs that answer: none." in silent.err
+        lock = BusLock(("virtual", channels_of(given, 4)[0], {}), "/right/can_bridge (PID 4711)")
+        held = run_tool(*words)
+        assert held.code == 1 and "held by /right/can_bridge (PID 4711)" in held.err
         lock.release()
         device.bus_silent = False
-        assert main(command) == 0
-        assert not device.powered
-    found = configured_arm(output, "right").motors
-    assert [motor.can_id for motor in found] == arm.ids
-    assert [motor.direction for motor in found] == arm.directions
-    assert [motor.zero for motor in found] == pytest.approx(arm.zeros, abs=0.003)
-    assert [motor.wire_format.name for motor in found] == ["mit_v3", "mit", "mit", "mit_v3"]
+        ended = run_tool(*words)
+        assert ended.code == 0 and not device.powered
+    new = configured_arm(output, "right")
+    assert new.can_bridge["can.channel"] == found
+    assert [motor.can_id for motor in new.motors] == arm.ids
+    assert [motor.direction for motor in new.motors] == arm.directions
+    assert [motor.zero for motor in new.motors] == pytest.approx(arm.zeros, abs=0.003)
+    assert [motor.wire_format.name for motor in new.motors] == ["mit_v3", "mit", "mit", "mit_v3"]
     assert "measured hanging" in output.read_text(encoding="utf-8")
     assert "Calibrated." in output.with_suffix(".html").read_text(encoding="utf-8")
-    assert f"elbow: motor {arm.ids[3]}, direction" in capsys.readouterr().out
+    assert f"elbow: motor {arm.ids[3]}, direction" in ended.out
+    assert f"on {' and '.join(dict.fromkeys(given.split(',')))}" in ended.out
