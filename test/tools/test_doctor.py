@@ -4,12 +4,12 @@
 import json
 import os
 import shutil
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from can.interfaces import BACKENDS
 
 from exo_gravity.core.motors.joint_motor import Traffic
@@ -18,7 +18,6 @@ from exo_gravity.lab import computer as settings
 from exo_gravity.lab.computer import Level, Wakeups
 from exo_gravity.tools import doctor
 
-from ..support import CONFIG
 from ..support.ports import own_ports
 
 PORTS = own_ports()
@@ -81,37 +80,34 @@ def computer(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("late", "by", "level"),
-    [
-        (0, 0.0, Level.FINE),
-        (2500, 0.0019, Level.FINE),  # less than half a period
-        (2, 0.002, Level.FINE),
-        (3, 0.002, Level.WARNING),
-        (1, 0.024, Level.FINE),
-        (1, 0.025, Level.WARNING),  # half of what lets the arm down
-        (1, 0.05, Level.FAULT),
-    ],
-)
+LATE = [  # how many wake-ups are late, by s, and how that is judged
+    (0, 0.0, Level.FINE),
+    (2500, 0.0019, Level.FINE),  # less than half a period
+    (2, 0.002, Level.FINE),
+    (3, 0.002, Level.WARNING),
+    (1, 0.024, Level.FINE),
+    (1, 0.025, Level.WARNING),  # half of what lets the arm down
+    (1, 0.05, Level.FAULT),
+]
+
+
+@pytest.mark.parametrize(("late", "by", "level"), LATE)
 def test_wake_ups_are_judged_by_how_many_are_late_and_by_the_worst(late: int, by: float, level: Level):
     row = settings.of_wakeups(wakeups(late, by), 0.004, 0.05)
     assert row.level is level and bool(row.remedy) == bool(level)
 
 
-def test_a_computer_that_could_not_be_better_gets_no_advice(computer):
-    assert {row.level for row in of_computer(computer).values()} == {Level.FINE}
+DELAYS = {
+    "kernel": {"proc/version": "Linux version 6.8.0 (gcc) #1 SMP PREEMPT_DYNAMIC", "sys/kernel/realtime": ""},
+    "CPU governor": {f"{CPU}/cpu1/cpufreq/scaling_governor": "powersave"},
+    "idle states": {f"{CPU}/cpu0/cpuidle/state2/disable": "0"},
+    "clock source": {"sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet"},
+}
 
 
-@pytest.mark.parametrize(
-    ("what", "change"),
-    [
-        ("kernel", {"proc/version": "Linux version 6.8.0 (gcc) #1 SMP PREEMPT_DYNAMIC", "sys/kernel/realtime": ""}),
-        ("CPU governor", {f"{CPU}/cpu1/cpufreq/scaling_governor": "powersave"}),
-        ("idle states", {f"{CPU}/cpu0/cpuidle/state2/disable": "0"}),
-        ("clock source", {"sys/devices/system/clocksource/clocksource0/current_clocksource": "hpet"}),
-    ],
-)
+@pytest.mark.parametrize(("what", "change"), DELAYS.items(), ids=DELAYS)
 def test_what_delays_threads_is_a_warning_only_where_they_were_late(computer, what: str, change: dict[str, str]):
+    assert {row.level for row in of_computer(computer).values()} == {Level.FINE}  # it could not be better
     for path, content in change.items():
         (computer / path).write_text(content)
     levels = [of_computer(computer, is_late)[what].level for is_late in (False, True)]
@@ -133,24 +129,24 @@ def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate(
 
 def test_limits_matter_only_where_a_thread_priority_is_asked_for_and_one_cpu_is_too_few(computer, monkeypatch):
     refused = IN_TIME._replace(refused=("thread_priority 50 is not permitted",))
-    assert of_computer(computer)["real-time limits"].level is Level.FINE
     row = of_computer(computer, woken=refused, priority=50)["real-time limits"]
     assert row.level is Level.WARNING and "rtprio 99" in row.remedy
-    assert of_computer(computer, priority=50)["real-time limits"].level is Level.FINE
+    for fine in ({"woken": refused}, {"priority": 50}):
+        assert of_computer(computer, **fine)["real-time limits"].level is Level.FINE
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0})
     assert of_computer(computer)["CPUs for the nodes"].level is Level.WARNING
 
 
-@pytest.mark.parametrize(
-    ("middleware", "reach", "opening", "level"),
-    [
-        ("rmw_fastrtps_cpp", "LOCALHOST", "", Level.FINE),
-        ("rmw_zenoh_cpp", "LOCALHOST", "", Level.WARNING),
-        ("rmw_fastrtps_cpp", "SUBNET", "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET", Level.WARNING),
-        ("rmw_fastrtps_cpp", "SUBNET", "", Level.FINE),  # SROS2 is enforced
-        ("rmw_fastrtps_cpp", "OFF", "", Level.FAULT),
-    ],
-)
+MIDDLEWARE = [  # the implementation, how far it reaches, what has opened it, and how that is judged
+    ("rmw_fastrtps_cpp", "LOCALHOST", "", Level.FINE),
+    ("rmw_zenoh_cpp", "LOCALHOST", "", Level.WARNING),
+    ("rmw_fastrtps_cpp", "SUBNET", "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET", Level.WARNING),
+    ("rmw_fastrtps_cpp", "SUBNET", "", Level.FINE),  # SROS2 is enforced
+    ("rmw_fastrtps_cpp", "OFF", "", Level.FAULT),
+]
+
+
+@pytest.mark.parametrize(("middleware", "reach", "opening", "level"), MIDDLEWARE)
 def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str, opening: str, level: Level):
     assert max(row.level for row in settings.of_middleware(middleware, reach, opening)) is level
 
@@ -203,61 +199,47 @@ def test_an_interface_that_is_missing_without_ip_or_virtual(computer):
 
 
 @pytest.fixture
-def run(computer, monkeypatch, capsys):
-    """Run doctor there, with wake-ups in time or as given; return its code and text.
+def run(computer, params_with, monkeypatch, capsys):
+    """Run doctor there on a packaged file, with wake-ups in time or as given; return its code and text.
 
     python-can has a bus within the process for each interface of SocketCAN.
     """
     monkeypatch.setitem(BACKENDS, "socketcan", ("can.interfaces.virtual", "VirtualBus"))
 
-    def run(*arguments: object, woken: Wakeups = IN_TIME):
+    def run(file: str = "exo.yaml", node: str = "/right/can_bridge", *, woken: Wakeups = IN_TIME, **changes: object):
         monkeypatch.setattr(settings, "measured", lambda *_: woken)
-        code = doctor.main([*map(str, arguments)], computer)
+        code = doctor.main(["--params", str(params_with(file, {node: changes}))], computer)
         output = capsys.readouterr()
         return code, output.out + output.err
 
     return run
 
 
-def test_the_real_device_on_a_computer_where_all_is_well(run):
-    code, text = run("--params", CONFIG / "exo.yaml")
+def row_of(text: str, what: str) -> str:
+    """Return the only row with these words."""
+    (row,) = (line for line in text.splitlines() if what in line)
+    return row
+
+
+def test_the_code_is_0_where_all_is_well_1_with_a_warning_and_2_with_a_fault_each_with_its_command(run, computer):
+    code, text = run()
     assert code == 0 and text.splitlines()[-1] == "Fine"
     assert "can1: bit rate" in text and "24% at 250 Hz" in text
-    row = next(line for line in text.splitlines() if "bus load" in line)
-    assert row.split("  ")[0] == "fine"
-
-
-def test_a_warning_is_exit_code_1_and_a_fault_2_each_with_its_command(run, computer):
-    queue = computer / "sys/class/net/can1/tx_queue_len"
-    queue.write_text("10\n")
-    code, text = run("--params", CONFIG / "exo.yaml")
+    assert [line.split("  ")[0] for line in text.splitlines() if "bus load" in line] == ["fine"] * 2
+    (computer / "sys/class/net/can1/tx_queue_len").write_text("10\n")
+    code, text = run()
     assert code == 1 and "-> sudo ip link set can1 txqueuelen 50\n" in text
-    code, text = run("--params", CONFIG / "exo.yaml", woken=wakeups(1, 0.06))
+    code, text = run(woken=wakeups(1, 0.06))
     assert code == 2 and "No one may wear an arm" in text
 
 
-def with_parameters(folder: Path, name: str, node: str, **changes: object) -> Path:
-    content = yaml.safe_load((CONFIG / name).read_text())
-    content[node]["ros__parameters"].update(changes)
-    path = folder / "params.yaml"
-    path.write_text(yaml.safe_dump(content))
-    return path
-
-
-def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(run, tmp_path):
-    port = {"port": "/dev/serial/by-id/usb-IMU"}
-    path = with_parameters(tmp_path, "exo.yaml", "/imu", source="witmotion", serial=port)
-    code, text = run("--params", path)
+def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(run, computer):
+    of_imu = partial(run, node="/imu", source="witmotion", serial={"port": "/dev/serial/by-id/usb-IMU"})
+    code, text = of_imu()
     assert code == 1 and "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/latency_timer" in text
-    (tmp_path / "dev/ttyUSB3").unlink()
-    code, text = run("--params", path)
+    (computer / "dev/ttyUSB3").unlink()
+    code, text = of_imu()
     assert code == 2 and "no such port" in text
-
-
-def test_a_rate_that_can_bridge_would_refuse_is_refused_here(run, tmp_path):
-    path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", rate=500.0, wire_format=["mit_v3"] * 4)
-    code, text = run("--params", path)
-    assert code == 2 and "/right/can_bridge rate = 500.0" in text and "400 Hz" in text
 
 
 BUS = {"interface": "udp_multicast", "channel": "239.74.163.2"}
@@ -273,54 +255,30 @@ INTERFACES = {  # the case, changes of `can`, what is found, and what is to be d
 
 
 @pytest.mark.parametrize(("can", "found", "remedy"), INTERFACES.values(), ids=INTERFACES)
-def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, tmp_path, can, found, remedy):
+def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, can, found, remedy):
     options = {"port": next(PORTS), "hop_limit": 0} if can["interface"] == BUS["interface"] else {}
-    path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can={"options": options, **can})
-    code, text = run("--params", path)
+    code, text = run("sim.yaml", can={"options": options, **can})
     row, advice = next(pair for pair in pairwise(text.splitlines()) if ": opens" in pair[0])
     assert code == 2 and row.startswith("fault") and found in row and remedy in advice
 
 
-@pytest.mark.parametrize("interface", ["seeedstudio", "systec", "iscan", "nixnet", "neousys", "pcan", "robotell"])
-def test_a_bit_rate_is_asked_for_where_the_adapter_would_take_another(run, tmp_path, interface):
-    can = {"interface": interface, "channel": "/dev/ttyUSB0", "options": {}}
-    code, text = run("--params", with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can=can))
-    assert code == 2 and f"/right/can_bridge can.options.bitrate = None: must be set for {interface}" in text
-
-
-def test_a_bus_that_a_bridge_holds_is_left_alone_and_the_last_line_says_that_not_all_was_tried(run, tmp_path):
+def test_a_bus_that_a_bridge_holds_is_left_alone_and_the_last_line_says_that_not_all_was_tried(run):
     options = {"port": next(PORTS), "hop_limit": 0}
-    path = with_parameters(tmp_path, "sim.yaml", "/right/can_bridge", can={**BUS, "options": options})
-    assert run("--params", path)[1].splitlines()[-1] == "Fine"
+    on_bus = partial(run, "sim.yaml", can={**BUS, "options": options})
+    assert on_bus()[1].splitlines()[-1] == "Fine"
     lock = BusLock((BUS["interface"], BUS["channel"], options), "/right/can_bridge (PID 7)")
     try:
-        code, text = run("--params", path)
+        code, text = on_bus()
     finally:
         lock.release()
-    (row,) = (line for line in text.splitlines() if ": opens" in line)
+    row = row_of(text, ": opens")
     assert row.startswith("unknown") and "not tried: held by /right/can_bridge (PID 7)" in row
     assert code == 0 and text.splitlines()[-1] == "Nothing is wrong in what could be tried; unknown: 1"
 
 
-NODES = {  # a node, its changes, and what the node itself would say
-    "misspelt": ("/right/compensator", {"max_efort": [1.0] * 4}, "/right/compensator max_efort"),
-    "no mounting": ("/imu", {"rotation_trunk_from_imu": [0.0] * 4}, "/imu rotation_trunk_from_imu"),
-    "no model": ("/right/compensator", {"law": "anfis", "anfis_file": "none.json"}, "/right/compensator anfis_file"),
-    "two types": ("/right/compensator", {"gain": [1, 1.0, 1.0, 1.0]}, "a list of one type"),
-}
-
-
-@pytest.mark.parametrize(("node", "changes", "said"), NODES.values(), ids=NODES)
-def test_each_node_of_the_file_is_checked_as_it_checks_itself(run, tmp_path, node, changes, said):
-    code, text = run("--params", with_parameters(tmp_path, "sim.yaml", node, **changes))
-    assert code == 2 and text.startswith("doctor: ") and said in text
-
-
 @pytest.mark.parametrize(("file", "level"), [("sim.yaml", "warning"), ("exo.yaml", "fault")])
-def test_a_node_that_waits_for_a_clock_is_named(run, tmp_path, file, level):
-    path = with_parameters(tmp_path, file, "/right/can_bridge", use_sim_time=True)
-    _, text = run("--params", path)
-    (row,) = (line for line in text.splitlines() if "use_sim_time  " in line)
+def test_a_node_that_waits_for_a_clock_is_named(run, file, level):
+    row = row_of(run(file, use_sim_time=True)[1], "use_sim_time  ")
     assert row.startswith(level) and "a program that publishes /clock" in row
 
 

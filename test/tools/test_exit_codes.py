@@ -3,15 +3,20 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import os
 import subprocess
 import sys
+import tempfile
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.lab import packages
 from exo_gravity.lab.processes import node_modules
 from exo_gravity.tools.cli import exit_code
 
@@ -23,16 +28,23 @@ EXO = str(CONFIG / "exo.yaml")
 NO_FILE = ["--params", "nowhere.yaml"]
 LAW = ["--output", "law.json"]
 IMU = ["imu", "--params", EXO, "--output"]
+BUDGET = ["--params", EXO, "--body-mass"]
+WEIGHT = ["--params", EXO, "--output", "new.yaml", "--bag", ".", "--lever", "0.3", "--mass"]
 LIMITS = ("--max-drift", "--max-drift-after-push", "--max-rate", "--min-hold")
 WRONG = [
     ("budget", ["--body-mass", "75", *NO_FILE], "nowhere.yaml"),
-    *(("budget", ["--params", EXO, "--body-mass", mass], "must be a number from") for mass in ("75000", "nan")),
-    ("budget", ["--params", EXO, "--body-mass", "75", "--support", "2"], "must be a number from"),
+    *(("budget", [*BUDGET, mass], "must be a number from") for mass in ("75000", "nan")),
+    ("budget", [*BUDGET, "75", "--support", "2"], "must be a number from"),
     ("calibrate", ["motor"], "invalid choice"),
     ("calibrate", [*IMU, "new.yaml", "--bag", "none"], "must be a recording that exists"),
     ("calibrate", [*IMU, "taken.yaml", "--bag", "."], "taken.html': must be a new file"),
+    ("calibrate", [*IMU, EXO, "--bag", "."], "exo.yaml': must be a new file"),
+    ("calibrate", [*IMU, "none/new.yaml", "--bag", "."], "none/new.yaml"),
+    ("calibrate", ["scale", *WEIGHT, "0.01"], "mass times lever"),
     ("doctor", NO_FILE, "nowhere.yaml"),
     ("report", ["nothing"], "nothing: no such file"),
+    ("report", ["run[1]"], "run[1]: must be a rosbag2 folder"),
+    ("report", [".", "--scheduler", "my cluster"], "scheduler = 'my cluster': must be an address"),
     ("report", ["--repair", "nothing"], "no such file"),
     *(("report", ["b", f"{o}={v}"], f"{o}: {v}: must be a num") for o in LIMITS for v in ("nan", "-1", "half")),
     ("train_anfis", [*LAW, *NO_FILE], "nowhere.yaml"),
@@ -43,59 +55,138 @@ WRONG = [
     ("trial", ["demo", *NO_FILE], "nowhere.yaml"),
     ("trial", ["demo", "--offline", "--params", EXO], "a file with a simulator"),
     ("trial", ["two_poses", "--params", "urdf.yaml"], "a file with a can_bridge, whose arm a trial follows"),
+    ("trial", ["two_poses", "--offline", "--subject", "Anna Meier"], "subject"),
     ("urdf", NO_FILE, "nowhere.yaml"),
     ("urdf", ["--params", EXO, "--output", "missing/arm.urdf"], "arm.urdf"),
     ("validate", NO_FILE, "nowhere.yaml"),
     ("validate", ["--side", "up"], "invalid choice"),
     ("validate", ["--output", "taken.html/folder"], "taken.html"),
 ]
-WITHOUT = {  # by tool: the package, words that need it, and how it is installed
-    "report": ("rosbags.typesys", ["b"], ".[report]"),
-    "budget": ("matplotlib.figure", ["--params", EXO, "--body-mass", "75"], ".[report]"),
-    "train_anfis": ("threadpoolctl", LAW, "python3-threadpoolctl"),
-    "launcher": ("rclpy", [], "/opt/ros/jazzy/setup.bash"),
-    "doctor": ("rich", ["--seconds", "0"], "python3-rich"),
-}
-# By node: the package, and the extra that has it.
-NODES_WITHOUT = {"simulator": ("mujoco", "sim"), "recorder": ("rosbags", "bag"), "panel": ("uvicorn", "panel")}
-NODE = """
-import sys
-sys.modules[{module!r}] = None
-sys.argv = [{node!r}]
-from importlib import import_module
-import_module({where!r}).main()
-"""
-ABSENT = " is not installed: "
-MAIN = """
-import sys
-sys.modules[{module!r}] = None
-from exo_gravity.tools import {tool}
-for words, expected in (({words!r}, 2), (["--help"], 0)):
-    try:
-        code = {tool}.main(words)
-    except SystemExit as ended:
-        code = ended.code
-    assert code == expected, (words, code)
-"""
 
 
 def says_what_is_absent(said: str) -> bool:
     """Whether this is the one sentence that names a package that a ROS host lacks; no other host may lack one."""
-    return UNDER_COLCON and said.count("\n") == 1 and ABSENT in said
+    return UNDER_COLCON and said.count("\n") == 1 and " is not installed: " in said
 
 
 @pytest.mark.parametrize(("tool", "words", "sentence"), WRONG)
-def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, monkeypatch, capsys):
+def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, monkeypatch, run_tool):
     monkeypatch.chdir(tmp_path)
     Path("taken.html").touch()
+    for folder in ("run[1]", "run1"):
+        Path(folder).mkdir()
     Path("urdf.yaml").write_text("/arm/compensator: {ros__parameters: {law: urdf, joint_names: [a1]}}\n")
-    try:
-        code = importlib.import_module(f"exo_gravity.tools.{tool}").main(words)
-    except SystemExit as ended:
-        code = ended.code
-    said = capsys.readouterr().err
+    before = sorted(tmp_path.iterdir())
+    code, _, said = run_tool(tool, *words)
     assert code == 2 and (sentence in said or says_what_is_absent(said))
-    assert f"{tool}: " in said.splitlines()[-1]
+    assert f"{tool}: " in said.splitlines()[-1] and sorted(tmp_path.iterdir()) == before
+
+
+BRIDGE, COMPENSATOR = "/right/can_bridge", "/right/compensator"
+NODES = yaml.safe_load((CONFIG / "sim.yaml").read_text())
+CAN = NODES[BRIDGE]["ros__parameters"]["can"]
+BITRATES = {**CAN, "options": {**CAN["options"], "bitrate": [500_000, 1_000_000]}}
+SLOW = {"interface": "virtual", "channel": "slow", "options": {"bitrate": 250_000}}
+LOCKED = {"interface": "virtual", "channel": f"vcan{os.getpid()}"}
+JOINTS = NODES[BRIDGE]["ros__parameters"]["joint_names"]
+EXECUTABLES = ", ".join(node_modules())
+# By case: changes of sim.yaml, how the error begins, and what must be. No node starts.
+REFUSED_FILES: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
+    "a misspelt node": ({"/right/can_brigde": {}}, "node name = '/right/can_brigde'", EXECUTABLES),
+    "a tool": ({"/right/budget": {}}, "node name = '/right/budget'", EXECUTABLES),
+    "two bridges on one bus": (
+        {"/left/can_bridge": {"can": CAN, "can_id": [9, 8, 7, 5]}},
+        "/right/can_bridge can = {'can.channel': '239.74.163.2'",
+        "must be different from the bus of /left/can_bridge: one arm per bus",
+    ),
+    "two orders of joints": ({BRIDGE: {"joint_names": JOINTS[::-1]}}, f"{BRIDGE} joint_names", f"of {COMPENSATOR}"),
+    "an option that not every motor has": (
+        {BRIDGE: {"can": BITRATES}}, f"{BRIDGE} can.options.bitrate = [500000, 1000000]", "must be one value",
+    ),
+    "a list that ROS reads for minutes": (
+        {COMPENSATOR: {"gain": [1.0] * 50_000}}, f"{COMPENSATOR} gain = [1.0, 1.0",
+        "at most 100 entries; it has 50,000",
+    ),
+    "a mass": ({COMPENSATOR: {"robot": {"mass": [585.0] * 4}}}, f"{COMPENSATOR} ", "robot.mass = [585.0"),
+    "a rate": ({BRIDGE: {"rate": 20.0}}, f"{BRIDGE} ", "rate = 20.0: must be at least"),
+    "a slow bus": ({BRIDGE: {"rate": 400.0, "can": SLOW}}, f"{BRIDGE} ", "Hz, the capacity of the CAN bus"),
+    "a torque": ({BRIDGE: {"max_effort": [18.0] * 4}}, f"{BRIDGE} ", "at most the motors' peak torque"),
+    "a mounting": ({"/imu": {"rotation_trunk_from_imu": [0.0] * 4}}, "/imu ", "must be a unit quaternion"),
+    "a model": ({COMPENSATOR: {"law": "anfis", "anfis_file": "none.json"}}, f"{COMPENSATOR} anfis_file", "'none.json'"),
+    "a URDF": (
+        {"/arm/compensator": {"law": "urdf", "urdf": {"file": "none.urdf"}}}, "/arm/compensator ",
+        "urdf.file = 'none.urdf'",
+    ),
+    "a carried arm": (
+        {BRIDGE: {"can": LOCKED}}, f"{BRIDGE}: CAN bus {LOCKED['channel']} is held by", "/right/can_bridge (PID 7)",
+    ),
+    "a misspelt parameter": ({COMPENSATOR: {"max_efort": [1.0] * 4}}, f"{COMPENSATOR} max_efort", ""),
+    "two types": ({COMPENSATOR: {"gain": [1, 1.0, 1.0, 1.0]}}, "", "a list of one type"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "begins", "sentence"), REFUSED_FILES.values(), ids=REFUSED_FILES)
+def test_a_file_with_which_a_node_could_not_run_is_refused_before_any_starts(
+    changes, begins, sentence, params_with, run_tool, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
+    lock = bus_lock.BusLock((LOCKED["interface"], LOCKED["channel"], {}), "/right/can_bridge (PID 7)")
+    ended = run_tool("launcher", "--params", params_with("sim.yaml", changes))
+    lock.release()
+    assert ended.code == 2 and ended.err.startswith(f"launcher: {begins}") and sentence in ended.err
+
+
+# By case: the command and its words, changes of sim.yaml, nodes that the file lacks, and what is said.
+OF_OTHER_TOOLS: dict[str, tuple[list[str], dict[str, dict[str, Any]], tuple[str, ...], str]] = {
+    "doctor, a parameter": (["doctor"], {COMPENSATOR: {"max_efort": [1.0] * 4}}, (), f"{COMPENSATOR} max_efort"),
+    "doctor, a model": (["doctor"], {COMPENSATOR: {"law": "anfis", "anfis_file": "no"}}, (), "compensator anfis_file"),
+    "doctor, a rate": (
+        ["doctor"], {BRIDGE: {"rate": 500.0, "wire_format": ["mit_v3"] * 4}}, (), "rate = 500.0: must be at most 400",
+    ),
+    **{
+        f"doctor, {interface}": (
+            ["doctor"], {BRIDGE: {"can": {"interface": interface, "channel": "/dev/ttyUSB0", "options": {}}}}, (),
+            f"{BRIDGE} can.options.bitrate = None: must be set for {interface}",
+        )
+        for interface in ("seeedstudio", "systec", "iscan", "nixnet", "neousys", "pcan", "robotell")
+    },
+    "trial": (["trial", "demo", "--offline"], {"/right/simulator": {"robot": {"cog": [0.5] * 4}}}, (), "simulator cog"),
+    "budget, a short link": (
+        ["budget", "--body-mass", "75"], {COMPENSATOR: {"link_length": [0.05, 0.13, 0.3, 0.15]}}, (), COMPENSATOR,
+    ),
+    "budget, no bridge": (["budget", "--body-mass", "75"], {}, (BRIDGE,), BRIDGE),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "changes", "without", "said"), OF_OTHER_TOOLS.values(), ids=OF_OTHER_TOOLS)
+def test_every_tool_refuses_a_wrong_file_in_one_line_that_names_the_parameter_and_writes_nothing(
+    words, changes, without, said, params_with, run_tool, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    path = params_with("sim.yaml", changes, without)
+    ended = run_tool(*words, "--params", path)
+    assert ended.code == 2 and ended.err.startswith(f"{words[0]}: ") and said in ended.err
+    assert ended.err.count("\n") == 1 and list(tmp_path.iterdir()) == [path]
+
+
+TOOLS = ["launcher", "doctor", "urdf", "trial demo --offline", "budget --body-mass 70"]
+
+
+@pytest.mark.parametrize("words", TOOLS)
+def test_every_tool_refuses_what_ros_would_read_otherwise_with_its_line(words, tmp_path, run_tool):
+    """What else it would: nodes/test_parameter_file.py."""
+    path, before = tmp_path / "params.yaml", (CONFIG / "sim.yaml").read_text()
+    path.write_text(f"{before}/right/compensator: {{ros__parameters: {{max_effort: [2.5, 6.0, 2.5, 2.5]}}}}\n")
+    code, _, error = run_tool(*words.split(), "--params", path)
+    said = f"params.yaml, line {before.count(chr(10)) + 1} = '/right/compensator': must be given once: line "
+    assert code == 2 and error.startswith(f"{words.split()[0]}: ") and said in error, error
+
+
+def test_a_full_or_missing_temporary_folder_is_named(monkeypatch, run_tool, tmp_path):
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "none"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    code, _, error = run_tool("launcher")
+    assert code == 2 and error.startswith("launcher: TMPDIR = ") and "none': must be a folder with room" in error
 
 
 def raised(error: type[BaseException]) -> int:
@@ -125,30 +216,57 @@ def test_ctrl_c_is_one_line_and_a_terminal_without_a_character_shows_its_code(mo
     assert ascii_alone.buffer.getvalue() == b"0.1 \\xb1 0.2\n"
 
 
-@pytest.mark.parametrize("tool", quick(["launcher"], WITHOUT))
-def test_a_missing_package_is_named_with_what_installs_it_and_help_still_works(tool, tmp_path):
-    module, words, installs = WITHOUT[tool]
-    program = MAIN.format(module=module, tool=tool, words=words)
-    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100)
-    assert ended.returncode == 0, ended.stderr
-    assert f"{module.partition('.')[0]} " in ended.stderr and installs in ended.stderr
-    assert ended.stderr.count("\n") == 1 and "usage: " in ended.stdout
+# Packages that are missing: of a tool or a node, and what installs each
+WITHOUT = {
+    "report b": ("exo_gravity.tools.report", "rosbags.typesys", ".[report]"),
+    f"budget {' '.join(BUDGET)} 75": ("exo_gravity.tools.budget", "matplotlib.figure", ".[report]"),
+    f"train_anfis {' '.join(LAW)}": ("exo_gravity.tools.train_anfis", "threadpoolctl", "python3-threadpoolctl"),
+    "validate --quick": ("exo_gravity.tools.validate", "pinocchio", "'.[report,validate]'"),
+    "launcher": ("exo_gravity.tools.launcher", "rclpy", "/opt/ros/jazzy/setup.bash"),
+    "doctor --seconds 0": ("exo_gravity.tools.doctor", "rich", "python3-rich"),
+    "simulator": (node_modules()["simulator"], "mujoco", "pip install '.[sim]' in the source folder"),
+    "recorder": (node_modules()["recorder"], "rosbags", "pip install '.[bag]' in the source folder"),
+    "panel": (node_modules()["panel"], "uvicorn", "pip install '.[panel]' in the source folder"),
+}
+PROGRAM = """
+import sys
+from importlib import import_module
+sys.modules[{package!r}] = None
+sys.argv = {words!r}
+sys.exit(import_module({module!r}).main())
+"""
 
 
-@pytest.mark.parametrize("node", quick(["recorder"], NODES_WITHOUT))
-def test_a_node_whose_package_is_missing_ends_with_one_sentence_in_place_of_a_traceback(node, tmp_path):
-    module, extra = NODES_WITHOUT[node]
-    program = NODE.format(module=module, node=node, where=node_modules()[node])
-    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=100)
-    (line,) = ended.stderr.splitlines()
-    assert ended.returncode == 2 and module in line and f"pip install '.[{extra}]' in the source folder" in line
+@pytest.mark.parametrize("words", quick(["launcher", "recorder"], WITHOUT))
+def test_a_missing_package_is_named_in_one_line_with_what_installs_it_and_help_still_works(words, tmp_path):
+    module, package, installs = WITHOUT[words]
+    for given, code in ((words.split(), 2), ([*words.split(), "--help"], 0)):
+        program = PROGRAM.format(module=module, package=package, words=given)
+        command = [sys.executable, "-c", program]
+        ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+        assert ended.returncode == code, ended.stderr
+        if code:
+            (line,) = ended.stderr.splitlines()
+            assert package.partition(".")[0] in line and installs in line
+        elif words.partition(" ")[0] not in node_modules():
+            assert "usage: " in ended.stdout
+
+
+def test_a_node_whose_package_is_missing_is_refused_before_any_starts(monkeypatch, run_tool):
+    monkeypatch.setattr(packages, "find_spec", lambda name: None)
+    assert run_tool("launcher") == (
+        2,
+        "",
+        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install '.[sim]' in the "
+        "source folder of exo_gravity\n",
+    )
 
 
 @pytest.mark.parametrize("node", node_modules())
 def test_each_node_answers_help_with_what_it_does(node, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [node, "--help"])
     with pytest.raises(SystemExit) as ended:
-        importlib.import_module(node_modules()[node]).main()
+        import_module(node_modules()[node]).main()
     said, error = capsys.readouterr()
     if not says_what_is_absent(error):
         assert ended.value.code == 0 and said.startswith(f"{node}: ") and f"{node} --ros-args" in said

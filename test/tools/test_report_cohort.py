@@ -20,7 +20,6 @@ from exo_gravity.lab.parallel import on_cluster
 from exo_gravity.lab.report import cohort
 from exo_gravity.lab.trial.analysis import HoldCriteria, analyse
 from exo_gravity.lab.trial.session import Session
-from exo_gravity.tools.report import main
 
 from ..support import csv_rows
 from ..support import synthetic_bags as made
@@ -30,19 +29,21 @@ DAY = 86_400 * 10**9  # ns
 JUDGING = cohort.Judging(HoldCriteria(), 2.0, 1)
 
 
+def drifting(per_minute):
+    """Return the recording of an arm whose elbow drifts by degrees per minute."""
+    return made.trial(made.POSES, hold=4.0, rate=50.0, drift=np.radians([0.0, 0.0, 0.0, per_minute]) / 60.0)
+
+
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """A folder of three trials of one subject, a day each, one that is no recording, and one that is cut."""
-    folder, monkeypatch = tmp_path_factory.mktemp("written") / "trials", pytest.MonkeyPatch()
+    folder, session = tmp_path_factory.mktemp("written") / "trials", json.dumps(asdict(Session("P01")))
     for number, drift in enumerate(DRIFTS):
-        with monkeypatch.context() as day:
+        with pytest.MonkeyPatch.context() as day:
             day.setattr(made, "START", made.START + number * DAY)
-            session = made.text_entry("/recorder/session", 0.0, json.dumps(asdict(Session("P01"))))
-            rates = np.radians([0.0, 0.0, 0.0, drift]) / 60.0
-            recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=rates)
-            made.write_bag(folder / f"day_{number}" / "bag", [session, *made.messages(recording)])
-    cut = folder / "cut" / "bag"
-    made.write_bag(cut, made.messages(recording))
+            content = [made.text_entry("/recorder/session", 0.0, session), *made.messages(drifting(drift))]
+            made.write_bag(folder / f"day_{number}" / "bag", content)
+    cut = made.write_bag(folder / "cut" / "bag", made.messages(drifting(3.0)))
     (cut / "metadata.yaml").unlink()
     made.cut(cut / "bag.mcap", 0.6)
     (folder / "damaged").mkdir()
@@ -56,18 +57,16 @@ def trials(written, tmp_path):
     return shutil.copytree(written, tmp_path / "trials")
 
 
-def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, capsys):
-    assert main([str(trials), "--output", str(tmp_path / "out")]) == 2
-    text = " ".join(capsys.readouterr().out.split())
-    assert "Not reported: " in text and "text.mcap: not an MCAP file" in text
+def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, run_tool):
+    ended, out = run_tool("report", trials, "--output", tmp_path / "out"), tmp_path / "out"
+    text, page = " ".join(ended.out.split()), (out / "cohort.html").read_text(encoding="utf-8")
+    assert ended.code == 2 and "Not reported: " in text and "text.mcap: not an MCAP file" in text
     assert "4 of 4 trials held; recordings not read, or not completely: 1; 0 recordings had not changed" in text
-    trend = re.search(
-        r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg", text
-    )
+    changes = r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg"
+    trend = re.search(changes, text)
     assert float(trend[1]) == pytest.approx(1.0, abs=0.4)
-    page = (tmp_path / "out" / "cohort.html").read_text(encoding="utf-8")
     assert "text.mcap: not an MCAP file" in page and trend[0] in page and page.count("<img ") == 1
-    rows = csv_rows(tmp_path / "out" / "cohort.csv")
+    rows = csv_rows(out / "cohort.csv")
     assert len(rows) == 4 * len(made.NAMES) + 1
     elbow = [float(row["drift_deg_per_min"]) for row in rows if row["joint"] == made.NAMES[3] and row["subject"]]
     np.testing.assert_allclose(elbow, DRIFTS, atol=0.6)
@@ -75,9 +74,9 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     first = [float(row["range_of_motion_deg"]) for row in rows if "day_0" in row["recording"]]
     np.testing.assert_allclose(first, moved, atol=0.5)
     # Of whom nothing has changed nothing is read: its own summary would not be there. Named twice, it is one trial.
-    assert main([str(trials), f"{trials}/.", "--output", str(tmp_path / "out")]) == 2
-    assert "4 recordings had not changed" in capsys.readouterr().out
-    assert csv_rows(tmp_path / "out" / "cohort.csv") == rows
+    again = run_tool("report", trials, f"{trials}/.", "--output", out)
+    assert again.code == 2 and "4 recordings had not changed" in again.out
+    assert csv_rows(out / "cohort.csv") == rows
 
 
 def test_a_recording_is_read_again_where_its_content_or_the_criteria_change(trials, tmp_path):
@@ -85,16 +84,14 @@ def test_a_recording_is_read_again_where_its_content_or_the_criteria_change(tria
     cache = cohort.Cache(path, JUDGING)
     key = cache.key(bag)
     cache.put(key, rows)
-    assert cohort.Cache(path, JUDGING).get(key) == rows
-    assert cohort.Cache(path, replace(JUDGING, min_hold=3.0)).key(bag) != key
-    file = bag / "bag.mcap"
-    data = bytearray(file.read_bytes())
-    data[len(data) // 2] ^= 1
-    file.write_bytes(data)
-    assert cache.key(bag) != key
     with path.open("a") as stream:
         stream.write('["cut')
     assert cohort.Cache(path, JUDGING).get(key) == rows
+    assert cohort.Cache(path, replace(JUDGING, min_hold=3.0)).key(bag) != key
+    data = bytearray((bag / "bag.mcap").read_bytes())
+    data[len(data) // 2] ^= 1
+    (bag / "bag.mcap").write_bytes(data)
+    assert cache.key(bag) != key
 
 
 def test_a_copy_that_was_repaired_is_not_a_second_trial(trials):
@@ -107,12 +104,9 @@ def test_a_copy_that_was_repaired_is_not_a_second_trial(trials):
 def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_there_twice(trials, tmp_path):
     from distributed import Client, LocalCluster  # a second of imports, which no other test needs
 
-    bags = []
     for number in range(8):
-        recording = made.trial(made.POSES, hold=4.0, rate=50.0, drift=math.radians(number) / 60.0)
-        bags.append(made.write_bag(trials / f"more_{number}" / "bag", made.messages(recording)))
+        made.write_bag(trials / f"more_{number}" / "bag", made.messages(drifting(number)))
     recordings = cohort.recordings_below(trials)
-    assert {*bags} < {*recordings}
     expected = [row for recording in recordings for row in cohort.summary(str(recording), JUDGING)]
     workers = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
     with LocalCluster(host="127.0.0.1", **workers) as cluster, Client(cluster) as client:
@@ -124,22 +118,17 @@ def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_t
                 running.clear()
 
         run, cache = partial(on_cluster, cluster.scheduler_address), cohort.Cache(tmp_path / "cache.jsonl", JUDGING)
-        rows, known = cohort.summaries(recordings, JUDGING, cache, run, done)
-    assert rows == expected and known == 0
+        assert cohort.summaries(recordings, JUDGING, cache, run, done) == (expected, 0)
 
 
-def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, capsys):
+def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, run_tool):
     monkeypatch.setattr("exo_gravity.lab.parallel.CONNECT", "0.1s")
-    assert main([str(trials), "--scheduler", "tcp://127.0.0.1:9"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("report: ") and "127.0.0.1:9" in line
-    assert main([str(trials), "--scheduler", "my cluster"]) == 2
-    assert "scheduler = 'my cluster': must be an address" in capsys.readouterr().err
+    ended = run_tool("report", trials, "--scheduler", "tcp://127.0.0.1:9")
+    (line,) = ended.err.splitlines()
+    assert ended.code == 2 and line.startswith("report: ") and "127.0.0.1:9" in line
 
 
 def test_a_move_along_a_bell_of_speed_is_smooth():
-    rows = cohort.summary(str(made.START), JUDGING)
-    assert rows[0]["problem"] and rows[0]["verdict"] is None
     recording = made.trial(made.POSES, hold=3.0, rate=200.0)
     assert -1.8 < cohort.smoothness(recording, analyse(recording)) < -1.3
     assert math.isnan(cohort.smoothness(recording, analyse(made.measured(made.still(made.POSES[0], 5.0)))))

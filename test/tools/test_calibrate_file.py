@@ -1,0 +1,401 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""What `calibrate` writes, shows and waits for.
+
+The first file of an arm from its URDF; a calibrated file, the old one with new values and nothing else changed; the
+page beside it; and the person at the terminal.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import io
+import json
+import math
+import os
+import re
+import signal
+import threading
+from dataclasses import replace
+from html import escape
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import BusError, DataError, ParameterError
+from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.lab.calibration import identification, live
+from exo_gravity.lab.calibration.moment_model import PapersMoments
+from exo_gravity.lab.calibration.new import turning_joints
+from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
+from exo_gravity.lab.inputs.arms import carried_arm, configured_arm, configured_arms
+from exo_gravity.lab.inputs.parameter_file import can_options, load
+from exo_gravity.lab.inputs.ros_yaml import dumped
+from exo_gravity.lab.moments import load_moments, regressor
+from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.sim.script import TrialScript
+
+from ..support import CONFIG
+from ..support.chains import random_chain
+
+DAY = datetime.date(2026, 11, 22)
+
+# The first file of an arm
+
+URDF = "package://exo_gravity/config/arms/three_joints.urdf"
+ARM = ["--urdf", URDF, "--motors", "AK80-9", "AK80-9", "AK60-6", "--ids", "1", "2", "3", "--hand", "hand"]
+
+
+@pytest.fixture
+def new(run_tool, tmp_path):
+    """A function that runs `calibrate new` for the arm of three joints, with these words besides."""
+    return lambda *words: run_tool("calibrate", "new", *ARM, *words, "--output", tmp_path / "arm.yaml")
+
+
+def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors_and_carries_the_simulated_arm(
+    tmp_path, new
+):
+    ended, output = new("--channel", "can1"), tmp_path / "arm.yaml"
+    assert ended.code == 0 and "MEASURE in it marks" in ended.out
+    arm = carried_arm(load(output), "/right")
+    assert arm.limits.position_max == (2.0, 2.4, 2.4) and arm.limits.max_effort == (9.0, 9.0, 3.0)
+    assert arm.can_bridge["can.channel"] == "can1" and not arm.can_bridge["autostart"]
+    assert max(map(abs, arm.settings.torque(arm.limits.home, Tilt.of("right"))[0])) < 0.01
+    content, shipped = (yaml.safe_load(file.read_text()) for file in (output, CONFIG / "three_joints.yaml"))
+    bridge = content["/right/can_bridge"]["ros__parameters"]
+    bridge["sign_check_torque"] = 0.0
+    motors = {"can": {**bridge["can"]}, "direction": [1, 1, 1], "zero": [0.0, 0.0, 0.0], "trial_delay": 3.0}
+    simulator = {"ros__parameters": {**shipped["/right/simulator"]["ros__parameters"], **motors}}
+    output.write_text(dumped({**content, "/right/simulator": simulator}))
+    script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.6, 0.5, 0.8], "over": 3.0}, {"hold": 3.0}]})
+    (trial,) = simulated_trials(output, script)
+    recording = trial.run()
+    assert not trial.trouble and recording.position.max() > 0.7
+
+
+UNFIT = {
+    "two IDs": (
+        ["--ids", 1, 2],
+        "motors and ids = .*: must be one motor and one ID for each of the joints abduction",
+    ),
+    "no such motor": (["--motors", "AK80-9", "AK80-9", "AK99"], "motors = 'AK99': must be one of AK10-9"),
+    "no such file": (["--urdf", "none.urdf"], "urdf.file = 'none.urdf': must be a URDF file"),
+    "no such link": (["--hand", "claw"], "urdf.hand = 'claw': must be a link of the URDF"),
+    "one ID twice": (["--ids", 1, 1, 2], "can_id = .*: must be 3 different IDs"),
+}
+
+
+@pytest.mark.parametrize(("changes", "problem"), UNFIT.values(), ids=UNFIT)
+def test_what_does_not_fit_is_refused_by_name(changes, problem, tmp_path, new):
+    ended = new(*changes)
+    assert ended.code == 2 and re.search(problem, ended.err)
+    assert not list(tmp_path.iterdir())
+
+
+LOWER, UPPER = 'lower="-0.1"', 'upper="2.4"'
+CHANGED = {  # of the elbow's description: what is written instead, the exit code, and what is said
+    "degrees": (
+        {LOWER: 'lower="-10"', UPPER: 'upper="150"'},
+        0,
+        "-10 to 150 rad, are cut to ±3.1: are they in deg",
+    ),
+    "no room": ({LOWER: 'lower="0"', UPPER: 'upper="0"'}, 0, "elbow: its limits, 0 to 0 rad, leave no room"),
+    "a formula": ({LOWER: 'lower="-pi/2"'}, 2, "limit lower of elbow = '-pi/2': must be a number of rad"),
+    "the wrong way": ({LOWER: 'lower="3"'}, 2, "limits of elbow = [3.0, 2.4]"),
+    "cut": ({"</robot>": ""}, 2, "must be well-formed XML"),
+    "no joint that turns": ({"revolute": "prismatic"}, 2, "the joints (none of the URDF turns)"),
+    **{name: ({'"elbow"': f"'{name}'"}, 0, "Written: ") for name in ("on", "a: [b]", "0x10", '"e"', "Arm für P01")},
+}
+
+
+@pytest.mark.parametrize(("changes", "code", "said"), CHANGED.values(), ids=CHANGED)
+def test_a_doubtful_description_is_named_and_any_name_of_a_joint_is_written_as_it_is(
+    changes, code, said, tmp_path, run_tool
+):
+    text = (CONFIG / "arms" / "elbow.urdf").read_text(encoding="utf-8")
+    for old, new in changes.items():
+        assert old in text
+        text = text.replace(old, new)
+    urdf, output = tmp_path / "my arm.urdf", tmp_path / "arm.yaml"
+    urdf.write_text(text, encoding="utf-8")
+    ended = run_tool("calibrate", "new", "--urdf", urdf, "--motors", "AK80-64", "--ids", 1, "--output", output)
+    assert ended.code == code and said in ended.text and output.exists() == (code == 0)
+    if said == "Written: ":
+        assert carried_arm(load(output), "/right").limits.joint_names == (changes['"elbow"'][1:-1],)
+
+
+def test_every_turning_joint_that_follows_no_other_is_one_of_the_arms():
+    text, names = random_chain(3, seed=1)
+    second = 'name="joint_1" type="revolute">'
+    assert list(turning_joints(text)) == names
+    assert list(turning_joints(text.replace(second, f'{second}<mimic joint="joint_0"/>'))) == [names[0], names[2]]
+    free = turning_joints(text.replace('"revolute"', '"continuous"'))
+    assert all(math.isclose(edge.high, 3.1) for edge in free.values())
+
+
+# A calibrated file
+
+OLD = """\
+# The whole arm.
+/right/can_bridge:
+  ros__parameters:
+    can: {interface: socketcan, channel: can0}  # the black box
+    zero: [0.0, 0.0,
+           # the odd one
+           0.0, 0.0]
+    direction:
+      - 1   # shoulder
+      - 1
+      - 1
+      - 1   # elbow
+
+    # Limits of the stops.
+    position_min: [-1.6, -0.1, -0.7, -0.1]
+
+/right/compensator:
+  ros__parameters:
+    side: right
+    robot: {mass: [0.5, 0.4, 0.5, 0.2], cog: [0.04, 0.11, 0.23, 0.12]}
+    wearer:
+      # of the wearer
+      mass: [0.0, 0.0, 0.0, 0.0]
+    max_effort: [3.0, 9.0, 3.0, 3.0]"""
+BRIDGE, COMPENSATOR, DATED = "/right/can_bridge", "/right/compensator", "# 2026-11-22 calibrate motors"
+ROBOT = "robot: {mass: [0.5, 0.4, 0.5, 0.2], cog: [0.04, 0.11, 0.23, 0.12]"
+WRITTEN = {  # changes, and what is written in place of which part of the file
+    "a value": (
+        [Change(BRIDGE, "position_min", [-1.5, -0.1, -0.7, 0.0], "rad, ±0.01")],
+        {"position_min: [-1.6, -0.1, -0.7, -0.1]": f"{DATED}: rad, ±0.01\n    position_min: [-1.5, -0.1, -0.7, 0.0]"},
+    ),
+    "lists with comments in them": (
+        [Change(BRIDGE, "direction", [1, -1, 1, -1]), Change(BRIDGE, "zero", [0.1, 0.2, 0.3, 0.4])],
+        {
+            "zero: [0.0, 0.0,": f"{DATED}\n    zero: [0.1, 0.2,",
+            "           0.0, 0.0]": "           0.3, 0.4]",
+            "direction:": f"{DATED}\n    direction:",
+            "- 1\n      - 1\n      - 1   # elbow": "- -1\n      - 1\n      - -1   # elbow",
+        },
+    ),
+    "names that the file lacks, each in its mapping": (
+        [
+            Change(COMPENSATOR, "robot.first_moment", [0.1, 0.2, 0.3, 0.05], "kg m"),
+            Change(COMPENSATOR, "wearer.cog", [0.0, 0.0, 0.1, 0.1], "m"),
+            Change(COMPENSATOR, "gain", [1.0, 1.0, 1.0, 1.0], "none"),
+        ],
+        {
+            ROBOT: f"{DATED}: kg m\n    {ROBOT}, first_moment: [0.1, 0.2, 0.3, 0.05]",
+            "0.0, 0.0]\n    max": f"0.0, 0.0]\n      {DATED}: m\n      cog: [0.0, 0.0, 0.1, 0.1]\n    max",
+            "3.0, 3.0]": f"3.0, 3.0]\n    {DATED}: none\n    gain: [1.0, 1.0, 1.0, 1.0]",
+        },
+    ),
+    "notes alone, in their order": (
+        [Change(BRIDGE, "", 0, note) for note in (f"first, {15 * 'many words '}", "second")],
+        {
+            f"{BRIDGE}:\n": f"{BRIDGE}:\n  {DATED}: first, {' '.join(7 * ['many words'])}\n"
+            f"  # {' '.join(8 * ['many words'])}\n  {DATED}: second\n"
+        },
+    ),
+}
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A function that writes changes of a file; it returns the new file's text."""
+
+    def written(changes, old=OLD):
+        params, output = tmp_path / "old.yaml", tmp_path / "new.yaml"
+        params.write_text(old, encoding="utf-8")
+        write_changes(params, output, changes, "calibrate motors", DAY)
+        return output.read_text(encoding="utf-8")
+
+    return written
+
+
+@pytest.mark.parametrize(("changes", "replaced"), WRITTEN.values(), ids=WRITTEN)
+def test_new_values_with_date_and_accuracy_are_all_that_changes(written, changes, replaced):
+    expected = OLD
+    for old, new in replaced.items():
+        assert old in expected
+        expected = expected.replace(old, new)
+    assert written(changes) == expected
+
+
+def test_of_a_value_that_changes_again_both_dates_stay(written, tmp_path):
+    again = [Change(BRIDGE, "zero", [0.1, 0.2, 0.3, 0.4])]
+    once = written(again)
+    (tmp_path / "new.yaml").unlink()
+    assert written(again, once).count(DATED) == 2
+
+
+@pytest.mark.parametrize("name", ["exo.yaml", "sim.yaml", "sim_both.yaml"])
+def test_a_packaged_file_keeps_every_line_and_still_describes_its_arms(written, tmp_path, name):
+    old, zeros = (CONFIG / name).read_text(encoding="utf-8"), [1e-5, -0.4, 0.1, 1 / 3]
+    changes = [Change(BRIDGE, "can_id", [4, 3, 2, 1]), Change(BRIDGE, "zero", zeros)]
+    new = written([*changes, Change(COMPENSATOR, "robot.mass", [0.5, 0.4, 0.3, 0.2])], old)
+    assert len(new.splitlines()) == len(old.splitlines()) + 3
+    arm = next(arm for arm in configured_arms(tmp_path / "new.yaml") if arm.side == "right")
+    assert [motor.can_id for motor in arm.motors] == [4, 3, 2, 1]
+    assert [motor.zero for motor in arm.motors] == pytest.approx(zeros, rel=1e-6)
+
+
+SHARED = "/a/x:\n  ros__parameters: &both\n    zero: [0.0]\n/b/x:\n  ros__parameters: *both\n"
+
+
+@pytest.mark.parametrize(("old", "node", "named"), [(SHARED, "/b/x", "&both"), (OLD, *2 * ("/left/can_bridge",))])
+def test_a_value_that_other_entries_share_and_a_node_that_the_file_lacks_are_refused(
+    tmp_path, written, old, node, named
+):
+    with pytest.raises(ParameterError, match=named):
+        written([Change(node, "zero", [1.0])], old)
+    assert not (tmp_path / "new.yaml").exists()
+
+
+# The page
+
+DOWN = Tilt.of("right", 0.3, -0.2).direction
+LOAD = (1.0, 0.25)  # kg, m from the elbow
+FRICTION = np.array((0.12, 0.2, 0.12, 0.1))
+POSES = np.radians(
+    [
+        (0, 10, 0, 20), (30, 60, 20, 30), (-40, 40, 60, 90), (20, 90, 0, 0), (0, 30, 90, 60), (-20, 70, 45, 110),
+        (45, 100, 30, 45), (0, 50, 110, 20), (-60, 80, 10, 70), (10, 20, 40, 120), (30, 80, 60, 10), (-30, 60, 90, 30),
+    ]
+)  # fmt: skip
+IN_FILE = configured_arm().robot
+PAPERS = PapersMoments(IN_FILE, keeps_tilt=True)
+#: The links of the configured arm, a fifth heavier, with centres of gravity off their axes.
+TRUE = ArmModel.from_moments(IN_FILE.length, 1.2 * np.array(IN_FILE.first_moment), (0.004, -0.006, 0.003, 0.002))
+LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on link 4
+
+
+def predicted(arm: ArmModel) -> np.ndarray:
+    """Return the torque (n, 4) in Nm that holds `arm` in each pose."""
+    weight = regressor(POSES, DOWN) @ load_moments(arm.length, *LOAD)
+    return gravity_torque(arm, POSES, DOWN) + LOADED[:, None] * weight
+
+
+def outcome(touched: float = 0.0) -> CalibrationResult:
+    """Return the result of a calibration of `TRUE`; touched: Nm by which somebody moves the arm in the sixth pose."""
+    effort = predicted(TRUE) + 0.005 * np.random.default_rng(1).standard_normal(POSES.shape)
+    effort[5] += touched
+    taken = tuple(
+        Observation(theta, DOWN, torque, FRICTION, np.full(4, 0.005), *(LOAD if loaded else (0.0, 0.0)))
+        for theta, torque, loaded in zip(POSES, effort, LOADED, strict=True)
+    )
+    result = identification.identify(taken, PAPERS)
+    change = Change(COMPENSATOR, "robot.first_moment", result.moments.tolist(), "kg m, <±0.001>")
+    return CalibrationResult((change,), ("M4 is 20 % larger.",), (), configured_arm(), PAPERS, taken, result)
+
+
+@pytest.fixture(scope="module")
+def found() -> CalibrationResult:
+    """The result of a calibration without outliers."""
+    return outcome()
+
+
+def remainders_of(result: CalibrationResult) -> tuple[np.ndarray, ...]:
+    return remainders(result.identified, result.arm, PAPERS, result.observations)
+
+
+def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found):
+    old, new, *_ = remainders_of(found)
+    measured, result = np.array([o.effort for o in found.observations]), found.identified
+    assert (measured - old) == pytest.approx(predicted(IN_FILE))
+    down = DOWN + np.cross(result.tilt, DOWN)  # the new file's mounting of the IMU
+    joints = POSES[~LOADED] + result.turn[:, 0]  # as the new zeros show them
+    unloaded = regressor(joints, down / np.linalg.norm(down)) @ result.in_file / result.scale
+    assert (measured - new)[~LOADED] == pytest.approx(unloaded, abs=1e-3)
+    assert np.abs(old).max() > 10.0 * np.abs(new).max()
+
+
+def test_the_page_says_what_was_found_what_does_not_show_and_where_the_arm_creeps(found):
+    page = page_of(found, "gravity", "old.yaml", DAY)
+    assert "<h1>calibrate gravity, right arm</h1>" in page and "2026-11-22, from old.yaml" in page
+    for words in ("<b>Calibrated.</b>", "robot.first_moment", "kg m, &lt;±0.001&gt;", "M4 is 20 % larger.", "Singular"):
+        assert words in page
+    assert page.count("data:image/png;base64,") == 1
+    assert all(escape(sentence) in page for sentence in found.identified.unknown)
+    old, _, held_out, _ = remainders_of(found)
+    creeping = [int((np.abs(wrong) > 0.2 * FRICTION).any(axis=1).sum()) for wrong in (old, held_out)]
+    assert f"With 0.2 times that the arm creeps in {creeping[0]} of 12 poses" in page
+    assert f"with the old file, in {creeping[1]} with the new" in page and ", in 0 with the new" in page
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_pose_that_was_left_out_is_not_counted_and_a_refusal_is_on_the_page_without_new_values(found):
+    touched = outcome(touched=1.0)
+    *_, used = remainders_of(touched)
+    assert np.flatnonzero(~used).tolist() == [5]
+    assert " of 11 poses with the old file" in page_of(touched, "gravity", "old.yaml", DAY)
+    page = page_of(replace(found, refusals=("pose 3 slipped",), identified=None), "gravity", "old.yaml", DAY)
+    assert "Not calibrated" in page and "<li>pose 3 slipped</li>" in page
+    assert "robot.first_moment" not in page and "<img" not in page
+
+
+def test_friction_is_drawn_over_speed_and_a_result_without_poses_is_its_values_alone():
+    speed = np.array((0.3, 0.05, 0.1))
+    curve = identification.fit_friction(speed, 0.1 + 0.02 * speed, np.full(len(speed), 0.002), np.zeros_like(speed))
+    comment = Change(BRIDGE, "", 0, "friction of the elbow")  # in the file alone
+    result = CalibrationResult((comment,), (), (), configured_arm(), curves=(curve,) * 4)
+    page = page_of(result, "friction", "old.yaml", DAY)
+    assert page.count("<img") == 1 and "Friction over speed" in page and "friction of the elbow" in page
+    change = Change("/imu", "rotation_trunk_from_imu", [0.0, 0.0, 0.0, 1.0])
+    page = page_of(CalibrationResult((change,)), "imu", "old.yaml", DAY)
+    assert "[0.0, 0.0, 0.0, 1.0]" in page and "<img" not in page
+
+
+# The person at the terminal
+
+
+def test_the_motors_are_watched_until_enter_is_pressed_and_without_a_person_the_program_ends():
+    reading, writing = os.pipe()
+    shown, watched = io.StringIO(), threading.Event()
+    with os.fdopen(reading) as program, os.fdopen(writing, "w", buffering=1) as keys:
+        person = live.Person(Console(file=shown, width=40), program)
+
+        def watch() -> str:
+            if not watched.is_set():
+                watched.set()
+                keys.write("\n")
+            return "a table"
+
+        person.wait("bend the elbow", watch)
+        assert watched.is_set() and "bend the elbow; then press Enter" in shown.getvalue()
+        line = "pose [3] of 12: " + 20 * "long "
+        person.say(line)
+        assert shown.getvalue().endswith(f"{line}\n")
+        keys.close()
+        with pytest.raises(DataError, match="standard input"):
+            person.wait("bow")
+
+
+def test_lines_of_the_calibrator_are_followed_and_observations_are_kept(tmp_path):
+    record, said, tour = tmp_path / "new.jsonl", list[str](), live.LiveTour()
+    values = {"theta": [0.0] * 4, "direction": [0, 0, 1], "effort": [1.0] * 4, "friction": [0.1] * 4}
+    values |= {"spread": [0.01] * 4, "load_mass": 0.0, "load_lever": 0.0, "speed": 0.1}
+    for event in ({"progress": "pose 1"}, {"observation": values}, {"trouble": "elbow: a hand"}, {"done": True}):
+        tour.follow(json.dumps(event), record, said.append)
+    tour.follow('{"half": ', record, said.append)
+    assert said == ["pose 1"] and tour.trouble == "elbow: a hand" and tour.done
+    assert tour.measured[0].speed == 0.1 and json.loads(record.read_text())["observation"] == values
+    with pytest.raises(DataError, match=r"elbow: a hand; what was measured is kept in .*new.jsonl"):
+        tour.complete(record)
+
+
+def test_no_tour_begins_on_an_arm_that_a_running_bridge_may_carry(tmp_path, monkeypatch):
+    monkeypatch.setattr(bus_lock, "FOLDERS", (tmp_path,))
+    channel = f"tour{os.getpid()}"
+    bridge = load(CONFIG / "sim.yaml")[BRIDGE]
+    lock = bus_lock.BusLock(("virtual", channel, can_options(bridge)), "/right/can_bridge (PID 7)")
+    nodes = {BRIDGE: {**bridge, "can.interface": "virtual", "can.channel": channel}}
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(BusError, match=r"held by /right/can_bridge \(PID 7\)"):
+        live.run_tour(argparse.Namespace(output=tmp_path / "new.yaml", record=None), nodes, print)
+    assert signal.getsignal(signal.SIGINT) is before
+    lock.release()
