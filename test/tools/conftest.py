@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
@@ -49,10 +50,12 @@ def params_with(tmp_path: Path) -> Callable[..., Path]:
 
     def write(name: str, changes: Mapping[str, Mapping[str, Any]] | None = None, without: Iterable[str] = ()) -> Path:
         content = yaml.safe_load((CONFIG / name).read_text())
-        for node, values in (changes or {}).items():
+        for node, values in copy.deepcopy(dict(changes or {})).items():  # ROS reads no YAML aliases
             content.setdefault(node, {"ros__parameters": {}})["ros__parameters"].update(values)
         path = tmp_path / "params.yaml"
-        path.write_text(yaml.safe_dump({node: entry for node, entry in content.items() if node not in without}))
+        path.write_text(
+            yaml.safe_dump({node: entry for node, entry in content.items() if node not in without}, sort_keys=False)
+        )
         return path
 
     return write

@@ -1,53 +1,104 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""trial, from script to report: offline, over ROS, interrupted, and used wrongly."""
+"""trial, from script to report: scripts and criteria, offline, over ROS, interrupted, repeated, and as a clip."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from subprocess import PIPE
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
 import yaml
 from rosbags.rosbag2 import Reader
 
+from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab import processes
-from exo_gravity.tools import report, trial
-from exo_gravity.tools.trial import main
+from exo_gravity.lab.report import video as clips
+from exo_gravity.lab.trial import run as running
+from exo_gravity.lab.trial.scripted import analysed, read_script
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.tools import trial
 
 from ..support import CONFIG, csv_rows
+from ..support import synthetic_bags as made
 from ..support.launched_nodes import PORTS, LaunchedNodes
 from ..support.trunk_trial import moved, trunk_trial
 from ..support.waiting import PATIENCE
 
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
+RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
+
+# Scripts and criteria
 
 
-def by_length(path: Path) -> int:
-    return len(path.name)  # attempts on a machine that was too busy have a number in addition
+@pytest.mark.parametrize("name", ["bow_and_walk", "demo", "thirteen_poses", "two_poses"])
+def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limits(name):
+    _, script = read_script(name)
+    values = yaml.safe_load((CONFIG / "exo.yaml").read_text())
+    bridge, robot = (values[f"/right/{node}"]["ros__parameters"] for node in ("can_bridge", "compensator"))
+    poses = np.array([step.value for step in script.steps if step.action == "move"])
+    assert np.all(poses > np.array(bridge["position_min"]) + 0.15)
+    assert np.all(poses < np.array(bridge["position_max"]) - 0.15)
+    arm = ArmModel(robot["link_length"], robot["robot"]["cog"], robot["robot"]["mass"])
+    for pitch, roll in itertools.product((-0.35, 0.0, 0.35), repeat=2):  # 20 degrees
+        assert np.all(np.abs(gravity_torque(arm, poses, Tilt.of("right", pitch, roll).direction)) < RATED)
+
+
+def bag_with(holds):
+    """Return a recording without a script, of one arm with that many holds of 4 s."""
+    recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
+    return made.bag_of(replace(recording, steps=(), carried=((0.0, recording.time[-1]),)))
+
+
+HELD = [  # holds found, holds of the script in s, whether a person guides the arm, trouble before, and after
+    (2, (4.0, 4.0), True, "", ""),
+    (1, (4.0, 4.0), True, "", "right: 1 of 2 holds"),  # a real arm that never came to rest
+    (1, (4.0, 4.0), True, "an arm is not active any more", "an arm is not active any more"),
+    (2, (60.0, 14.0), True, "", "right: 0 of 2 holds"),  # a moment in which a person holds the arm still
+    (2, (60.0, 14.0), False, "", ""),
+]
+
+
+@pytest.mark.parametrize(("found", "durations", "guided", "given", "trouble"), HELD)
+def test_a_real_arm_must_have_held_for_half_of_each_hold_of_the_script(found, durations, guided, given, trouble):
+    script = TrialScript.parse({"name": "holds", "steps": [{"hold": duration} for duration in durations]})
+    report, why = analysed(bag_with(found), script, guided, given)
+    assert why.startswith(trouble) and bool(why) == bool(trouble)
+    assert len(report.arms[0][1].holds) == (0 if "0 of 2" in trouble else found)
+
+
+def test_only_holds_of_a_minute_are_judged_by_their_rate_and_a_simulator_makes_a_guide_needless():
+    demo, poses = (analysed(bag_with(1), read_script(name)[1], False, "")[0] for name in ("demo", "thirteen_poses"))
+    assert (demo.criteria.max_rate, poses.criteria.max_rate) == (math.inf, pytest.approx(math.radians(0.2) / 60))
+    assert running.is_guided(CONFIG / "exo.yaml") and not running.is_guided(CONFIG / "sim_both.yaml")
+
+
+# Offline
 
 
 @pytest.fixture
-def run(tmp_path):
-    """Run `trial` with `changes` of sim.yaml by node; return its exit code and the folder of its last attempt.
-
-    The folder is `tmp_path` if it wrote none.
-    """
+def run(tmp_path, run_tool):
+    """Run `trial` with `changes` of sim.yaml by node; return how it ended and the folder of its last attempt."""
     handlers = [(number, signal.getsignal(number)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
     def run(*arguments, script=SHORT, simulator=None, **changes):
-        (tmp_path / "script.yaml").write_text(yaml.safe_dump(script))
-        output = tmp_path / f"out_{next(PORTS)}"
+        path, output = tmp_path / "script.yaml", tmp_path / f"out_{next(PORTS)}"
+        path.write_text(yaml.safe_dump(script))
         # Saves seconds. The wearer first moves after RAMPING_IN, in which a joint that moves gives up its torque.
         params = LaunchedNodes(tmp_path, simulator={"trial_delay": 3.0, **(simulator or {})}, **changes).path
-        code = main([str(tmp_path / "script.yaml"), "--params", str(params), "--output", str(output), *arguments])
-        return code, min(output.iterdir(), key=by_length) if output.exists() else tmp_path
+        ended = run_tool("trial", path, "--params", params, "--output", output, *arguments)
+        # Attempts on a machine that was too busy have a number in addition.
+        return ended, min(output.iterdir(), key=lambda path: len(path.name))
 
     yield run
     for number, handler in handlers:
@@ -58,46 +109,31 @@ def column(folder, name):
     return [float(row[name]) for row in csv_rows(folder / "holds.csv")]
 
 
-def test_an_offline_trial_ends_with_a_report_of_its_recording(run, capsys):
-    code, folder = run("--offline")
-    assert code == 0
+def test_an_offline_trial_ends_with_a_report_of_its_recording(run, run_tool):
+    ended, folder = run("--offline")
     report_files = {"holds.csv", "motions.csv", "report.html", "right_overview.png"}  # it held: no drift to draw
     assert {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
-    text = capsys.readouterr().out
-    assert "times real time" in text and "It held." in text
+    assert ended.code == 0 and "times real time" in ended.out and "It held." in ended.out
     np.testing.assert_allclose(column(folder, "pose_deg"), np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
     with Reader(folder / "bag") as recorded:  # rosbags' own
         assert {"/right/joint_states", "/right/effort_commands", "/diagnostics"} <= set(recorded.topics)
     metadata = yaml.safe_load((folder / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["custom_data"] == {"source.right": "simulated"}
     assert "Simulated: programs made" in (folder / "report.html").read_text(encoding="utf-8")
-    assert report.main([str(folder / "bag"), "--output", str(folder / "again")]) == 0
+    assert run_tool("report", folder / "bag", "--output", folder / "again").code == 0
     for table in ("holds.csv", "motions.csv"):
         assert csv_rows(folder / "again" / table) == csv_rows(folder / table)
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day_and_a_name_is_refused(run, capsys):
-    code, folder = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
+def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day(run):
+    ended, folder = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
     (found,) = folder.glob("*-*-*/short_*")
-    assert code == 0 and folder.name == "P01"
+    assert ended.code == 0 and folder.name == "P01"
     rows = {(row["subject"], row["trial"], row["mode"]) for row in csv_rows(found / "holds.csv")}
     assert rows == {("P01", found.name, "one_g")}
     page = (found / "report.html").read_text(encoding="utf-8")
     assert "Protocol: pilot" in page and "Note: - stiff" in page
-    code, folder = run("--offline", "--subject", "Anna Meier")
-    assert code == 2 and "subject" in capsys.readouterr().err and not list(folder.rglob("Anna*"))
-
-
-def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
-    code = "import sys; from exo_gravity.tools.trial import _print_json as p; p(step=0); input(); p(step=1); p(step=2)"
-    process = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
-    assert process.stdout.readline() == '{"step": 0}\n'
-    process.stdout.close()
-    process.stdin.write("\n")
-    process.stdin.close()
-    assert process.wait(PATIENCE) == 0 and process.stderr.read() == ""
-    process.stderr.close()
 
 
 def thirteen(poses=13):
@@ -109,72 +145,190 @@ def thirteen(poses=13):
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
-    code, folder = run("--offline", script=thirteen())
+    ended, folder = run("--offline", script=thirteen())
     rates = np.abs(column(folder, "drift_deg_per_min"))
-    assert code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
+    assert ended.code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
 
 
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
-def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_poses_that_give_way(run, capsys):
+def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_poses_that_give_way(run):
     masses = [round(1.1 * mass, 4) for mass in (0.585, 0.468, 0.598, 0.203)]
     heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
     slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
-    code, _ = run("--offline", script=thirteen(poses=4), compensator=heavy, simulator=slippery)
-    said = capsys.readouterr().out
-    assert code == 1 and "It did not hold." in said
-    assert said.count("the arm was still moving at the end of a hold") > 1
-
-
-def test_a_wrong_parameter_ends_with_exit_code_2_one_sentence_and_no_folder(run, capsys):
-    """Of the other nodes: test_doctor.py, by the same reader."""
-    code, folder = run("--offline", simulator={"robot": {"cog": [0.5] * 4}})
-    error = capsys.readouterr().err
-    assert code == 2 and not list(folder.glob("out_*"))
-    assert "/right/simulator cog" in error and error.count("\n") == 1
+    ended, _ = run("--offline", script=thirteen(poses=4), compensator=heavy, simulator=slippery)
+    assert ended.code == 1 and "It did not hold." in ended.out
+    assert ended.out.count("the arm was still moving at the end of a hold") > 1
 
 
 @pytest.mark.usefixtures("without_pictures")
-def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, capsys, monkeypatch):
+def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, monkeypatch):
     def stop_on_signals() -> threading.Event:
         stopped = processes.stop_on_signals()
         threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         return stopped
 
     monkeypatch.setattr(trial, "stop_on_signals", stop_on_signals)
-    code, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
-    assert code == 1 and (folder / "report.html").exists()
-    text = capsys.readouterr().out
-    assert "stopped by the operator" in text and "slipped" not in text
+    ended, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
+    assert ended.code == 1 and (folder / "report.html").exists()
+    assert "stopped by the operator" in ended.out and "slipped" not in ended.out
+
+
+BOW, HOLD = {"bow": math.radians(30.0), "over": 3.0}, {"hold": 1.0}
+TRUNK = {  # the trunk's motion, whether its acceleration is compensated, and how far the arm moves in degrees
+    "bow": ((BOW, HOLD), True, 0.0, 2.0),
+    "walk": (({"walk": 6.0}, HOLD), True, 0.0, 3.0),
+    "bow, tilt alone": ((BOW, HOLD), False, 0.0, 2.0),
+    "walk, tilt alone": (({"walk": 4.0},), False, 5.0, math.inf),
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("steps", "inertial", "least", "most"), TRUNK.values(), ids=TRUNK)
+def test_an_arm_with_little_friction_stays_where_it_is_unless_a_walking_trunks_acceleration_is_left_out(
+    steps, inertial, least, most
+):
+    trial = trunk_trial(*steps, inertial=inertial)
+    assert least < moved(trial.run(), ("bow", "walk")) < most
+    assert trial.trouble == ""
+
+
+# On running nodes
+
+
+def test_a_trial_goes_on_when_its_progress_is_no_longer_read():
+    code = "import sys; from exo_gravity.tools.trial import _print_json as p; p(step=0); input(); p(step=1); p(step=2)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, stderr=PIPE, text=True)
+    assert process.stdout.readline() == '{"step": 0}\n'
+    process.stdout.close()
+    assert process.communicate("\n", timeout=PATIENCE)[1] == "" and process.returncode == 0
 
 
 @pytest.mark.thorough
 @pytest.mark.real_time
 def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
-    code, folder = run()
-    assert code == 0, (folder / "log.txt").read_text()
+    ended, folder = run()
+    assert ended.code == 0, (folder / "log.txt").read_text()
     assert {"bag", "log.txt", "params.yaml", "report.html"} <= {path.name for path in folder.iterdir()}
     _, offline = run("--offline")
     np.testing.assert_allclose(column(folder, "pose_deg"), column(offline, "pose_deg"), atol=0.3)
 
 
-BOW = {"bow": math.radians(30.0), "over": 3.0}
+def simulator(stall=12.0, silence=14.0, disconnected="no"):
+    values = {"longest stall (ms)": f"{stall:.0f}", "longest silence (ms)": f"{silence:.0f}"}
+    return {"right/simulator": {"level": 0, "message": "running", "disconnected": disconnected, **values}}
+
+
+NO_SENTENCE = "zqx vw: kfj, 17"  # in the place of each: what a program decides does not depend on it
+CASES = {  # the fault, what a simulator says, and by what the computer was too busy
+    "a stalled device": ("motor_silent", simulator(140, 150), "right/simulator was not run for 140 ms"),
+    "a stalled bridge": ("motor_silent", simulator(12, 130), "right/can_bridge was not run for 130 ms"),
+    "late replies without a long gap": ("motor_silent", simulator(), "replies"),
+    "late efforts": ("command_stale", simulator(), "efforts"),
+    "a simulated fault": ("motor_silent", simulator(60, 70, "yes"), ""),
+    "a hot motor": ("over_temperature", simulator(140, 150), ""),
+    "a real arm's silent motor": ("motor_silent", {}, ""),
+    "a real arm's late efforts": ("command_stale", {}, ""),
+}
+
+
+@pytest.mark.parametrize(("fault", "device", "reason"), CASES.values(), ids=CASES)
+def test_only_a_gap_and_late_replies_or_efforts_of_a_simulated_arm_mean_a_busy_computer(fault, device, reason):
+    bridge = {"level": 2, "message": NO_SENTENCE, "state": "letting down", "fault": fault}
+    found = running.too_busy({"right/can_bridge": bridge, **device})
+    assert reason in found and bool(found) == bool(reason)
+
+
+STALLED = "right/simulator was not run for 140 ms"
+BUSY = running.TrialEnd("right/can_bridge: letting down: motor_silent", 1, STALLED)
+FAULT = running.TrialEnd("right/can_bridge: letting down: over_temperature", 1, "")
+ATTEMPTS = [  # how attempts end, the exit code, the attempts that are made, and the last line
+    ((BUSY, BUSY, BUSY), 3, 3, STALLED),
+    ((BUSY, FAULT), 1, 2, "over_temperature"),
+    ((FAULT, BUSY), 1, 1, "over_temperature"),
+]
+
+
+@pytest.mark.parametrize(("ends", "code", "attempts", "last_line"), ATTEMPTS)
+def test_a_trial_on_a_busy_computer_is_repeated_and_one_with_a_fault_is_not(
+    tmp_path, monkeypatch, run_tool, ends, code, attempts, last_line
+):
+    left = list(ends)
+
+    def no_recording(path: Path) -> None:
+        raise DataError(f"{path}: nothing was recorded")
+
+    monkeypatch.setattr(running, "run_nodes", lambda *_: left.pop(0))
+    monkeypatch.setattr("exo_gravity.lab.bag.reader.read_bag", no_recording)
+    monkeypatch.setattr(trial, "stop_on_signals", threading.Event)
+    ended = run_tool("trial", "demo", "--output", tmp_path)
+    assert ended.code == code and len(ends) - len(left) == attempts
+    lines = ended.out.splitlines()
+    assert last_line in lines[-1] and (f"attempt {attempts} of 3" in "".join(lines)) == (attempts > 1)
+
+
+# As a clip
+
+CLIPS = {  # the file, the speed, the graphics libraries, the packages that are needed, and what is said
+    "another format": ("clip.avi", 1.0, {"EGL"}, (), "a file that ends with .mp4 or .gif"),
+    "no format": ("clip", 1.0, {"EGL"}, (), "a file that ends with .mp4 or .gif"),
+    "no folder": ("missing/clip.gif", 1.0, {"EGL"}, (), "a file in a folder that exists"),
+    "no speed": ("clip.gif", 0.0, {"EGL"}, (), "a number from 0.1 to 100"),
+    "a speed that is none": ("clip.gif", float("nan"), {"EGL"}, (), "a number from 0.1 to 100"),
+    "no encoder": ("clip.gif", 1.0, {"EGL"}, ("no_such_encoder",), r"no_such_encoder .*\.\[video\]"),
+    "no graphics": ("clip.gif", 1.0, set(), (), "apt install libegl1"),
+    "other graphics": ("clip.gif", 1.0, {"OSMesa"}, (), "apt install libegl1"),
+}
+
+
+@pytest.mark.parametrize(("video", "speed", "libraries", "needed", "said"), CLIPS.values(), ids=CLIPS)
+def test_a_wrong_clip_is_refused_before_the_trial(tmp_path, monkeypatch, video, speed, libraries, needed, said):
+    monkeypatch.setattr(clips, "find_library", lambda name: name if name in libraries else None)
+    monkeypatch.setattr(clips, "NEEDED", needed)
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    with pytest.raises(ParameterError, match=said):
+        clips.requested(str(tmp_path / video), speed)
+
+
+@pytest.mark.parametrize(("installed", "expected"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa"), ({}, "")])
+def test_egl_is_preferred_to_osmesa_and_mujoco_gl_to_both(monkeypatch, installed, expected):
+    monkeypatch.setattr(clips, "find_library", lambda name: name if name in installed else None)
+    for chosen, found in (("disabled", expected), ("osmesa", "osmesa" * bool(installed)), ("glfw", "glfw")):
+        monkeypatch.setenv("MUJOCO_GL", chosen)
+        assert clips.backend() == found
+
+
+def test_from_frame_to_frame_the_recording_goes_on_at_the_speed_of_the_clip(monkeypatch, tmp_path):
+    monkeypatch.setattr(clips, "find_library", lambda name: name)
+    assert clips.requested(None, 1.0) is None
+    for kind, step in (("gif", 0.4), ("mp4", 0.16)):
+        assert clips.requested(str(tmp_path / f"clip.{kind}"), 4.0).step == pytest.approx(step)
+
+
+def colourful(frame):
+    """Return how many pixels are not grey: torques, states and centres of gravity."""
+    pixels = frame[..., :3].astype(int)
+    return int(np.count_nonzero(np.ptp(pixels, axis=-1) > 60))
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("steps", "inertial", "least", "most"),
-    [
-        ((BOW, {"hold": 1.0}), True, 0.0, 2.0),
-        (({"walk": 6.0}, {"hold": 1.0}), True, 0.0, 3.0),
-        ((BOW, {"hold": 1.0}), False, 0.0, 2.0),
-        (({"walk": 4.0},), False, 5.0, math.inf),
-    ],
-    ids=["bow", "walk", "bow, tilt alone", "walk, tilt alone"],
-)
-def test_an_arm_with_little_friction_stays_where_it_is_unless_a_walking_trunks_acceleration_is_left_out(
-    steps, inertial, least, most
-):
-    trial = trunk_trial(*steps, inertial=inertial)
-    assert least < moved(trial.run(), ("bow", "walk")) < most  # degrees
-    assert trial.trouble == ""
+@pytest.mark.timeout(300)  # software rendering on a busy machine
+@pytest.mark.parametrize(("kind", "speed"), [("gif", "20"), ("mp4", "50")])  # a frame every 2 s
+def test_a_clip_of_an_offline_trial_shows_the_arm_move_and_its_torques(tmp_path, kind, speed):
+    """In a separate process: MuJoCo chooses how it draws when it is imported, which other tests have done in this."""
+    script, clip = tmp_path / "short.yaml", tmp_path / f"clip.{kind}"
+    steps = [{"move": [0.0, 0.8, 0.6, 0.4], "over": 1.0}, {"hold": 2.0}]
+    script.write_text(yaml.safe_dump({"name": "short", "steps": steps}))
+    words = [str(script), "--offline", "--params", str(CONFIG / "sim.yaml"), "--output", str(tmp_path)]
+    words += ["--video", str(clip), "--video-speed", speed]
+    code = f"from exo_gravity.tools.trial import main; raise SystemExit(main({words}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
+    if not clips.backend():  # a machine without OpenGL
+        assert (done.returncode, clips.NO_GRAPHICS in done.stderr) == (2, True)
+        return
+    assert done.returncode == 0, done.stdout + done.stderr
+    frames = iio.imread(clip, plugin="pillow" if kind == "gif" else "pyav")
+    assert 8 <= len(frames) <= 12
+    held = frames[5]  # at 10 s
+    assert np.count_nonzero(np.any(held != frames[0], axis=-1)) > 0.01 * held.shape[0] * held.shape[1]
+    assert colourful(held) > 1.5 * colourful(frames[0])
