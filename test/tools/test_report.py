@@ -155,6 +155,8 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     assert run_tool("report", short_bag).code == 0
     written = {path.name for path in short_bag.with_name("short_report").iterdir()}
     assert written == {"holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png"}
+    nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
+    assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
     labelled = Figure(figsize=(1.0, 1.0))
     labelled.text(0.5, 0.5, "Torque (Nm)")
     for name in ("overview", "drift"):
