@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from exo_gravity.hardware.clock import favour
 
 from .support.ports import own_domain
 from .support.selection import UNDER_COLCON, missing_packages
+from .support.stalls import Machine
 
 LINTERS = "test_linters.py"  # elsewhere `make lint` runs it
 left_out: Counter[str] = Counter()
@@ -27,11 +29,14 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 
 @pytest.fixture(scope="session")
-def machine() -> None:
-    """The machine for one test of running nodes at a time: nodes let the arm down when they get no processor."""
+def machine() -> Iterator[Machine]:
+    """The machine for one test of running nodes at a time, which tells what it kept from them."""
     if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1:
         pytest.fail("tests marked real_time run alone: use `-m real_time` without -n")
     favour(5)  # what a test receives is in time
+    machine = Machine()
+    yield machine
+    machine.close()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

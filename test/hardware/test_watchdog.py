@@ -2,7 +2,7 @@
 """The watchdog's process: after the bridge has died, its arm is let down, whatever else froze.
 
 What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py. What happens after
-both have died: test_bus_lock.py in virtual time, nodes/test_bridge_death.py with processes.
+both have died: test_bus_lock.py in virtual time, nodes/test_stack.py with processes.
 """
 
 from __future__ import annotations

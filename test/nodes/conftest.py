@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from ..support.bus_listener import BusListener
 from ..support.launched_nodes import LaunchedNodes
-from ..support.own_node import own_node
+from ..support.node_thread import own_node
 from ..support.ros_probe import RosProbe
 
 

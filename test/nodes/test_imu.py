@@ -1,11 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The node `imu` as a process, over real DDS, with a trunk that moves and with impossible samples."""
+"""The node `imu` over real DDS: a trunk that moves, impossible samples, and sensors that it reads itself."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,18 +20,137 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trunk.params import IMU_SOURCES
+from exo_gravity.hardware.imu_sources import SOURCES, ImuSource
+from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
+from exo_gravity.nodes.imu import ImuDevice
 from exo_gravity.nodes.imu import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
+from exo_gravity.sim.virtual_time import VirtualClock
 
+from ..support.fake_imu.chips import G as CHIP_G
+from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
 from ..support.imu_faults import bowing_and_walking
+from ..support.node_thread import own_node
 from ..support.waiting import PATIENCE, wait_until
 
+keep_to_this_machine()
 G = 9.80665
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 MOUNTING = Rotation.from_euler("xyz", (math.pi / 2, 0.0, math.pi / 2))  # trunk from IMU: its x points left, its y up
 AHEAD = 25  # samples in flight: fewer than the node queues, so that none is lost
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", "--ros-args"]
+
+
+# An IMU that the node reads itself. How a device is opened again: hardware/test_imu_reopening.py
+
+
+@pytest.fixture
+def sensor(tmp_path):
+    """A BNO085 that is plugged in, on a pseudo-terminal."""
+    sensor = FakeSerialSensor(tmp_path / "imu")
+    yield sensor
+    sensor.unplug()
+
+
+def test_each_sample_goes_to_the_callback_and_to_the_topic_once_in_order_and_states_what_is_not_measured(sensor):
+    published, received, time = [], [], VirtualClock()
+    now = SimpleNamespace(now=lambda: Time(nanoseconds=round(time.monotonic() * 1e9)))
+    node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=published.append), get_clock=lambda: now)
+    values = {"source": "bno085", "rate": 100.0, "serial.port": str(sensor.port), "serial.baud": 115200}
+    device = ImuDevice(node, values, "/imu/data_raw", lambda *sample: received.append(sample), time)
+    for number in range(20):
+        time.sleep(0.01)
+        sensor.deliver(rvc_packet(number, (90, 0, 0), (0, 0, 1000)))
+        device.poll()
+    messages, numbers = zip(*received, strict=True)
+    assert [info["publication_sequence_number"] for info in numbers] == list(range(1, 21))
+    assert published == list(messages)
+    age = now.now().nanoseconds - to_nanoseconds(messages[-1].header.stamp)
+    assert age == pytest.approx(0.5e9 * 0.01, rel=0.01)
+    assert messages[-1].angular_velocity_covariance[0] == -1.0 and messages[-1].orientation_covariance[0] == 0.0
+    assert messages[-1].linear_acceleration.z == pytest.approx(CHIP_G)
+    assert messages[-1].orientation.z == pytest.approx(0.5**0.5)
+
+
+def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(sensor):
+    arguments = ("source:=bno085", f"serial.port:={sensor.port}", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
+    rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))])
+    node, listener, executor = ImuShell(), rclpy.create_node("imu_listener"), SingleThreadedExecutor()
+    tilts, reports = [], [DiagnosticStatus()]
+    for each in (node, listener):
+        executor.add_node(each)
+    listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", tilts.append, 50)
+    listener.create_subscription(DiagnosticArray, "/diagnostics", lambda message: reports.extend(message.status), 50)
+    counters, is_read = itertools.count(), True
+
+    def send():
+        if is_read:  # with noise, as every real one has
+            number = next(counters)
+            sensor.send(rvc_packet(number, (0, 20, 0), (0, 342, 940 + number % 3)))
+
+    listener.create_timer(0.01, send)
+
+    def wait(condition):
+        wait_until(condition, lambda: executor.spin_once(timeout_sec=0.002), seen=lambda: reports[-1])
+
+    try:
+        wait(lambda: tilts)
+        assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
+        wait(lambda: reports[-1].message == "publishing")
+        is_read = False
+        sensor.unplug()
+        wait(lambda: f"BNO085 on {sensor.port}: cannot be" in reports[-1].message)
+        assert reports[-1].level == DiagnosticStatus.ERROR
+        sensor.plug()
+        is_read = True
+        wait(lambda: reports[-1].message == "publishing")
+        assert int({pair.key: pair.value for pair in reports[-1].values}["opened"]) >= 2
+    finally:
+        node.close()
+        executor.shutdown()
+        for each in (node, listener):
+            each.destroy_node()
+        rclpy.try_shutdown()
+
+
+# CONTRIBUTING, "Add an IMU", followed literally: a class with `read` and `close`, and its name in two places
+
+
+class LevelImu(ImuSource):
+    """A sensor that always lies level."""
+
+    def __init__(self, values, clock):
+        super().__init__(f"level IMU at {values['rate']:g} Hz")
+        self.clock, self.is_open = clock, True
+
+    def read(self):
+        return [ImuSample(self.clock(), (0.0, 0.0, 0.01), (0.0, 0.0, 9.81))]
+
+    def close(self):
+        self.is_open = False
+
+
+def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monkeypatch):
+    assert set(IMU_SOURCES) == {"topic", *SOURCES}
+    monkeypatch.setitem(SOURCES, "level", LevelImu)
+    clock, received = VirtualClock(), []
+    with own_node("listener") as (node, _):
+        values = {"source": "level", "rate": 100.0}
+        device = ImuDevice(node, values, "/imu/data_raw", lambda message, _: received.append(message), clock)
+        for _ in range(3):
+            clock.sleep(0.01)
+            device.poll()
+    assert [message.linear_acceleration.z for message in received] == pytest.approx([9.81] * 3)
+    assert received[0].orientation_covariance[0] == -1.0  # not reported
+    assert device.values["device"] == "level IMU at 100 Hz"
+    source = device.reopening.source
+    device.reopening.close()
+    assert not source.is_open
+
+
+# The node as a process, fed by a driver
 
 
 class ImuNode:
@@ -39,14 +160,10 @@ class ImuNode:
     reported: the statuses so far; one lasts for a moment only.
     """
 
-    def __init__(self, rotation):
+    def __init__(self, rotation, node, executor):
         arguments = ("-p", f"rotation_trunk_from_imu:={[float(part) for part in rotation]}")
         self.process = subprocess.Popen([*NODE, *arguments], stdin=subprocess.PIPE)  # it ends with its stdin
-        self.context = rclpy.Context()
-        rclpy.init(context=self.context)
-        self.node = rclpy.create_node("imu_driver", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
+        self.node, self.executor = node, executor
         self.publisher = self.node.create_publisher(Imu, "/imu/data_raw", 50)
         self.node.create_subscription(Vector3Stamped, "/imu/pitch_yaw", self._on_tilt, 1000)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
@@ -58,9 +175,6 @@ class ImuNode:
     def close(self):
         self.process.terminate()
         self.process.wait(PATIENCE)
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
 
     def _on_tilt(self, message):
         stamp = to_nanoseconds(message.header.stamp)
@@ -106,10 +220,10 @@ class ImuNode:
         self._number[round(stamp * 1e9)] = self.sent
         self.wait_until(lambda: self.sent - self.received < AHEAD)
 
-    def settle(self, start, **sample):
+    def settle(self, start, *sample, **options):
         """Send the same sample for 4 s of stamps, wait until the node has received all, and return the last stamp."""
         for stamp in start + 0.01 * np.arange(400):
-            self.send(stamp, **sample)
+            self.send(stamp, *sample, **options)
         self.wait_until(lambda: self.received == self.sent and round(stamp * 1e9) in self.tilts)
         return float(stamp)
 
@@ -117,13 +231,12 @@ class ImuNode:
 @pytest.fixture(scope="module")
 def node(request):
     """A node whose IMU is aligned with the trunk, or mounted as the module's parameter states."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("EXO_GRAVITY_SUPERVISED", "1")
-        imu = ImuNode(getattr(request, "param", UPRIGHT))
-    try:
+    with own_node("imu_driver") as own:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("EXO_GRAVITY_SUPERVISED", "1")
+            imu = ImuNode(getattr(request, "param", UPRIGHT), *own)
         imu.wait_until(lambda: imu.publisher.get_subscription_count() and imu.reports("waiting"))
         yield imu
-    finally:
         imu.close()
 
 
@@ -172,20 +285,16 @@ def test_a_refusal_is_reported_with_its_reason_and_gives_no_tilt(imu):
     assert not [number for number in imu.tilts if number > round((stamp + 0.11) * 1e9)]
 
 
-def test_values_with_a_covariance_of_minus_1_are_used_and_passed_on_as_measured(imu):
-    messages = []
+def test_an_orientation_that_the_driver_does_not_have_is_fused_and_values_without_covariance_are_passed_on(imu):
+    messages, tilted, missing = [], (0.0, G * math.sin(0.2), G * math.cos(0.2)), ((0.0,) * 4, (math.nan,) * 4)
     imu.node.create_subscription(Imu, "/imu/data", messages.append, 50)
-    imu.settle(5000.0, rate=(0.0, 0.0, 1e-3), covariance=-1.0)
-    imu.wait_until(lambda: messages)
+    # 8 s of stamps each: what was learnt before is forgotten
+    for start, orientation in zip((6000.0, 6004.0, 6008.0, 6012.0), np.repeat(missing, 2, axis=0), strict=True):
+        stamp = imu.settle(start, (0.0, 0.0, 1e-3), tilted, orientation, covariance=-1.0)
+        imu.wait_until(lambda: messages)
+    assert imu.tilts[round(stamp * 1e9)].x == pytest.approx(0.2, abs=1e-3)
     assert messages[-1].angular_velocity.z == pytest.approx(1e-3)
     assert messages[-1].angular_velocity_covariance[0] == messages[-1].linear_acceleration_covariance[0] == 0.0
-
-
-@pytest.mark.parametrize("orientation", [(0.0,) * 4, (math.nan,) * 4], ids=["0 0 0 0", "NaN"])
-def test_an_orientation_that_the_driver_does_not_have_is_fused(imu, orientation):
-    for start in (6000.0, 6004.0):  # 8 s of stamps: what was learnt in the tests before is forgotten
-        stamp = imu.settle(start, acceleration=(0.0, G * math.sin(0.2), G * math.cos(0.2)), orientation=orientation)
-    assert imu.tilts[round(stamp * 1e9)].x == pytest.approx(0.2, abs=1e-3)
 
 
 def test_samples_of_a_second_driver_are_an_error_and_give_no_tilt(imu):

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel, gravity_torque
@@ -21,10 +22,12 @@ from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.compensator.node import CompensatorNode
+from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..hardware.rig import LIMITS, raised_arm
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU
+from ..support.truth import Truth
 from ..support.waiting import wait_until
 
 PARAMETERS = load(CONFIG / "sim.yaml")["/right/compensator"]
@@ -61,12 +64,8 @@ class Bridge:
         return self.exchange.newest, self.exchange.efforts(time.monotonic())
 
 
-@pytest.fixture
-def bridge(node):
-    return Bridge(node, Limits(tuple(NAMES)))
-
-
-def test_efforts_that_answer_a_joint_state_are_there_at_once_and_are_not_taken_again_from_the_topic(bridge):
+def test_efforts_are_there_at_once_are_not_taken_again_from_the_topic_and_another_publisher_is_noticed(node):
+    bridge = Bridge(node, Limits(tuple(NAMES)))
     command, later = bridge.cycle(100.0)
     assert (tuple(command.effort), command.answered) == ((0.0, 1.0, 2.0, 3.0), 100.0) and later is command
     bridge.efforts = None
@@ -75,13 +74,7 @@ def test_efforts_that_answer_a_joint_state_are_there_at_once_and_are_not_taken_a
         assert bridge.cycle(now) == (command, command) and bridge.exchange.newest is command
     assert [list(message.position) for message in bridge.answered] == [[0.5] * 4] * 4
     assert not bridge.trips and not bridge.exchange.refusal
-
-
-def test_another_publisher_of_efforts_is_noticed_at_its_first_message(bridge, node):
     other = node.create_publisher(JointState, "effort_commands", 1)
-    for _ in range(20):
-        bridge.cycle()
-    assert not bridge.trips
     wait_until(lambda: other.get_subscription_count() == 1)
     other.publish(JointState(name=NAMES, effort=NO_EFFORT))
     wait_until(lambda: bridge.trips, bridge.cycle)
@@ -142,25 +135,20 @@ def settled(node):
     return node.answer(states())
 
 
-def test_the_compensator_answers_with_what_gravity_needs_and_publishes_it(compensator, node):
-    received = []
+def test_the_compensator_answers_with_what_gravity_needs_publishes_it_and_withdraws_it_for_two_publishers(
+    compensator, node
+):
+    received, running = [], compensator()
     node.create_subscription(JointState, "effort_commands", received.append, 10)
-    executor = rclpy.executors.SingleThreadedExecutor(context=node.context)
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    running = compensator()
-    answer = settled(running)
-    assert answer.name == NAMES
+    assert settled(running).name == NAMES
 
     def is_received():
         answer = running.answer(states())  # the first ones may precede the discovery of this subscription
         return received and received[-1] == answer
 
     wait_until(is_received, lambda: executor.spin_once(0.01))
-
-
-def test_joint_states_of_another_publisher_withdraw_the_efforts(compensator, node):
-    running = compensator()
-    settled(running)
     bridge, other = (node.create_publisher(JointState, "joint_states", 1) for _ in range(2))
     wait_until(lambda: other.get_subscription_count() == bridge.get_subscription_count() == 1)
 
@@ -180,8 +168,7 @@ def test_an_exception_of_the_step_ends_the_answers_for_good_and_is_kept(compensa
     with monkeypatch.context() as patched:
         patched.setattr(Compensator, "step", lambda *_: 1 / 0)
         assert running.answer(states()) is None
-    assert running.answer(states()) is None
-    assert isinstance(running.failure, ZeroDivisionError)
+    assert running.answer(states()) is None and isinstance(running.failure, ZeroDivisionError)
 
 
 def test_efforts_for_an_effort_controller_are_refused(compensator):
@@ -191,9 +178,8 @@ def test_efforts_for_an_effort_controller_are_refused(compensator):
 
 @pytest.mark.thorough
 @pytest.mark.real_time
-def test_both_nodes_run_under_their_own_names_carry_the_arm_and_let_it_down(launch, probe, listen):
-    nodes = launch(without=("imu",), timing=CALM, compensator=NO_IMU, one_process=True)
-    listener = listen(nodes)
+def test_both_nodes_run_under_their_own_names_carry_the_arm_and_let_it_down(launch, probe):
+    nodes = launch(without=("imu",), timing=CALM, truth=True, compensator=NO_IMU, one_process=True)
     probe.wait_until_carried()
     assert nodes.pid("compensator") == nodes.pid("can_bridge")
     probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
@@ -202,11 +188,11 @@ def test_both_nodes_run_under_their_own_names_carry_the_arm_and_let_it_down(laun
     assert [dumped[node]["ros__parameters"]["joint_names"] for node in both] == [NAMES, NAMES]
     assert dumped[both[1]]["ros__parameters"]["link_length"] == given[both[1]]["link_length"]
     assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
-    stamps = {(message.header.stamp.sec, message.header.stamp.nanosec) for message in probe.joint_states.copy()}
-    answered = {(message.header.stamp.sec, message.header.stamp.nanosec) for message in probe.effort_commands.copy()}
-    assert len(stamps & answered) > 10  # both topics are published
+    published = [probe.joint_states.copy(), probe.effort_commands.copy()]
+    asked, answered = ({to_nanoseconds(each.header.stamp) for each in messages} for messages in published)
+    assert len(asked & answered) > 10  # both topics are published
     assert any(line.startswith("/right/compensator: INFO compensating") for line in nodes.log)
     nodes.process("can_bridge").send_signal(signal.SIGINT)
     probe.wait_until(lambda: nodes.have_ended)
     assert nodes.ended_node == ("/right/can_bridge", 0)
-    assert listener.motors_are_off()
+    assert Truth(nodes.truth_path()).motors_are_off()

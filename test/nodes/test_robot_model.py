@@ -1,9 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The node `robot_model` with the real compensators and bridges of both arms, whose joint states the test sends."""
+"""The node `robot_model` with the real compensators and bridges of both arms, and the viewers' layouts."""
 
 from __future__ import annotations
 
+import ast
+import re
+
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Vector3Stamped
 from rosbags.highlevel import AnyReader
@@ -12,10 +16,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from exo_gravity.lab.processes import node_modules
 from exo_gravity.lab.view.urdf import ROOT
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
+from ..support import CONFIG
 from ..support.joint_state_feeder import PARTS
 from ..support.launched_nodes import LaunchedNodes
 from ..support.node_thread import NodeThread
@@ -145,3 +151,36 @@ def test_a_recording_holds_each_joint_state_once_and_the_arms_run_on_if_robot_mo
         topics = {connection.topic for connection in bag.connections}
     assert "/joint_states" not in topics
     assert {"/left/joint_states", "/right/joint_states"} <= topics
+
+
+# The layouts of RViz, PlotJuggler and Foxglove, and the launch file: what they name exists. The viewers have no wheels
+
+SHOWN = re.compile(
+    r"/robot_description|/joint_states|/robot_model/markers|/diagnostics|/imu/pitch_yaw([./]vector[./][xy])?"
+    rf"|/(?P<side>left|right)/joint_states(\.(position|velocity|effort)\[[0-3]\]"
+    rf"|/(?P=side)_({'|'.join(PARTS)})/(position|velocity|effort))?"
+)
+
+
+@pytest.mark.parametrize("layout", ["rviz/exo.rviz", "plotjuggler/exo.xml", "foxglove/exo.json"])
+def test_a_layout_names_topics_fields_and_frames_that_exist(layout):
+    text = (CONFIG / layout).read_text(encoding="utf-8")
+    found = re.findall(r"[\s\";](/[a-z][\w/.\[\]]*)", text)
+    assert found and not [name for name in found if not SHOWN.fullmatch(name)]
+    assert {*re.findall(r"(?:Fixed Frame: |\"followTf\": \")(\w+)", text)} <= {ROOT}
+
+
+def test_rviz_subscribes_with_the_quality_of_service_that_the_topics_have():
+    displays = yaml.safe_load((CONFIG / "rviz" / "exo.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
+    topics = [each[key] for each in displays for key in each if key in ("Description Topic", "Topic")]
+    assert {topic["Value"]: topic["Durability Policy"] for topic in topics} == {
+        "/robot_description": "Transient Local",
+        "/robot_model/markers": "Volatile",
+    }
+
+
+def test_the_launch_file_names_executables_and_files_that_exist():
+    tree = ast.parse((CONFIG.parent / "launch" / "view.launch.py").read_text(encoding="utf-8"))
+    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    assert {"robot_model", "robot_state_publisher", "rviz2", "sim.yaml", "rviz/exo.rviz"} <= texts
+    assert "robot_model" in node_modules() and (CONFIG / "rviz/exo.rviz").is_file()

@@ -45,8 +45,8 @@ ROS2 = {
 }
 ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no test has
     "ros2 launch exo_gravity exo.launch.py": "other tests of test/nodes/ros2_launch.py",
-    "ros2 service call /arm/compensator/clear_fault": "test/nodes/test_compensator_urdf.py, over the service",
-    "ros2 service call /right/compensator/weigh": "test/nodes/test_wearer_efforts.py, over the service",
+    "ros2 service call /arm/compensator/clear_fault": "test/nodes/test_compensator.py, over the service",
+    "ros2 service call /right/compensator/weigh": "test/nodes/test_compensator.py, over the service",
     "ros2 launch exo_gravity view.launch.py": "ros-jazzy-rviz2 and ros-jazzy-robot-state-publisher",
     "ros2 security": "ros-jazzy-sros2",
     "ROS_SECURITY_ENCLAVE_OVERRIDE=": "ros-jazzy-sros2",

@@ -1,29 +1,31 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Nodes of a test, on a separate thread."""
+"""Nodes of a test, in a ROS context of their own; on a separate thread, if wanted."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 
 InvalidHandle = rclpy_implementation.InvalidHandle
 
 
 class NodeThread:
-    """Nodes with these names in a separate context, which a thread spins until `close`.
+    """Nodes with these names in a separate context, which a thread spins from `start` until `close`.
 
-    after_spin: called on that thread whenever something may have arrived.
+    after_spin: called on that thread whenever something may have arrived. options: those of `create_node`.
     """
 
-    def __init__(self, *names: str, namespace: str = "", after_spin: Callable[[], object] = lambda: None) -> None:
+    def __init__(self, *names: str, after_spin: Callable[[], object] = lambda: None, **options: Any) -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
-        self.nodes = [rclpy.create_node(name, namespace=namespace, context=self.context) for name in names]
+        self.nodes = [rclpy.create_node(name, context=self.context, **options) for name in names]
         self.executor = SingleThreadedExecutor(context=self.context)
         for node in self.nodes:
             self.executor.add_node(node)
@@ -42,8 +44,19 @@ class NodeThread:
 
     def close(self) -> None:
         self._closing = True
-        self._thread.join()
+        if self._thread.ident is not None:
+            self._thread.join()
         self.executor.shutdown()
         for node in self.nodes:
             node.destroy_node()
         rclpy.try_shutdown(context=self.context)
+
+
+@contextmanager
+def own_node(name: str, namespace: str = "/right", **options: Any) -> Iterator[tuple[Node, SingleThreadedExecutor]]:
+    """Make a node, and an executor that has it, which the test spins; they end with the block."""
+    thread = NodeThread(name, namespace=namespace, **options)
+    try:
+        yield thread.nodes[0], thread.executor
+    finally:
+        thread.close()

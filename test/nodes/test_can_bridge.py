@@ -1,0 +1,570 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""can_bridge in this process: its report, its services, who operates it, and every transition of its lifecycle."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import KeyValue
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+
+from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.compensation.compensator import Compensation
+from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.motors.boards import Boards
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
+from exo_gravity.core.safety import descent
+from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
+from exo_gravity.core.safety.lease import LEASE_TIME, Lease
+from exo_gravity.core.safety.limits import Limits
+from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.vocabulary import NO_REASON
+from exo_gravity.hardware.can.can_port import ArmOnBus
+from exo_gravity.hardware.ownership import owned_bus
+from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.nodes.can_bridge import node as can_bridge
+from exo_gravity.nodes.can_bridge import operation
+from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
+from exo_gravity.nodes.can_bridge.node import CanBridge
+from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
+from exo_gravity.nodes.compensator.arm import JointStateInterface
+from exo_gravity.nodes.ros.inner import NodeExecutor
+from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+
+from ..hardware.rig import raised_arm
+from ..hardware.simulated_rig import NoWatchdog, SimulatedRig
+from ..support.keys import broken
+from ..support.node_thread import NodeThread
+from ..support.waiting import wait_until
+
+real_time = pytest.mark.real_time
+NAMES = ("a", "b", "c", "elbow")
+MOTORS_OF_ARM = tuple(JointMotor(MOTORS["AK60-6"], can_id) for can_id in (1, 2, 3, 4))
+
+
+def carrying(effort, cycles=0, temperature=40):
+    """Return what a bridge reports on: an arm that is carried at rest, the elbow with `effort` Nm."""
+    safety = SafetyMachine(Limits(NAMES), 0.004)
+    safety.state = State.ACTIVE
+    samples = [JointSample(0.5, 2.0, torque, 40, 0, 0.0) for torque in (0.0, 0.0, 0.0, effort)]
+    boards = Boards(MOTORS_OF_ARM)
+    for joint, sample in enumerate(samples):
+        boards.take(joint, sample if joint else sample._replace(temperature=temperature))
+    counts = dict.fromkeys(("late", "incomplete", "cycle_errors"), 0)
+    bus = SimpleNamespace(ignored={}, boards=boards)
+    return SimpleNamespace(safety=safety, samples=samples, bus=bus, failure=None, cycles=cycles, **counts)
+
+
+@pytest.fixture
+def sent(node, monkeypatch):
+    """A function that lets a bridge report on `loop(n)`, `count` times, 0.1 s apart; it returns the reports.
+
+    answered: when the answered joint states were measured, s; None for always now.
+    """
+    reports, clock = [], SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(Diagnostics, "report", lambda _, *report: reports.append(report))
+    monkeypatch.setattr(operation, "time", SimpleNamespace(monotonic=lambda: clock.now))
+
+    def sent(loop, count, answered=None):
+        arm = ArmOnBus(("virtual", "arm", {}), MOTORS_OF_ARM, Limits(NAMES), 0.004)
+        report = BridgeReport(node, arm, {"can0": Traffic(4)}, Lease(), SimpleNamespace(last=("none", "none")))
+        for n in range(count):
+            report.send(loop(n), NO_EFFORTS._replace(answered=clock.now if answered is None else answered), NO_REASON)
+            clock.now += 0.1
+        return reports
+
+    return sent
+
+
+def keys_of(report):
+    """Return what programs read of a report, which must keep to docs/keys.md."""
+    values = {"interface": "1", **{key: str(value) for key, value in report[2].items()}}
+    assert not broken("right/can_bridge", values)
+    return values
+
+
+def test_a_motor_above_its_rated_torque_and_a_slow_loop_are_named_and_every_key_is_documented(sent):
+    reports = sent(lambda n: carrying(6.0, 20 * n), 1200, answered=-math.inf)
+    assert keys_of(reports[20])["warnings"] == "slow_loop"
+    level, message, values = reports[-1]
+    assert level == WARN and "slower than 225 Hz" in message
+    assert "above rated torque for too long: elbow" in message
+    assert values["elbow power (W)"] == "12" and values["elbow torque (Nm)"] == "6"
+    assert 180 < int(values["elbow RMS of rated torque (%)"]) < 200 and values["a RMS of rated torque (%)"] == "0"
+    assert values["rate (Hz)"] == "200.0" and values["age of efforts (ms)"] == "none"
+    values = keys_of(reports[-1])
+    assert values["warnings"] == "above_rated_torque, slow_loop"
+    assert values["joints above rated torque"] == "elbow" and values["fault"] == "none"
+
+
+def test_a_motor_that_did_not_read_room_temperature_when_it_was_switched_on_is_reported(sent):
+    report = sent(lambda n: carrying(1.0, 25 * n), 30)[-1]
+    assert report[:2] == (OK, "active") and report[2]["temperatures when switched on"] == "plausible"
+    level, message, values = sent(lambda n: carrying(1.0, 25 * n, temperature=-15), 30)[-1]
+    assert level == WARN and "motor 1 read -15 degC when it was switched on, the others 40 to 40" in message
+    assert values["temperatures when switched on"] == "implausible"
+
+
+def test_a_ride_through_late_efforts_is_reported_and_counted(sent):
+    def riding(n):
+        loop = carrying(1.0, 25 * n)
+        loop.safety.ride.step(1000.0, 0.004, 0.07, False)
+        return loop
+
+    reports = sent(riding, 30)
+    assert reports[15][:2] == (WARN, "active, riding through: efforts 70 ms old")
+    assert reports[15][2]["rides"] == 1
+    assert reports[-1][:2] == (OK, "active")
+
+
+def test_what_a_start_waits_for_and_why_it_ended_have_words_and_figures(sent):
+    limits, loop = Limits(NAMES), carrying(0.0)
+    hanging = JointSample(0.0, 0.0, 0.0, None, 0, math.inf)
+    loop.samples = [hanging] * 3 + [hanging._replace(position=limits.position_max[3] + math.radians(2.0))]
+    loop.safety = safety = SafetyMachine(limits, 0.004)
+    safety.enable(0.0)
+    safety.step(0.0, loop.samples, NO_EFFORTS)
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["motors"], values["waiting for"]) == ("checking", "off", "joint_limits")
+    assert (values["joints outside limits"], float(values["turn back (deg)"])) == (
+        "elbow",
+        pytest.approx(-2.0, abs=0.11),
+    )
+    assert values["refusal"] == "none" and values["elbow temperature (degC)"] == "unknown"
+    safety.step(100.0, loop.samples, NO_EFFORTS)  # longer than any start waits
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["state"], values["waiting for"], values["refusal"]) == ("disabled", "none", "joint_limits")
+    loop.samples = [hanging] * 4
+    values = keys_of(sent(lambda _: loop, 1)[-1])
+    assert (values["joints outside limits"], values["turn back (deg)"]) == ("none", "none")
+
+
+def test_an_inactive_bridge_has_its_state_and_who_controls_it(sent):
+    values = keys_of(sent(lambda _: None, 1)[-1])
+    assert (values["state"], values["source"], values["control held by"]) == ("inactive", "simulated", "nobody")
+
+
+# Services
+
+
+@pytest.fixture
+def ask(node):
+    """A function that asks for a service of a bridge whose control thread is `loop`; it returns why not, or ''.
+
+    last: the keys `request` and `answer` after it.
+    """
+
+    def ask(service, loop, data=None, zero=0.0, hindrance=""):
+        motors = [JointMotor(MOTORS["AK60-6"], can_id, zero=zero) for can_id in (1, 2, 3, 4)]
+        services = BridgeServices(node, lambda: loop, motors, lambda: hindrance)
+        assert services.last == ("none", "none")
+        response = finish(services.answer(getattr(services, service), SimpleNamespace(data=data), SimpleNamespace()))
+        ask.last = services.last
+        if response.success:
+            assert ("/diagnostics" in response.message) is (loop.safety.state is State.CHECKING)
+            return ""
+        return response.message
+
+    return ask
+
+
+def finish(callback):
+    """Let a service's callback run to its end; return its response."""
+    while True:
+        try:
+            callback.send(None)
+        except StopIteration as end:
+            return end.value
+
+
+def standing():
+    """A control loop whose arm is off and at rest, and which runs a call at once."""
+    loop = SimpleNamespace(safety=SafetyMachine(Limits(NAMES), 0.004))
+    loop.samples = (JointSample(0.0, 0.0, 0.0, 40, 0, math.inf),) * 4
+
+    def call(function):
+        future = Future()
+        future.set_result(function())
+        return future
+
+    loop.call = call
+    loop.safety.step(0.0, loop.samples, NO_EFFORTS)
+    return loop
+
+
+def test_an_operator_enables_disables_and_clears_or_reads_why_not(ask):
+    loop = standing()
+    assert ask("enable", loop, True) == "" and ask.last == ("enable", "done")
+    assert ask("enable", loop, True).startswith("refused") and ask.last == ("enable", "refused")
+    loop.safety.trip(FaultCode.BUS_ERROR, "unplugged", 1.0)
+    assert "unplugged" in ask("enable", loop, True)
+    assert ask("enable", loop, False) == ask("clear_fault", loop) == ""
+    assert ask("clear_fault", loop).startswith("no fault to clear") and ask.last == ("clear_fault", "refused")
+    assert ask("enable", None, True) == "the node is not active" and ask.last == ("enable", "inactive")
+
+
+def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monkeypatch):
+    loop = standing()
+    assert ask("enable", loop, True, hindrance="leaves") == "leaves" and ask.last == ("enable", "leaving")
+    assert ask("enable", loop, False, hindrance="leaves") == "" and ask.last == ("let_down", "done")
+    run, waiting = loop.call, Future()
+    loop.call = lambda function: waiting
+    monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.0)
+    assert "did not respond" in ask("enable", loop, True) and ask.last == ("enable", "no_response")
+    assert not waiting.set_running_or_notify_cancel()  # as the control thread asks: it never enables the arm later
+    broken = Future()
+    broken.set_exception(BusError("unplugged"))
+    loop.call = lambda function: broken
+    assert ask("resume", loop) == "unplugged" and ask.last == ("resume", "bus_error")
+    overtaken = Future()
+    overtaken.cancel()
+    loop.call = lambda function: overtaken
+    assert "asked to be let down" in ask("confirm_pose", loop) and ask.last == ("confirm_pose", "overtaken")
+    loop.call = run
+    monkeypatch.setattr(operation, "age_of_request", lambda node: 1.5)
+    assert "1.5 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
+    assert ask("enable", loop, False) == ""
+
+
+def test_one_request_resumes_or_is_refused_with_the_reason(ask, monkeypatch):
+    loop = standing()
+    assert ask("resume", loop) == f"refused: {loop.safety.why_not_resumed}"
+    loop.safety.enable(0.0)
+    loop.safety.trip(FaultCode.COMMAND_STALE, "late", 1.0)
+    assert ask("resume", loop).startswith("refused: zeros are no longer sure")
+    monkeypatch.setattr(SafetyMachine, "why_not_resumed", "")  # as tested with the machine
+    assert ask("resume", loop) == ""
+    assert (loop.safety.state, loop.safety.fault) == (State.CHECKING, None)
+
+
+def test_set_zero_is_refused_with_the_zeros_to_write_in_the_file(ask):
+    loop = standing()
+    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(position=-0.25))
+    assert "write zero: [0.1000, 0.1000, 0.1000, -0.1500] for can_bridge" in ask("set_zero", loop, zero=0.1)
+    loop.samples = (*loop.samples[:3], loop.samples[3]._replace(position=math.nan))
+    assert ask("set_zero", loop).endswith("write zero: in the file, once all reply")
+
+
+def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
+    operation.refuse_simulated_time(node, "udp_multicast")
+    assert node.set_parameters([Parameter("use_sim_time", value=True)])[0].successful
+    with pytest.raises(ParameterError, match="use_sim_time = True: must be false with a real bus"):
+        operation.refuse_simulated_time(node, "socketcan")
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    operation.refuse_simulated_time(node, "slcan")
+    result = node.set_parameters([Parameter("use_sim_time", value=True)])[0]
+    assert not result.successful and "read-only parameter: use_sim_time" in result.reason
+
+
+@pytest.mark.parametrize("held", ["", "trunk tilt older than 80 ms: held on"])
+def test_under_a_clock_that_stands_still_efforts_grow_old_and_those_of_a_late_tilt_are_known(node, held):
+    node.set_parameters([Parameter("use_sim_time", value=True)])  # and no /clock: every stamp is 0
+    exchange = EffortExchange(node, Limits(NAMES), lambda: SimpleNamespace())
+    compensator, effort = JointStateInterface(node, NAMES), (0.0, 1.0, 2.0, 3.0)
+    for now in (100.0, 100.004, 100.3):
+        exchange.take(now, [JointSample(0.0, 0.0, 0.0, 40, 0, now)] * 4)
+    answer = Compensation(effort, NO_REASON, (), "", (), False, held)
+
+    def send() -> None:
+        compensator.send(0.0, JointState(), answer)
+        exchange.efforts(time.monotonic() + 0.05)
+
+    wait_until(lambda: exchange.newest.effort is not None, send, seen=lambda: exchange.refusal)
+    found = exchange.newest
+    assert (tuple(found.effort), found.answered, found.damped, found.held) == (effort, 100.0, False, bool(held))
+
+
+# Who operates an arm
+
+
+@pytest.fixture
+def operated(node):
+    """An arm that is carried in virtual time, who operates it, and a function that lets the bridge watch for a time."""
+    arm = raised_arm()
+    operator = Operator(node, lambda: arm.loop, arm.clock)
+
+    def run(seconds, holding=""):
+        for _ in range(round(seconds / WATCH_PERIOD)):
+            if holding:
+                operator.lease.request(arm.clock.monotonic(), holding, "hold")
+            arm.run(WATCH_PERIOD)
+            operator.watch()
+
+    return SimpleNamespace(arm=arm, operator=operator, run=run, safety=arm.safety)
+
+
+def test_an_arm_is_let_down_gently_when_its_operator_is_gone_but_not_after_a_release(operated):
+    operated.run(2.0)
+    operated.run(5.0, holding="anna")
+    assert operated.operator.lease.holder == "anna"
+    operated.operator.lease.request(operated.arm.clock.monotonic(), "anna", "release")
+    operated.run(5.0)
+    assert operated.safety.state is State.ACTIVE and not operated.safety.fault
+    operated.run(1.0, holding="anna")
+    operated.run(LEASE_TIME - 0.2)
+    assert operated.safety.state is State.ACTIVE
+    operated.run(0.5)
+    assert operated.safety.state is State.LETTING_DOWN
+    assert operated.safety.fault.code is FaultCode.CONTROL_LOST
+    operated.arm.assert_let_down()
+
+
+def test_an_operator_who_leaves_during_the_descent_leaves_no_fault(operated):
+    operated.run(1.0, holding="anna")
+    operated.safety.disable(operated.arm.clock.monotonic())
+    operated.run(3.0)
+    operated.arm.assert_let_down()
+    assert operated.safety.state is State.DISABLED and not operated.safety.fault
+
+
+def test_requests_for_control_arrive_by_topic(operated, node):
+    publisher = node.create_publisher(KeyValue, "listener/control", 10)
+    for kind, holder in (("hold", "anna"), ("release", "")):
+
+        def ask(kind: str = kind) -> None:
+            publisher.publish(KeyValue(key="anna", value=kind))
+            operated.operator.watch()
+
+        wait_until(lambda holder=holder: operated.operator.lease.holder == holder, ask)
+
+
+# The lifecycle, with a simulated arm in real time
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
+    monkeypatch.setattr(owned_bus, "ATTEMPT_TIME", 0.1)
+    monkeypatch.setattr(descent, "DESCENT", replace(descent.DESCENT, rest_time=0.2))
+    monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
+    rig = SimulatedRig(friction=0.5, pose=NO_TORQUE)  # more friction than the pushes of the switch-on check
+    yield rig
+    rig.close()
+
+
+@pytest.fixture
+def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., CanBridge]]:
+    """A function that makes a bridge of the simulated arm, which needs no efforts from outside."""
+    bridges: list[CanBridge] = []
+    command = Efforts(NO_TORQUE, 0.0, False, False)
+    monkeypatch.setattr(EffortExchange, "efforts", lambda self, latest: command._replace(answered=time.monotonic()))
+
+    def make_bridge(autostart: bool = False, start_pose: str = "hanging") -> CanBridge:
+        parameters = {
+            "autostart": autostart,
+            "can.interface": rig.arm.address[0],
+            "can.channel": rig.arm.address[1],
+            "sign_check_torque": 0.0,
+            "start_pose": start_pose,
+            "rate": 100.0,  # the tests share a busy machine
+            "command_timeout": 0.1,
+        }
+        given = [f"{name}:={str(value).lower()}" for name, value in parameters.items()]
+        rclpy.init(args=["--ros-args", *(word for text in given for word in ("-p", text))])
+        bridges.append(CanBridge())
+        return bridges[-1]
+
+    yield make_bridge
+    for bridge in bridges:
+        bridge.close()
+        bridge.destroy_node()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture
+def user() -> Iterator[Node]:
+    """The node of a user, whom a thread spins."""
+    thread = NodeThread("user")
+    thread.start()
+    yield thread.nodes[0]
+    thread.close()
+
+
+def asked(user: Node, kind: Any, name: str, **fields: Any) -> Any:
+    """Ask for a service of the bridge; return the future of its response."""
+    client = user.create_client(kind, f"/can_bridge/{name}")
+    wait_until(client.service_is_ready)
+    return client.call_async(kind.Request(**fields))
+
+
+def spin_until(bridge: CanBridge, condition: Callable[[], object]) -> None:
+    """Spin the bridge until `condition()` holds: a node that stands still carries no arm."""
+    wait_until(condition, lambda: rclpy.spin_once(bridge, timeout_sec=0.01))
+
+
+def assert_bus_is_free(rig: SimulatedRig) -> None:
+    BusLock(rig.arm.address, "a test").release()
+
+
+def assert_nothing_runs(bridge: CanBridge, rig: SimulatedRig) -> None:
+    assert bridge.loop is None
+    assert "control" not in [thread.name for thread in threading.enumerate()]
+    assert rig.motors_on == [False] * 4
+
+
+def carry(bridge: CanBridge, rig: SimulatedRig) -> None:
+    """Configure and activate, until the arm is carried; a fault, as a busy machine causes, is cleared."""
+    assert bridge.trigger_configure() is bridge.trigger_activate() is SUCCESS
+    safety = bridge.loop.safety
+    spin_until(bridge, lambda: safety.state in (State.ACTIVE, State.FAULT))
+    while safety.state is State.FAULT:
+        bridge.loop.call(lambda: safety.clear(time.monotonic()) and safety.enable(time.monotonic())).result(5.0)
+        spin_until(bridge, lambda: safety.state in (State.ACTIVE, State.FAULT))
+    assert rig.motors_on == [True] * 4
+
+
+@real_time
+def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_up(rig, make_bridge, monkeypatch):
+    bridge = make_bridge()
+    carry(bridge, rig)
+    with pytest.raises(BusError, match="is held by /can_bridge"):
+        BusLock(rig.arm.address, "another")
+    rig.device.bus_silent = True
+    with monkeypatch.context() as patch:
+        patch.setattr(can_bridge, "TRANSITION_TIMEOUT", 1.0)
+        assert bridge.trigger_deactivate() is FAILURE
+    rig.device.bus_silent = False
+    assert bridge.trigger_deactivate() is SUCCESS  # so the node had stayed active
+    assert_nothing_runs(bridge, rig)
+    assert bridge.trigger_activate() is SUCCESS
+    wait_until(lambda: bridge.loop.safety.state is not State.DISABLED)
+    assert bridge.trigger_deactivate() is SUCCESS
+    assert bridge.trigger_cleanup() is SUCCESS
+    assert_nothing_runs(bridge, rig)
+    assert_bus_is_free(rig)
+
+
+@real_time
+def test_no_motor_is_switched_on_before_the_operator_has_confirmed_the_pose_through_the_service(rig, make_bridge, user):
+    bridge = make_bridge(start_pose="confirm")
+    assert bridge.trigger_configure() is bridge.trigger_activate() is SUCCESS
+    safety = bridge.loop.safety
+    spin_until(bridge, lambda: safety.pose.asked)
+    assert rig.motors_on == [False] * 4
+    confirmed = asked(user, Trigger, "confirm_pose")
+    spin_until(bridge, confirmed.done)
+    response = confirmed.result()
+    assert response.success and "right_elbow_flexion 0" in response.message, response.message
+    spin_until(bridge, lambda: safety.state is not State.CHECKING)
+    confirmed = asked(user, Trigger, "confirm_pose")
+    spin_until(bridge, confirmed.done)
+    assert not confirmed.result().success and "nothing to confirm: the arm is" in confirmed.result().message
+
+
+@real_time
+def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_bridge, user, monkeypatch):
+    bridge = make_bridge()
+    carry(bridge, rig)
+    usual, leave = descent.DESCENT, Transition(id=Transition.TRANSITION_DEACTIVATE)
+    # However late this thread runs, the arm is not down before the requests are answered.
+    monkeypatch.setattr(descent, "DESCENT", replace(usual, rest_time=1e3, longest_rest=1e3))
+    executor = NodeExecutor()
+    executor.add_node(bridge)
+
+    def spin_until(condition: Callable[[], object]) -> None:
+        wait_until(condition, lambda: executor.spin_once(0.01))
+
+    left = asked(user, ChangeState, "change_state", transition=leave)
+    spin_until(lambda: bridge.loop.safety.state is State.LETTING_DOWN)
+    enabled = asked(user, SetBool, "enable", data=True)
+    again = asked(user, ChangeState, "change_state", transition=leave)
+    spin_until(lambda: enabled.done() and again.done())
+    assert not left.done()
+    assert enabled.result().message == can_bridge.LEAVING and not again.result().success
+    monkeypatch.setattr(descent, "DESCENT", usual)
+    spin_until(left.done)
+    assert left.result().success
+    assert_nothing_runs(bridge, rig)
+    executor.shutdown()
+
+
+@real_time
+def test_no_motor_is_switched_on_before_the_watchdog_watches_nor_stays_on_without_it(rig, make_bridge, monkeypatch):
+    monkeypatch.setattr(NoWatchdog, "is_starting", True)
+    bridge = make_bridge()
+    assert bridge.trigger_configure() is bridge.trigger_activate() is SUCCESS
+    safety = bridge.loop.safety
+    wait_until(lambda: safety.waiting_for == "the watchdog to start")
+    monkeypatch.setattr(NoWatchdog, "alive", False)  # it never started
+    spin_until(bridge, lambda: safety.fault)
+    assert (safety.state, safety.fault.code) == (State.FAULT, "watchdog_dead")
+    assert rig.motors_on == [False] * 4
+
+
+@real_time
+def test_a_shutdown_lets_the_arm_down_reports_it_and_releases_the_bus(rig, make_bridge, monkeypatch):
+    reported: list[str] = []
+    monkeypatch.setattr(BridgeReport, "send", lambda self, loop, *_: reported.append(loop.safety.state.value))
+    bridge = make_bridge()
+    carry(bridge, rig)
+    assert bridge.trigger_shutdown() is SUCCESS
+    assert "letting down" in reported
+    assert reported[-1] in ("disabled", "fault")  # the latter on a machine that was too busy meanwhile
+    assert_nothing_runs(bridge, rig)
+    assert_bus_is_free(rig)
+
+
+@real_time
+def test_a_bus_that_is_held_or_cannot_be_opened_fails_the_configuration_and_the_next_one_works(
+    rig, make_bridge, monkeypatch
+):
+    lock = BusLock(rig.arm.address, "another (PID 1)")
+    bridge = make_bridge()
+    assert bridge.trigger_configure() is FAILURE
+    lock.release()
+    with monkeypatch.context() as patch:
+        patch.setattr(can_bridge.OwnedBus, "open", raises(BusError("CAN bus can0 cannot be opened")))
+        assert bridge.trigger_configure() is FAILURE
+    assert_bus_is_free(rig)
+    assert bridge.trigger_configure() is SUCCESS
+
+
+@real_time
+def test_autostart_without_a_bus_ends_the_node_with_the_reason(rig, make_bridge):
+    lock = BusLock(rig.arm.address, "another (PID 1)")
+    with pytest.raises(BusError, match=r"is held by another \(PID 1\)"):
+        make_bridge(autostart=True)
+    lock.release()
+
+
+@real_time
+def test_a_failed_activation_leaves_nothing_running_and_a_dead_control_thread_is_a_failure_of_the_node(
+    rig, make_bridge, monkeypatch
+):
+    bridge = make_bridge()
+    assert bridge.trigger_configure() is SUCCESS
+    with monkeypatch.context() as patch:
+        patch.setattr(can_bridge, "request_real_time", raises(OSError("no such thread")))
+        assert bridge.trigger_activate() is FAILURE
+    assert_nothing_runs(bridge, rig)
+    assert bridge.trigger_activate() is SUCCESS
+    assert bridge.failure is None
+    bridge.loop.safety.step = raises(RuntimeError("broken"))
+    wait_until(lambda: bridge.failure)
+    assert str(bridge.failure) == "broken"
+
+
+def raises(error: Exception) -> Callable[..., None]:
+    """Return a function that raises `error`."""
+
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail

@@ -1,0 +1,622 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""What every node shares, over real DDS in this process: subscriptions outside the executor, the parameters of other
+nodes, standard services and requests that wait, the clock, signals, discovery, and numbers on /diagnostics.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import LoggerLevel, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    ListParameters,
+    SetLoggerLevels,
+    SetParameters,
+    SetParametersAtomically,
+)
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import SetBool, Trigger
+from type_description_interfaces.srv import GetTypeDescription
+
+from exo_gravity.core.params import Param
+from exo_gravity.hardware import network
+from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
+from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.nodes.can_bridge import operation
+from exo_gravity.nodes.can_bridge.operation import BridgeServices
+from exo_gravity.nodes.ros import inner
+from exo_gravity.nodes.ros import parameters as parameters_module
+from exo_gravity.nodes.ros import run as running
+from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, prepare_transitions
+from exo_gravity.nodes.ros.messages import milliseconds, row
+from exo_gravity.nodes.ros.parameters import RESPONSE_TIMEOUT, NodeParameters, accept_changes
+from exo_gravity.nodes.ros.run import WAITS_FOR_BRIDGES, handle_signals
+from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, NEWEST_ONLY, PolledSubscription, Publishers
+
+from ..support import CONFIG
+from ..support.node_thread import own_node
+from ..support.waiting import pause, wait_until
+from .test_can_bridge import standing
+
+keep_to_this_machine()
+NUMBERS = itertools.count(1)
+QUEUE = QoSProfile(depth=8)
+
+# Subscriptions outside the executor
+
+
+class Pair:
+    """A publisher and a polled subscription on a topic of their own.
+
+    received: (text, sequence number, thread) of each message. error: raised by the callback if set.
+    """
+
+    def __init__(self, node: Node, qos: QoSProfile = QUEUE, **options: float) -> None:
+        self.topic = f"topic_{next(NUMBERS)}"
+        self.received: list[tuple[str, int, str]] = []
+        self.arrivals: list[int] = []  # ns since 1970
+        self.error: Exception | None = None
+        self.on_message: Callable[[], object] = lambda: None
+        self.subscription = PolledSubscription(node, String, self.topic, self._on_message, qos, **options)
+        self.publisher = node.create_publisher(String, self.topic, 8)
+        self.wait_until(lambda: self.publisher.get_subscription_count() == 1)
+
+    def _on_message(self, message: String, info: dict[str, Any]) -> None:
+        self.arrivals.append(info["received_timestamp"])
+        text = message if isinstance(message, bytes) else message.data
+        self.received.append((text, info["publication_sequence_number"], threading.current_thread().name))
+        self.on_message()
+        if self.error:
+            raise self.error
+
+    def send(self, *texts: str) -> None:
+        for text in texts:
+            self.publisher.publish(String(data=text))
+
+    def wait_until(self, condition: Callable[[], Any], meanwhile: Callable[[], object] = pause) -> None:
+        wait_until(condition, meanwhile, seen=lambda: self.received)
+
+    def texts(self) -> list[str]:
+        return [text for text, _, _ in self.received]
+
+
+@pytest.fixture
+def pair(executor) -> Iterator[Pair]:
+    """A publisher and a polled subscription."""
+    pair = Pair(executor.get_nodes()[0])
+    yield pair
+    pair.subscription.stop()
+
+
+@pytest.mark.parametrize("has_thread", [True, False])
+def test_messages_are_passed_on_in_order_with_their_numbers_by_a_thread_or_a_poll(pair, has_thread):
+    pair.send("a", "b", "c")
+    if has_thread:
+        pair.subscription.start()
+    pair.wait_until(lambda: len(pair.received) == 3, pause if has_thread else pair.subscription.poll)
+    thread = pair.topic if has_thread else threading.current_thread().name
+    assert pair.received == [("a", 1, thread), ("b", 2, thread), ("c", 3, thread)]
+
+
+def test_a_poll_waits_for_a_message_until_its_timeout(pair):
+    pair.subscription.poll(0.01)
+    assert pair.received == []
+    sender = threading.Timer(0.05, pair.send, "a")
+    sender.start()
+    pair.subscription.poll(20.0)
+    assert pair.texts() == ["a"]
+    sender.join()
+
+
+def test_a_poll_ends_although_messages_arrive_faster_than_it_takes_them(pair):
+    pair.on_message = lambda: [pair.send("more"), time.sleep(0.01)]
+    pair.send("a")
+    pair.wait_until(lambda: pair.received, pair.subscription.poll)
+    assert pair.texts()[0] == "a" and len(pair.texts()) <= QUEUE.depth
+
+
+def test_of_a_flood_the_thread_takes_the_newest_message_once_in_each_pause(executor):
+    pair = Pair(executor.get_nodes()[0], NEWEST_ONLY, pause=1.5)  # longer than this process may not be run
+    pair.subscription.start()
+    pair.send("a")
+    pair.wait_until(lambda: pair.received)
+    pair.send(*(str(number) for number in range(200)))
+    pair.wait_until(lambda: len(pair.received) == 2)
+    assert pair.texts() == ["a", "199"]
+    pair.subscription.stop()
+
+
+def test_the_executor_does_not_take_the_messages_and_after_stop_the_callback_is_not_called(pair, executor):
+    def spin() -> None:
+        for _ in range(20):
+            executor.spin_once(timeout_sec=0.01)
+
+    pair.send("a")
+    spin()
+    assert pair.received == []
+    pair.wait_until(lambda: pair.received, pair.subscription.poll)
+    pair.subscription.start()
+    pair.subscription.stop()
+    pair.send("b")
+    spin()
+    assert pair.texts() == ["a"]
+
+
+def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(pair):
+    pair.error = ValueError("not like that")
+    pair.subscription.start()
+    pair.send("a", "b")
+    pair.wait_until(lambda: pair.subscription.failure)
+    assert pair.subscription.failure is pair.error
+    assert pair.texts() == ["a"]
+
+
+def test_raw_messages_are_passed_on_in_bytes_with_their_time_of_arrival(executor):
+    pair = Pair(executor.get_nodes()[0], raw=True)
+    pair.send("a", "b")
+    pair.wait_until(lambda: len(pair.received) == 2, pair.subscription.poll)
+    assert [deserialize_message(data, String).data for data in pair.texts()] == ["a", "b"]
+    assert 0 < pair.arrivals[0] <= pair.arrivals[1]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "others", "missed"),
+    [
+        ([1, 2, 3, 4], [], 0),
+        ([7, 8, 11], [], 2),
+        ([500, 501, 1, 2, 3], [2], 0),
+        ([500, 1, 501, 2, 502, 4], [1, 3, 5], 1),
+        ([7, 8, 1, 9, 2], [2, 4], 0),
+    ],
+    ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"],
+)
+def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of_their_messages(
+    numbers, others, missed
+):
+    publishers = Publishers()
+    changes = [publishers.note({"publication_sequence_number": number}) for number in numbers]
+    assert [n for n, has_changed in enumerate(changes) if has_changed] == others
+    assert publishers.missed == missed
+
+
+def test_a_middleware_that_does_not_number_messages_is_refused_with_one_that_does():
+    with pytest.raises(RuntimeError, match="rmw_fastrtps_cpp"):
+        Publishers().note({"publication_sequence_number": None})
+
+
+def test_messages_pass_through_the_executor_where_rclpy_has_no_wait_set_for_one_topic(served):
+    topic, received = f"inbox_{next(NUMBERS)}", []
+    subscription = PolledSubscription(
+        served.node,
+        String,
+        topic,
+        lambda message, info: received.append((message.data, info["publication_sequence_number"])),
+        QUEUE,
+        open_inbox=ExecutorInbox,
+    )
+    publisher = served.client.create_publisher(String, topic, 8)
+    wait_until(lambda: publisher.get_subscription_count() == 1)
+    for text in ("a", "b"):
+        publisher.publish(String(data=text))
+
+    def poll():
+        served.spin()
+        subscription.poll(0.01)
+
+    wait_until(lambda: len(received) == 2, poll)
+    assert received == [("a", 1), ("b", 2)]
+
+
+# The parameters of another node, as it comes and goes
+
+
+def other_node(node: Node, value: float = 1.0) -> Node:
+    other = rclpy.create_node("other", namespace="/right", context=node.context)
+    other.declare_parameter("gain", value)
+    return other
+
+
+def test_a_node_that_has_gone_and_returned_is_read_anew(executor):
+    (node,) = executor.get_nodes()
+    seen: list[float] = []
+    parameters = NodeParameters(node, "/right/other", lambda _name, values: seen.append(values["gain"]))
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.05)
+        parameters.update()
+
+    for value in (1.0, 2.0):
+        other = other_node(node, value)
+        executor.add_node(other)
+        wait_until(lambda value=value: parameters.is_present and parameters.values.get("gain") == value, spin)
+        executor.remove_node(other)
+        other.destroy_node()
+        wait_until(lambda: not parameters.is_present, spin)
+    assert seen == [1.0, 2.0]
+
+
+def test_a_name_without_services_is_not_present(node):
+    ghost = rclpy.create_node("ghost", context=node.context, start_parameter_services=False)
+    parameters = NodeParameters(node, "/ghost")
+    parameters.update()
+    assert not parameters.is_present
+    ghost.destroy_node()
+
+
+def test_what_is_read_once_ignores_the_answers_after_the_first(executor, monkeypatch):
+    (node,) = executor.get_nodes()
+    other = other_node(node)
+    clock = itertools.count(0.0, RESPONSE_TIMEOUT).__next__  # every update asks again
+    monkeypatch.setattr(parameters_module, "time", SimpleNamespace(monotonic=clock))
+    answers: list[object] = []
+
+    parameters = NodeParameters(node, "/right/other", lambda _name, values: answers.append(values), once=True)
+    wait_until(lambda: parameters.is_present, parameters.update)
+    for _ in range(5):
+        parameters.update()
+    executor.add_node(other)  # which answers all requests now
+    wait_until(lambda: answers, lambda: executor.spin_once(timeout_sec=0.05))
+    for _ in range(50):
+        executor.spin_once(timeout_sec=0.01)
+    assert len(answers) == 1
+    executor.remove_node(other)
+    other.destroy_node()
+
+
+# Standard services, and requests that wait
+
+UNKNOWN_TYPE = ParameterMessage(name="some", value=ParameterValue(type=99))
+TEXTS = ["", "msispelt", "support", "can.channel", "use_sim_time", "a b", "/x", "." * 300, "é"]
+VALUES = [math.nan, math.inf, -1e308]
+ODD = [
+    ParameterMessage(name=name, value=ParameterValue(type=kind, double_value=math.nan, double_array_value=VALUES))
+    for name, kind in zip(TEXTS * 2, (*range(10), 99, 255), strict=False)
+]
+WRONG_REQUESTS = (
+    (GetParameters, "get_parameters", GetParameters.Request(names=TEXTS)),
+    (ListParameters, "list_parameters", ListParameters.Request(prefixes=TEXTS, depth=2**64 - 1)),
+    (SetParametersAtomically, "set_parameters_atomically", SetParametersAtomically.Request(parameters=ODD)),
+    (GetTypeDescription, "get_type_description", GetTypeDescription.Request(type_name="/x", type_hash="é")),
+    (GetParameterTypes, "get_parameter_types", GetParameterTypes.Request(names=["msispelt"])),
+    (DescribeParameters, "describe_parameters", DescribeParameters.Request(names=["msispelt"])),
+    (GetParameters, "get_parameters", GetParameters.Request(names=["msispelt", ""])),
+    (SetParameters, "set_parameters", SetParameters.Request(parameters=[UNKNOWN_TYPE] * 2)),
+    (SetParametersAtomically, "set_parameters_atomically", SetParametersAtomically.Request(parameters=[UNKNOWN_TYPE])),
+    (SetLoggerLevels, "set_logger_levels", SetLoggerLevels.Request(levels=[LoggerLevel(name="a", level=77)])),
+    (ChangeState, "change_state", ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))),
+    (ChangeState, "change_state", ChangeState.Request(transition=Transition(id=200))),
+    (ChangeState, "change_state", ChangeState.Request(transition=Transition(label="fly"))),
+)
+
+
+class Served:
+    """A lifecycle node with an executor, and a client node with another; nothing spins by itself."""
+
+    def __init__(self, client: Node, own: SingleThreadedExecutor, executor: type[SingleThreadedExecutor]) -> None:
+        self.client, self._own = client, own
+        self.node = LifecycleNode("served", namespace="/right", context=client.context, enable_logger_service=True)
+        self.executor = executor(context=client.context)
+        self.executor.add_node(self.node)
+
+    def send(self, kind, name, request):
+        """Send a request to a service of the node; return the future of its response."""
+        client = self.client.create_client(kind, f"served/{name}")
+        wait_until(client.service_is_ready)
+        return client.call_async(request)
+
+    def spin(self):
+        """Let node and client each handle what has arrived."""
+        self.executor.spin_once(0.01)
+        self._own.spin_once(0.01)
+
+    def answer(self, future):
+        """Return the response of a request."""
+        wait_until(future.done, self.spin)
+        return future.result()
+
+
+@pytest.fixture
+def served(request):
+    """A node that nothing spins; `indirect` for an executor of another kind."""
+    with own_node("asking") as own:
+        served = Served(*own, getattr(request, "param", NodeExecutor))
+        yield served
+        served.executor.shutdown()
+        served.node.destroy_node()
+
+
+def test_wrong_requests_to_the_standard_services_are_answered_and_end_no_node(served):
+    prepare_transitions(served.node, nothing_first)
+    for kind, name, wrong in WRONG_REQUESTS * 2:
+        response = served.answer(served.send(kind, name, wrong))
+        results = list(getattr(response, "results", [getattr(response, "result", response)]))
+        if kind is SetParameters:
+            assert len(results) == 2 and all("99" in result.reason for result in results)
+        assert not any(getattr(result, "successful", getattr(result, "success", False)) for result in results)
+    state = served.answer(served.send(GetState, "get_state", GetState.Request())).current_state
+    assert state.label == "unconfigured"
+
+
+async def nothing_first(_request):
+    return ""
+
+
+def test_an_exception_of_this_package_in_a_standard_service_still_ends_the_node(served):
+    def fail(_read: object, _names: set[str]) -> None:
+        raise KeyError("broken")
+
+    served.node.declare_parameter("some", 1)
+    accept_changes(served.node, (Param("some", 1, "a number"),), lambda values: values, fail)
+    some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=3))
+    served.send(SetParameters, "set_parameters", SetParameters.Request(parameters=[some]))
+    with pytest.raises(KeyError, match="broken"):
+        wait_until(lambda: False, served.spin)
+
+
+def test_a_value_that_the_check_cannot_use_is_refused_and_leaves_the_node_and_its_value_as_they_were(served):
+    def read(values: dict[str, int]) -> dict[str, int]:
+        if values["some"] > 2:
+            raise OverflowError("too large for a float")
+        return values
+
+    applied: list[object] = []
+    served.node.declare_parameter("some", 1)
+    accept_changes(served.node, (Param("some", 1, "a number"),), read, lambda values, _names: applied.append(values))
+    results = []
+    for value in (3, 2):
+        some = ParameterMessage(name="some", value=ParameterValue(type=2, integer_value=value))
+        answer = served.answer(served.send(SetParameters, "set_parameters", SetParameters.Request(parameters=[some])))
+        results += answer.results
+    refused, done = results
+    assert not refused.successful and refused.reason == "some: cannot be used: OverflowError: too large for a float"
+    assert done.successful and applied == [{"some": 2}]
+
+
+@pytest.mark.parametrize("data", [True, False])
+def test_an_enable_that_has_waited_is_refused_and_a_let_down_is_not(served, monkeypatch, data):
+    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.2)
+    loop = standing()
+    loop.safety.enable(1.0)
+    if data:
+        loop.safety.disable(1.0)
+    BridgeServices(served.node, lambda: loop, (), lambda: "")
+    future = served.send(SetBool, "enable", SetBool.Request(data=data))
+    time.sleep(0.3)
+    response = served.answer(future)
+    assert response.success is not data and loop.safety.state == "disabled"
+    assert ("s old" in response.message) is data
+
+
+def test_a_let_down_is_not_pushed_out_by_a_hundred_other_requests(served, monkeypatch):
+    monkeypatch.setattr(operation, "REQUEST_LIFE", 0.0)  # those are refused
+    loop = standing()
+    loop.safety.enable(1.0)
+    services = BridgeServices(served.node, lambda: loop, (), lambda: "")
+    answered: list[tuple[str, str]] = []
+    other = served.client.create_client(SetBool, "served/enable", qos_profile=MANY_REQUESTS)
+    wait_until(other.service_is_ready)
+    let_down = served.send(SetBool, "enable", SetBool.Request(data=False))
+    others = [other.call_async(SetBool.Request(data=True)) for _ in range(100)]
+    time.sleep(0.1)
+    wait_until(others[-1].done, lambda: served.spin() or answered.append(services.last))
+    assert loop.safety.state == "disabled" and ("let_down", "done") in answered
+    assert let_down.done() and let_down.result().success
+
+
+def test_a_let_down_does_not_wait_behind_enables_which_then_never_run(served):
+    """The control thread stands still, and goes on once both have asked."""
+    loop, calls = standing(), []
+    run = loop.call
+
+    def call(function):
+        future = run(lambda: "")
+        waiting = type(future)()
+        calls.append((function, waiting))
+        return waiting
+
+    loop.call = call
+    BridgeServices(served.node, lambda: loop, (), lambda: "")
+    enable = served.send(SetBool, "enable", SetBool.Request(data=True))
+    wait_until(lambda: len(calls) == 1, served.spin)
+    disable = served.send(SetBool, "enable", SetBool.Request(data=False))
+    wait_until(lambda: len(calls) == 2, served.spin)
+    for function, future in calls:
+        if future.set_running_or_notify_cancel():
+            future.set_result(function())
+    assert served.answer(disable).success
+    refused = served.answer(enable)
+    assert not refused.success and "let down" in refused.message
+    assert loop.safety.state == "disabled"
+
+
+@pytest.mark.parametrize("served", [NodeExecutor, SingleThreadedExecutor], indirect=True)
+def test_a_service_that_awaits_answers_under_any_executor_and_keeps_ours_free(served):
+    done, looked = [], []
+
+    async def wait(_request, response):
+        await Until(lambda: done, 60.0)
+        response.success = bool(done)
+        return response
+
+    served.node.create_service(Trigger, "~/wait", wait)
+    served.node.create_service(Trigger, "~/look", lambda _, response: looked.append(1) or response)
+    waiting = served.send(Trigger, "wait", Trigger.Request())
+    if type(served.executor) is NodeExecutor:
+        for _ in range(10):
+            served.spin()
+        served.answer(served.send(Trigger, "look", Trigger.Request()))
+        assert looked and not waiting.done()
+    done.append(1)
+    assert served.answer(waiting).success
+
+
+def test_an_executor_that_stood_still_knows_it_without_stamps_of_the_middleware(served, monkeypatch):
+    monkeypatch.setattr(inner, "STOOD_STILL", 0.2)
+    served.executor.spin_once(0.0)
+    time.sleep(0.3)
+    assert served.executor._age(SimpleNamespace()) >= 0.3
+
+
+# Discovery, signals and the clock
+
+RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
+PEERS, PROFILES = "ROS_STATIC_PEERS", "FASTRTPS_DEFAULT_PROFILES_FILE"
+VARIABLES = (RANGE, ROS_RANGE, PEERS, PROFILES, "ROS_LOCALHOST_ONLY", "ROS_DISCOVERY_SERVER")
+LOOPBACK, WITH_PEERS = (str(Path(network.__file__).with_name(name)) for name in ("fastdds.xml", "fastdds_peers.xml"))
+SECURITY = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_STRATEGY": "Enforce"}
+
+
+@pytest.fixture
+def environment(monkeypatch):
+    for name in (*VARIABLES, *SECURITY, WAITS_FOR_BRIDGES):
+        monkeypatch.setenv(name, "")  # so that what the test's subject sets goes after the test
+        monkeypatch.delenv(name)
+    return monkeypatch.setenv
+
+
+@pytest.mark.parametrize(
+    ("settings", "reach", "profile", "named"),
+    [
+        ({}, "LOCALHOST", LOOPBACK, ""),
+        ({ROS_RANGE: "SUBNET"}, "LOCALHOST", LOOPBACK, ""),  # as ROS's setup.bash exports it
+        ({RANGE: "SUBNET"}, "SUBNET", None, "EXO_GRAVITY_DISCOVERY_RANGE=SUBNET"),
+        ({RANGE: "SYSTEM_DEFAULT"}, "SYSTEM_DEFAULT", None, "EXO_GRAVITY_DISCOVERY_RANGE=SYSTEM_DEFAULT"),
+        ({RANGE: "SUBNET", **SECURITY}, "SUBNET", None, ""),
+        ({RANGE: "SUBNET", "ROS_LOCALHOST_ONLY": "1"}, "SUBNET", None, ""),
+        ({RANGE: "OFF", "ROS_DISCOVERY_SERVER": "lab:11811"}, "OFF", None, "ROS_DISCOVERY_SERVER=lab:11811"),
+        ({PEERS: "10.0.0.2"}, "LOCALHOST", WITH_PEERS, "ROS_STATIC_PEERS=10.0.0.2"),
+        # as docs/security.md recommends for other programs
+        ({PEERS: "10.0.0.2", PROFILES: LOOPBACK}, "LOCALHOST", WITH_PEERS, "ROS_STATIC_PEERS=10.0.0.2"),
+        ({PEERS: "10.0.0.2", PROFILES: "own.xml"}, "LOCALHOST", "own.xml", "ROS_STATIC_PEERS=10.0.0.2"),
+    ],
+)
+def test_a_node_communicates_on_this_machine_only_unless_a_person_widens_it_and_that_setting_is_named(
+    environment, settings, reach, profile, named
+):
+    for name, value in settings.items():
+        environment(name, value)
+    keep_to_this_machine()
+    assert (os.environ[ROS_RANGE], os.environ.get(PROFILES), open_to_others()) == (reach, profile, named)
+
+
+@pytest.mark.parametrize(
+    ("has_nohup", "waits", "ends"),
+    [
+        (False, "", ["SIGTERM", "SIGINT", "SIGHUP"]),
+        (True, "", ["SIGTERM", "SIGINT"]),
+        (False, "1", ["SIGTERM"]),  # under `ros2 launch`, which interrupts all nodes at once
+    ],
+)
+def test_which_signals_end_a_node(environment, has_nohup, waits, ends):
+    environment(WAITS_FOR_BRIDGES, waits)
+    sent = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    handlers = [signal.getsignal(number) for number in sent]
+    ending = []
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN if has_nohup else signal.SIG_DFL)
+        handle_signals(ending)
+        for number in sent:
+            signal.raise_signal(number)
+    finally:
+        for number, handler in zip(sent, handlers, strict=True):
+            signal.signal(number, handler)
+    assert ending == [signal.Signals[name] for name in ends]
+
+
+@pytest.fixture
+def waiting():
+    """A node that waits for /clock, and its executor."""
+    keep_to_this_machine()
+    with own_node("waiting", parameter_overrides=[Parameter("use_sim_time", value=True)]) as own:
+        yield own
+
+
+def test_a_node_whose_clock_nobody_publishes_says_so_until_it_is_published(waiting, monkeypatch):
+    (node, executor), now, heard = waiting, [0.0], []
+    monkeypatch.setattr(running, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    node.create_subscription(DiagnosticArray, "/diagnostics", lambda array: heard.extend(array.status), 10)
+    watch = running.ClockWatch(node)
+
+    def spin() -> None:
+        executor.spin_once(timeout_sec=0.05)
+
+    for now[0] in (0.0, 1.9, 2.1):
+        watch.look()
+    wait_until(lambda: heard, spin)
+    assert [(status.name, status.message) for status in heard] == [("right/waiting", running.NO_CLOCK)]
+    publisher = node.create_publisher(Clock, "/clock", 10)
+
+    def publish() -> None:
+        publisher.publish(Clock(clock=Time(sec=5)))
+        spin()
+
+    wait_until(lambda: node.get_clock().now().nanoseconds, publish)
+    watch.look()
+    wait_until(lambda: heard[-1].message == "/clock is published", spin)
+    for now[0] in (10.0, 20.0):  # a clock that its publisher has stopped, as a simulation that waits
+        watch.look()
+    spin()
+    assert len(heard) == 2
+    node.destroy_publisher(publisher)
+    wait_until(lambda: not node.count_publishers("/clock"), spin)
+    for now[0] in (30.0, 32.1):
+        watch.look()
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    watch.look()
+    wait_until(lambda: heard[-1].message.startswith("use_sim_time is false"), spin)
+
+
+# Numbers on /diagnostics, and the aggregator
+
+
+@pytest.mark.parametrize(
+    ("values", "digits", "text"),
+    [
+        ((100.0, -0.0001, 2.0320), 3, "100, 0, 2.032"),
+        ((99.6,), 0, "100"),
+        ((math.nan, -1.25), 1, "nan, -1.2"),
+        ((), 3, ""),
+    ],
+)
+def test_numbers_have_few_digits_and_no_negative_zero(values, digits, text):
+    assert row(values, digits) == text
+
+
+def test_an_age_is_in_milliseconds_or_none():
+    assert [milliseconds(0.0123), milliseconds(math.inf)] == ["12.3", "none"]
+
+
+@pytest.mark.parametrize("file", ["exo.yaml", "sim.yaml", "sim_both.yaml"])
+def test_the_aggregator_shows_each_reporting_node_once(file):
+    analyzers = yaml.safe_load((CONFIG / "diagnostics.yaml").read_text())["analyzers"]["ros__parameters"]
+    prefixes = [entry["startswith"] for entry in analyzers.values() if isinstance(entry, dict)]
+    for node in load(CONFIG / file):
+        if node.split("/")[-1] in ("can_bridge", "compensator", "simulator", "imu"):
+            assert sum(any(node.lstrip("/").startswith(prefix) for prefix in group) for group in prefixes) == 1, node
