@@ -24,10 +24,10 @@ import exo_gravity
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.virtual_arm import VirtualArm, resting
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 

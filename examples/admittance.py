@@ -38,11 +38,11 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import COVER, for_joints
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import carried_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.observer.momentum import MomentumObserver
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import VirtualArm
 

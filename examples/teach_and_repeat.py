@@ -21,8 +21,8 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import VirtualArm
 

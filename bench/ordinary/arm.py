@@ -7,8 +7,6 @@ truth.
 
 from __future__ import annotations
 
-import random
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -19,21 +17,18 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT_V3
-from exo_gravity.core.motors.joint_motor import JointSample
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
-from exo_gravity.hardware.control_loop import Controller
+from exo_gravity.core.safety.drive import State
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import SimulatedDevice, SimulatedImu, VirtualWearer
+from exo_gravity.sim.controllers import DirectController, UnreliableController
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
-from exo_gravity.sim.virtual_time import VirtualClock, Wire
+from exo_gravity.sim.virtual_time import Wire
 
 from ..arms import Friction, PlayedArm, on_boards
 from .drivers import Timing
 from .motors import Electronics, motor_of
 
-LATE = 0.02  # s by which a busy computer is late
 TILT_TIMEOUT = 0.08  # s
 LOOK_PERIOD = 0.01  # s between two comparisons with the truth
 SETTLED = 1.5  # s until a tilt must be there
@@ -63,7 +58,8 @@ class Equipment:
     """Ordinary equipment: the motors' electronics, the arm's friction, the CAN adapter, and a busy computer.
 
     electronics: None for ideal motors. loss: share of the frames lost each way. batch: s between two deliveries of the
-    adapter. late: how often in 10 ms the bridge is late by LATE, and the compensator.
+    adapter. late: how often in 10 ms the bridge is late by
+    20 ms, and the compensator.
     """
 
     name: str
@@ -89,36 +85,6 @@ class Result:
     rides: int = 0  #: through late efforts or a late tilt
 
 
-class LateController:
-    """A controller on a computer that is late now and then, by LATE.
-
-    controller: what answers the samples.
-    clock: of the loop, which is late too.
-    late: share of the cycles in which the loop is late, and of the answers that are.
-    """
-
-    def __init__(self, controller: Controller, clock: VirtualClock, late: float, seed: int) -> None:
-        self._controller, self._clock, self._late = controller, clock, late
-        self._random = random.Random(seed)
-        self._answers: deque[tuple[float, Efforts]] = deque()  # on their way, by the time of their arrival
-        self._newest = NO_EFFORTS
-
-    def efforts(self, latest: float) -> Efforts:
-        """Return the newest efforts that have arrived."""
-        if self._random.random() < self._late:
-            self._clock.stall(LATE)
-        while self._answers and self._answers[0][0] <= self._clock.monotonic():
-            self._newest = self._answers.popleft()[1]
-        return self._newest
-
-    def take(self, now: float, samples: Sequence[JointSample]) -> None:
-        """Answer the samples, perhaps late; answers arrive in order."""
-        self._controller.take(now, samples)
-        due = now + (LATE if self._random.random() < self._late else 0.0)
-        due = max(due, self._answers[-1][0]) if self._answers else due
-        self._answers.append((due, self._controller.efforts(now)))
-
-
 class OrdinaryArm:
     """An arm of `equipment` and its wearer, whose trunk may carry an IMU behind the driver `timing`."""
 
@@ -142,7 +108,7 @@ class OrdinaryArm:
         limits = arm.limits(rate)
         self._compensator = Compensator(settings, limits.joint_names)
         controller = DirectController(self._compensator, limits)
-        late = LateController(controller, wire.clock, equipment.late / (0.01 * rate), seed)
+        late = UnreliableController(controller, wire.clock, equipment.late / (0.01 * rate), seed)
         self._arm = VirtualArm(self.device, late, motors, limits, rate, wire)
         self.clock, self.safety, self.loop = wire.clock, self._arm.safety, self._arm.loop
         self._estimator = TrunkEstimator((0.0, 0.0, 0.0, 1.0))

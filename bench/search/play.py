@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from exo_gravity.core.safety.drive import State
 from exo_gravity.sim.judge import Driven, driven
+from exo_gravity.sim.rig import Change
 
 from .case import CARRIED, Bound, Case, bound_of, draw
-from .events import do
-from .stage import Stage
+from .stage import ACTS, Stage
 
 MOVE, SETTLE = 1.6, 0.8  # s in which the wearer moves the arm to its pose, and then leaves it alone
 START = 30.0  # s within which an arm without a fault is carried
@@ -27,7 +26,7 @@ class Played:
     case: Case
     driven: Driven
     bound: Bound
-    states: tuple[tuple[float, str, str], ...]  #: when the state changed, the state, and the fault's sentence
+    states: tuple[Change, ...]
     begin: float  #: s, from which the times of the events count
     error: str = ""  #: an exception of the code under test
 
@@ -51,34 +50,30 @@ def play_case(case: Case) -> tuple[Played, np.ndarray]:
         begin = _play(stage, case)
     except Exception as caught:
         error = f"{type(caught).__name__}: {caught}"
-    stage.arm.bus.close()
+    stage.bus.close()
     records = stage.truth.records
-    bound = bound_of(case, stage.controller.was_clamped)
+    bound = bound_of(case, stage.direct.was_clamped)
     config = stage.device.arm.config
     stops = config.position_min, config.position_max
     specs = [motor.joint.spec for motor in stage.motors]
     done = driven(records, specs, stops, bound.slow, bound.turning)
-    return Played(case, done, bound, tuple(stage.states), begin, error), records
+    return Played(case, done, bound, tuple(stage.changes), begin, error), records
 
 
 def _play(stage: Stage, case: Case) -> float:
     stage.run(0.2)
     if case.begin == CARRIED:
         stage.between_cycles(stage.safety.enable)
-        stage.run(START, lambda: stage.safety.state is State.ACTIVE)
-        stage.act({"move": list(case.pose), "over": MOVE})
-        stage.run(MOVE + SETTLE)
+        stage.run_until(lambda: stage.state is State.ACTIVE, START)
+        stage.raise_to(case.pose, MOVE, SETTLE)
     begin = stage.now
-    for event in case.events:
-        stage.clock.later(event.time, partial(do, stage, event.name, event.values))
+    stage.schedule(case.events, ACTS)
     if case.begin != CARRIED:
         stage.run(0.05)
         stage.between_cycles(stage.safety.enable)
     stage.run(case.events[-1].time + AFTERWARDS)
-    stage.between_cycles(stage.safety.disable)
-    off = State.DISABLED, State.FAULT
-    stage.run(DESCENT, lambda: stage.safety.state in off and not stage.device.powered)
+    stage.let_down(DESCENT)
     stage.run(1.0)
-    stage.arm.catch_up()
-    stage.arm.check_controller()
+    stage.catch_up()
+    stage.check_controller()
     return begin

@@ -36,9 +36,9 @@ from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
-from exo_gravity.lab.controllers import SampleController
 from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
+from exo_gravity.sim.controllers import SampleController
 
 
 @dataclass(frozen=True)

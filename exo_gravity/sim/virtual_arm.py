@@ -5,6 +5,7 @@ Offline trials, studies and tests use it. The controller is the caller's: a comp
 calibration, or one that is late on purpose. Only what takes time on a real computer takes none here.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,6 +14,7 @@ from typing import NamedTuple
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.limits import HANGING, Limits
@@ -90,17 +92,21 @@ class VirtualArm:
         """Start the checks, after which the arm is carried."""
         self.safety.enable(self.now)
 
+    def cycle(self) -> bool:
+        """Run one cycle of the loop; return False once it has ended."""
+        return self.loop.cycle()
+
     def run(self, duration: float) -> None:
-        """Run the loop for `duration` s."""
+        """Run the loop for `duration` s, or until it has ended."""
         end = self.now + duration
-        while self.now < end:
-            self.loop.cycle()
+        while self.now < end and self.cycle():
+            pass
 
     def run_until(self, condition: Callable[[], object], timeout: float = 60.0) -> bool:
         """Run the loop until `condition()` holds; return whether it did within `timeout` s, before the loop ended."""
         end = self.now + timeout
         while not condition():
-            if self.now >= end or not self.loop.cycle():
+            if self.now >= end or not self.cycle():
                 return False
         return True
 
@@ -126,7 +132,11 @@ class VirtualArm:
     def _read_trunk(self, sensor: TrunkSensor, compensator: Compensator, delay: float) -> None:
         self.catch_up()
         if reading := sensor(self.now, self.device.trunk):
-            self.clock.later(delay, partial(self.tell, compensator, reading, self.now))
+            self.clock.later(delay, partial(self._deliver, compensator, reading, self.now))
+
+    def _deliver(self, compensator: Compensator, reading: TrunkReading, taken: float) -> None:
+        with contextlib.suppress(ParameterError):  # the node refuses it, too
+            self.tell(compensator, reading, taken)
 
     def tell(self, compensator: Compensator, reading: TrunkReading, taken: float) -> None:
         """Deliver a reading of the trunk, which was taken at `taken` s, to compensator and safety machine."""

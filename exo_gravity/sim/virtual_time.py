@@ -206,7 +206,8 @@ class Wire:
     bitrate: bit/s; 0: frames take no time, and none collide.
 
     refusal: what opening it raises, None if it can be opened. opened: how many ends were opened. loss: share of the
-    frames that are lost. batch: s between two deliveries of the CAN adapters, 0 if they deliver at once.
+    frames that are lost. commands_lost, replies_lost: arbitration IDs of frames that are lost on their way from a host,
+    or from a device. batch: s between two deliveries of the CAN adapters, 0 if they deliver at once.
     """
 
     def __init__(
@@ -217,6 +218,8 @@ class Wire:
         self.refusal: Exception | None = None
         self.opened = 0
         self.loss = self.batch = 0.0
+        self.commands_lost: set[int] = set()
+        self.replies_lost: set[int] = set()
         self._random = random.Random(1)
         self.broken: set[VirtualBus] = set()
         self.error: Exception = OSError()
@@ -270,7 +273,8 @@ class Wire:
         controller: what sends it, if `sender` is a device with several.
         retransmits: whether that sends it again after an error.
         """
-        if self.loss and self._random.random() < self.loss:
+        lost = self.commands_lost if isinstance(sender, VirtualBus) else self.replies_lost
+        if message.arbitration_id in lost or (self.loss and self._random.random() < self.loss):
             return
         if self._arbitration:
             self._arbitration.send(controller or sender, sender, message, retransmits)

@@ -11,8 +11,8 @@ import pytest
 
 from bench.search.__main__ import kept
 from bench.search.case import KINDS, Bound, Case, Event, bound_of, draw
-from bench.search.events import ACTS
 from bench.search.play import play_case
+from bench.search.stage import ACTS
 from exo_gravity.core.safety.drive import State
 
 POSE = (0.0, 0.5, 0.1, 0.3)
@@ -25,7 +25,7 @@ def case_of(*events: Event, begin: str = "carried") -> Case:
 def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happen():
     cases = [draw(seed, "paper") for seed in range(500)]
     assert cases[:20] == [draw(seed, "paper") for seed in range(20)]
-    assert {event.name for case in cases for event in case.events} == set(KINDS) == set(ACTS)
+    assert {event.name for case in cases for event in case.events} == set(KINDS) <= set(ACTS)
     assert json.loads(json.dumps(cases[0].events)) == [list(event) for event in cases[0].events]
 
 

@@ -31,8 +31,8 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MOTION
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_wearer import path_between

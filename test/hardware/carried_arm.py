@@ -16,11 +16,11 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.motors.ak import SimulatedMotor

@@ -15,9 +15,9 @@ from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
 from exo_gravity.sim.virtual_wearer import VirtualWearer

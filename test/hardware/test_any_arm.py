@@ -28,8 +28,8 @@ from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.sim.arm import SimulatedArm
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.trunk_motion import TrunkState

@@ -32,7 +32,7 @@ from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
 from exo_gravity.lab.calibration.record import observations_in
-from exo_gravity.lab.controllers import SampleController
+from exo_gravity.sim.controllers import SampleController
 
 # Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it
 # tips over: with 1 kg, and motors 17 % stronger than the file says, it swung out to 0.9 rad before the tour began.

@@ -22,9 +22,9 @@ from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.bag.content import BRIDGE, Event, NodeStatus
-from exo_gravity.lab.controllers import DirectController
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
+from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.script import IDLE, TrialScript
 from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm

@@ -84,6 +84,8 @@ class SimulatedMotor:
         self.ambient = 30.0  #: degC
         self.temperature = self.ambient  #: degC
         self.error = 0  #: the error byte, to which a firmware may add bits of its own
+        self.is_reversed = False  #: a fault: its torque turns the joint the other way
+        self.speed_factor = 1.0  #: a fault: of the velocity that it reports
         self.entered = False  #: the motor is on, after ENTER and before EXIT
         self.has_left = False  #: its boot loader runs, and it takes no part in the bus until its next power cycle
         self.dips = 0  #: how often its time-out has taken a torque or gains away
@@ -259,7 +261,7 @@ class SimulatedMotor:
             self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
         if self.firmware.error_is_mask and self.temperature >= SHUT_OFF_AT:
             self.entered, self._is_shut_off = False, True
-        return torque
+        return -torque if self.is_reversed else torque
 
     def torque(self, position: float, velocity: float) -> float:
         """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.
@@ -279,7 +281,7 @@ class SimulatedMotor:
 
     def damps_at_once(self, torque: float) -> bool:
         """Return whether its `torque` in Nm follows the joint's velocity without delay: not at its peak."""
-        return abs(torque) < self.joint.spec.peak_torque * self._scale * self.strength
+        return not self.is_reversed and abs(torque) < self.joint.spec.peak_torque * self._scale * self.strength
 
     def _state(self, position: float, velocity: float) -> bytes:
         """Return the bytes of a reply or status frame, with readings within the ranges of the wire format."""
@@ -292,7 +294,7 @@ class SimulatedMotor:
 
     def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
         """Return angle, velocity and torque of the motor in rad, rad/s and Nm, within the ranges of the wire format."""
-        joint, spec = self.joint, self.joint.spec
+        joint, spec, velocity = self.joint, self.joint.spec, self.speed_factor * velocity
         torque = joint.direction * self.torque(position, velocity) / (self._scale * self.strength)
         if self.firmware.current_noise:
             torque *= self._random.gauss(1.0, self.firmware.current_noise)

@@ -120,7 +120,7 @@ class DamiaoMotor(SimulatedMotor):
         if self._heat.rise:
             load = torque / self.joint.spec.rated_torque
             self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
-        return torque
+        return -torque if self.is_reversed else torque
 
     def _let_go(self) -> None:
         self.entered = False
