@@ -52,7 +52,6 @@ ROOMS = {
         "urdf_arm",
     ),
 }
-EXCEPTIONS: dict[str, set[str]] = {}
 
 
 def module_of(path: Path) -> str:
@@ -101,14 +100,9 @@ def test_a_module_imports_only_what_its_part_may() -> None:
     def forbidden(module: str) -> set[str]:
         parts = [part for part in MAY_IMPORT if is_in(module, part)]
         allowed = MAY_IMPORT[max(parts, key=len)] if parts else ()
-        known = EXCEPTIONS.get(module, set())
-        return {name for name in ours(module) if not any(is_in(name, part) for part in allowed)} - known
+        return {name for name in ours(module) if not any(is_in(name, part) for part in allowed)}
 
     assert not breaches(forbidden)
-
-
-def test_no_exception_is_left_that_no_module_needs() -> None:
-    assert not {module: names - ours(module) for module, names in EXCEPTIONS.items() if names - ours(module)}
 
 
 @pytest.mark.parametrize("part", ROOMS)
@@ -176,21 +170,17 @@ def test_the_library_has_the_names_that_others_import(module: str, names: str) -
     assert not [missing for missing in names.split() if not hasattr(library, missing)]
 
 
-def test_what_serves_real_arms_needs_no_simulator() -> None:
-    modules = ("tools.trial", "tools.report", "lab.trial.analysis", "nodes.panel.node")
-    imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
-    program = f"import sys; sys.modules['mujoco'] = None; {imports}"
-    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)
-
-
 @pytest.mark.parametrize(
-    ("modules", "later"),
+    ("modules", "missing"),
     [
+        # What serves real arms needs no simulator.
+        (("tools.trial", "tools.report", "lab.trial.analysis", "nodes.panel.node"), "mujoco"),
+        # A start does not wait for what is only used later.
         (("core.compensation.compensator", "core.safety.machine", "hardware.urdf_arm"), "importlib.metadata"),
         (("tools.report", "lab.report.cohort", "lab.report.trial_report"), "matplotlib"),
     ],
 )
-def test_a_start_does_not_wait_for_what_is_only_used_later(modules: tuple[str, ...], later: str) -> None:
+def test_a_module_is_imported_without_what_it_may_not_need(modules: tuple[str, ...], missing: str) -> None:
     imports = "; ".join(f"import exo_gravity.{module}" for module in modules)
-    program = f"import sys; sys.modules[{later!r}] = None; {imports}"
+    program = f"import sys; sys.modules[{missing!r}] = None; {imports}"
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=PATIENCE)

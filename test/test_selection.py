@@ -9,33 +9,21 @@ from . import conftest
 from .support import ROOT, selection
 
 
-@pytest.fixture(autouse=True)
-def without_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under colcon, on a computer that has every package but MuJoCo."""
-    monkeypatch.setattr(selection, "find_spec", lambda name: None if name == "mujoco" else name)
-    monkeypatch.setattr(conftest, "UNDER_COLCON", True)
-    monkeypatch.setattr(conftest, "left_out", Counter())
-    selection.is_missing.cache_clear()
-    selection.direct_needs.cache_clear()
-
-
 @pytest.mark.parametrize(
-    "path",
+    ("path", "is_left_out"),
     [
-        "test/sim/test_arm.py",  # imports it
-        "test/nodes/test_stack.py",  # starts a node that imports it
-        "test/hardware",  # its conftest.py imports it
+        ("test/sim/test_arm.py", True),  # imports MuJoCo
+        ("test/nodes/test_stack.py", True),  # starts a node that imports it
+        ("test/hardware", True),  # its conftest.py imports it
+        ("test/core/test_motors.py", None),
     ],
 )
-def test_a_file_that_needs_a_missing_package_is_left_out(path: str) -> None:
-    assert conftest.pytest_ignore_collect(ROOT / path) is True
-    assert conftest.left_out["mujoco"] == 1
-
-
-def test_a_file_that_does_not_need_it_is_kept() -> None:
-    assert conftest.pytest_ignore_collect(ROOT / "test/core/test_motors.py") is None
-
-
-def test_outside_of_colcon_nothing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(conftest, "UNDER_COLCON", False)
-    assert conftest.pytest_ignore_collect(ROOT / "test/sim/test_arm.py") is None
+def test_a_file_that_needs_a_missing_package_is_left_out_under_colcon_alone(monkeypatch, path, is_left_out) -> None:
+    monkeypatch.setattr(selection, "find_spec", lambda name: None if name == "mujoco" else name)
+    monkeypatch.setattr(conftest, "left_out", Counter())
+    for cached in (selection.is_missing, selection.direct_needs):
+        cached.cache_clear()
+    for under_colcon, expected in ((True, is_left_out), (False, None)):
+        monkeypatch.setattr(conftest, "UNDER_COLCON", under_colcon)
+        assert conftest.pytest_ignore_collect(ROOT / path) is expected
+    assert conftest.left_out["mujoco"] == bool(is_left_out)

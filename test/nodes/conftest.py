@@ -11,7 +11,6 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from ..support.bus_listener import BusListener
 from ..support.launched_nodes import LaunchedNodes
 from ..support.node_thread import own_node
 from ..support.ros_probe import RosProbe
@@ -62,17 +61,3 @@ def launch(prepare: Callable[..., LaunchedNodes]) -> Iterator[Callable[..., Laun
     for nodes in launched:
         nodes.stop()
         print("\n".join(nodes.log))  # pytest shows it if the test failed
-
-
-@pytest.fixture
-def listen() -> Iterator[Callable[[LaunchedNodes], BusListener]]:
-    """A function that records the frames on the bus of some nodes."""
-    listeners: list[BusListener] = []
-
-    def listen(nodes: LaunchedNodes) -> BusListener:
-        listeners.append(BusListener(nodes.bus))
-        return listeners[-1]
-
-    yield listen
-    for listener in listeners:
-        listener.close()

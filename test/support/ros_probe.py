@@ -171,17 +171,6 @@ class RosProbe:
         """Return whether the virtual wearer's newest step is a 'move', 'hold' or 'push', or the end, 'done'."""
         return bool(self.wearer_steps) and json.loads(self.wearer_steps[-1].data)["action"] == action
 
-    def wait_until_carried(self) -> None:
-        """Wait until the arm is carried; a fault, such as a busy machine causes, is cleared and the bridge enabled."""
-        self.wait_until(lambda: self.state in ("active", "fault", "disabled"))
-        while self.state != "active":
-            if self.state == "fault":
-                assert self.trigger("clear_fault").success
-                self.wait_until(lambda: self.state == "disabled")
-            self.enable(True)  # refused while the bridge enables by itself
-            self.wait_for_report()
-            self.wait_until(lambda: self.state in ("active", "fault", "disabled"))  # disabled: the enable has expired
-
     def get_carried(self) -> None:
         """Wait until the arm is carried; the wearer moves one that hangs outside its limits or away from home."""
         helped = -math.inf
@@ -196,6 +185,8 @@ class RosProbe:
             elif self.state == "disabled":
                 self.enable(True)
             self.wait_for_report()
+
+    wait_until_carried = get_carried
 
     def bring_to(self, script: object) -> None:
         """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""
