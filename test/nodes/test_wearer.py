@@ -22,9 +22,6 @@ from std_msgs.msg import String
 from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.settings import urdf_table
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.lab.inputs.arms import carried_arm
@@ -35,7 +32,6 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.nodes.wearer.node import WearerNode
 
-from ..support import DATA
 from ..support.chains import random_chain
 from ..support.joint_state_feeder import PARTS, POSE, ROBOT, StillArm
 from ..support.launched_nodes import NO_IMU
@@ -108,8 +104,9 @@ def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_th
     # A compensator that hangs, or is gone: the middleware lists it for long.
     os.kill(nodes.pid("compensator"), signal.SIGSTOP)
     probe.wait_until(lambda: value("reason") == "no_compensator" and set(torques()) == {"unknown"})
-    told, seen = len(found[""]), len(probe.joint_states)
-    probe.wait_until(lambda: len(probe.joint_states) > seen + 200)
+    for count in (100, 200):  # what was on its way arrives in the first time
+        told, seen = len(found[""]), len(probe.joint_states)
+        probe.wait_until(lambda end=seen + count: len(probe.joint_states) > end)
     assert len(found[""]) == told
     os.kill(nodes.pid("compensator"), signal.SIGCONT)
     probe.wait_until(lambda: torques() == NONE and len(found[""]) > told)
@@ -250,13 +247,4 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(wea
         for settings in made:
             torque, _ = settings.torque(theta.tolist(), Tilt.of("left"))
             np.testing.assert_allclose(torque, oracle.torque(theta, GRAVITY), rtol=0.0, atol=1e-10)
-    node.destroy_node()
-
-
-def test_a_joint_that_is_not_listed_and_cannot_be_at_0_is_refused_by_all_three(wearer):
-    given = given_of(DATA / "arms" / "panda.urdf", [f"panda_joint{n}" for n in (1, 2, 3)])
-    node, values = compensator(given), values_of(urdf_table(given), given)
-    for make in (lambda: declared(node), lambda: wearer._read(values), lambda: carried_arm(files(given), "/right")):
-        with pytest.raises(ParameterError, match="position of panda_joint4 = None: must be in the joint states"):
-            make()
     node.destroy_node()

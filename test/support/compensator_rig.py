@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 
 import rclpy
@@ -80,8 +81,9 @@ class CompensatorRig:
         self.status = next((status for status in message.status if status.name == self._name), self.status)
 
     @property
-    def values(self) -> dict[str, str]:
-        return {item.key: item.value for item in self.status.values}
+    def values(self) -> Mapping[str, str]:
+        """The newest value of each key, '' before the first report."""
+        return defaultdict(str, {item.key: item.value for item in self.status.values})
 
     def set(self, **values: object) -> list[str]:
         """Set parameters (`__` for a dot) and return why each was refused, '' if it was not."""
