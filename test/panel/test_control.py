@@ -1,17 +1,40 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Who may do what: requests are checked, one page holds control, and letting down always works."""
+"""The panel without web and ROS: who may do what, what is recorded, what is named after a fault, limits and texts.
+
+Requests are checked, one page holds control, and letting down always works. The texts are complete in every language.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import json
+import math
+import re
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
+import exo_gravity.panel
+from exo_gravity.core import vocabulary
+from exo_gravity.core.compensation.guidance import CAUSE_TIME
+from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME
+from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.lab.inputs.arms import fitting
+from exo_gravity.panel import recordings
 from exo_gravity.panel.control import LIMITS, Control, Page, parse
+from exo_gravity.panel.recordings import Recordings
+from exo_gravity.panel.view import NEWS_DELAY, PANEL, LoadChanges, setup_of
+from exo_gravity.sim.script import TIMED, VALUED
 
-from ..support.panel_stage import PlayedArms, PlayedFiles
+from ..support.panel_stage import WEARER_FILE, PlayedArms, PlayedFiles
 
 DOWN = [("let_down", "right"), ("let_down", "left")]
 OWN_LEASE = ("10.0.0.1 page 1", "hold")
@@ -104,8 +127,8 @@ WRONG = [
 def test_a_right_request_is_understood_and_a_whole_number_has_the_parameters_type():
     for body in RIGHT:
         assert parse(body, ("right", "left"), ("demo",)) == body
-    body = {"do": "set", "arm": "right", "values": {"support": 1}}
-    assert isinstance(parse(body, ("right",), ())["values"]["support"], float)
+    body = parse({"do": "set", "arm": "right", "values": {"support": 1}}, ("right",), ())
+    assert isinstance(body["values"]["support"], float)
 
 
 @pytest.mark.parametrize("body", WRONG)
@@ -123,25 +146,22 @@ def test_log_and_refusals_name_the_client_and_never_the_wearers_data(panel):
         assert "wearer.body_mass" in panel.notes[-1] and "81" not in panel.notes[-1]
 
 
+OPERATED = ("enable", "activate", "clear_fault", "resume", "confirm_pose")
+FILED = ("record", "stop_recording", "save", "stop_trial")
+
+
 def test_every_page_lets_down_and_only_the_one_in_control_does_anything_else(panel):
     for page in (panel.first, panel.second, "", "guessed"):
-        panel.arms.calls.clear()
-        assert panel.ask(page, "let_down") == (200, "")
-        assert panel.arms.calls == DOWN
-        assert panel.status(page, "let_down", "left") == 200
-        assert panel.arms.calls[-1] == ("let_down", "left")
-    for kind in ("enable", "activate", "clear_fault", "resume", "confirm_pose"):
-        panel.arms.calls.clear()
-        assert [panel.status(page, kind, "right") for page in (panel.second, "", "guessed")] == [403] * 3
-        assert panel.arms.calls == []
-        assert panel.status(panel.first, kind, "right") == 200
-        assert panel.arms.calls == [(kind, "right")]
-    for kind, more in [(kind, {}) for kind in ("record", "stop_recording", "save", "stop_trial")] + [
-        ("trial", {"name": "demo"})
-    ]:
-        assert panel.status(panel.second, kind, **more) == 403
+        assert panel.ask(page, "let_down") == panel.ask(page, "let_down", "left") == (200, "")
+    assert panel.arms.calls == 4 * [*DOWN, ("let_down", "left")]
+    panel.arms.calls.clear()
+    requests = [(kind, {"arm": "right"}) for kind in OPERATED] + [(kind, {}) for kind in FILED]
+    for kind, more in (*requests, ("trial", {"name": "demo"})):
+        assert [panel.status(page, kind, **more) for page in (panel.second, "", "guessed")] == [403] * 3
+        assert len(panel.arms.calls) + len(panel.files.calls) == [*OPERATED, *FILED, "trial"].index(kind)
         assert panel.status(panel.first, kind, **more) == 200
-    assert panel.files.calls == ["record", "stop_recording", "save", "stop_trial", "trial demo"]
+    assert panel.arms.calls == [(kind, "right") for kind in OPERATED]
+    assert panel.files.calls == [*FILED, "trial demo"]
 
 
 def test_letting_down_has_no_rate_limit_and_everything_else_has_also_in_the_log(panel):
@@ -169,12 +189,9 @@ def test_a_refusal_of_the_device_reaches_the_page_and_the_log(panel):
 def test_nothing_keeps_an_arm_up_neither_the_other_arm_nor_the_log(panel, caplog):
     panel.arms.errors["right"] = RuntimeError("the client is gone")
     assert panel.ask(panel.first, "let_down") == (409, "right: RuntimeError: the client is gone")
-    assert panel.arms.calls == DOWN
     panel.arms.errors.clear()
-    panel.arms.calls.clear()
     panel.note_error = OSError("no space left")
-    assert panel.ask(panel.first, "let_down") == (200, "")
-    assert panel.arms.calls == DOWN
+    assert panel.ask(panel.first, "let_down") == (200, "") and panel.arms.calls == 2 * DOWN
     assert "no space left" in caplog.text and "page 1: let down: done" in caplog.text
     panel.arms.names = ()
     assert panel.status(panel.first, "let_down") == 409  # without an arm it fails visibly
@@ -183,8 +200,8 @@ def test_nothing_keeps_an_arm_up_neither_the_other_arm_nor_the_log(panel, caplog
 def test_control_is_taken_and_given_up_here_and_at_the_arms(panel):
     assert panel.status(panel.second, "take") == 200
     assert panel.status(panel.first, "enable", "left") == 403
-    panel.confirm(panel.first)
-    panel.confirm(panel.second)
+    for page in (panel.first, panel.second):
+        panel.confirm(page)
     panel.ask(panel.second, "release")
     panel.confirm(panel.second)
     assert panel.arms.leases == [("10.0.0.2 page 2", kind) for kind in ("take", "hold", "release")]
@@ -194,8 +211,7 @@ def test_control_is_taken_and_given_up_here_and_at_the_arms(panel):
 
 def test_a_reloaded_page_keeps_its_number_and_control_and_no_other_secret_is_accepted(panel):
     panel.first.connection = None
-    assert panel.opened(secret=panel.first.secret) is panel.first is panel.holder
-    assert panel.first.number == 1
+    assert panel.opened(secret=panel.first.secret) is panel.first is panel.holder and panel.first.number == 1
     assert panel.opened(secret="my own").secret != "my own"
 
 
@@ -242,3 +258,290 @@ def test_an_arm_that_another_operator_holds_is_only_let_down(panel):
         assert "anna" in panel.notes[-1]
     assert panel.arms.calls == []
     assert panel.status(panel.first, "enable", "right") == panel.status(panel.first, "let_down", "left") == 200
+
+
+# Recordings, sessions and trials
+
+# Stands for `trial --attach`: prints what it prints, and writes a report.
+TRIAL = """
+import json, pathlib, sys
+given = [word for word in sys.argv if word.startswith("--subject=")][0].partition("=")[2]
+output = sys.argv[sys.argv.index("--output") + 1]
+folder = pathlib.Path(output, given, "2026-03-14" if given else "", "short_20260314_120000")
+folder.mkdir(parents=True)
+(folder / "report.html").touch()
+for line in ({"folder": str(folder)}, {"step": 0, "left": 4.0}, LAST, {"problem": PROBLEM}):
+    print(json.dumps(line), flush=True)
+"""
+CANNOT_START = "import sys; print('trial: no rclpy', file=sys.stderr); raise SystemExit(2)"
+
+
+class Device:
+    """One compensator, and a bridge whose state is `state`."""
+
+    def __init__(self):
+        self.state, self.performed = "active", []
+
+    def parameters(self):
+        compensator = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
+        return {"/right/compensator": compensator, "/right/simulator": {}}
+
+    def states(self):
+        return {"right": self.state}
+
+    def mark(self, text):
+        self.marked = text
+        return ""
+
+    async def perform(self, script):
+        self.performed.append(script)
+        return ""
+
+
+class Kept(Recordings):
+    """Recordings below `folder / "out"` of an active arm, with the trial `short`; what a page is told and is noted."""
+
+    def __init__(self, folder):
+        (folder / "short.yaml").write_text(yaml.safe_dump({"name": "short", "steps": [{"hold": 4.0}]}))
+        self.device, self.notes, self.out = Device(), [], folder / "out"
+        super().__init__(str(self.out), folder, self.device, print, lambda: 0.0)
+        self._control = Control(PlayedArms(), self, self.notes.append, lambda: 0.0)
+        self._page = self._control.open("", "10.0.0.1")
+
+    def ask(self, kind, **body):
+        return asyncio.run(self._control.perform({"do": kind, **body}, self._page.secret, self._page.address))[1]
+
+    def begin(self, subject, note=""):
+        return self.ask("session", subject=subject, protocol="", note=note)
+
+    def followed(self):
+        """Start the trial `short`; return what the page shows at each change until it is done."""
+
+        async def follow():
+            assert await self.trial("short") == ""
+            assert "running already" in await self.trial("short")
+            assert "stop the trial" in await self.stop_recording()
+            shown = [self.state()]
+            while shown[-1]["trial"]["phase"] != "done":
+                await asyncio.sleep(0)
+                shown += [self.state()] if self.state() != shown[-1] else []
+            return shown
+
+        return asyncio.run(follow())
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A panel's recordings."""
+    return Kept(tmp_path)
+
+
+@pytest.fixture
+def run_instead(monkeypatch):
+    """A function that lets a program run in place of the recorder and the trial."""
+
+    def run_instead(code=TRIAL, problem="", last="{'phase': 'reporting'}"):
+        code = code.replace("PROBLEM", repr(problem)).replace("LAST", last)
+        monkeypatch.setattr(recordings, "command", lambda module, *words: [sys.executable, "-S", "-c", code, *words])
+
+    return run_instead
+
+
+def test_parameters_saved_twice_within_a_second_are_two_files_and_a_folder_that_cannot_be_made_is_named(kept):
+    paths = [kept.ask("save") or kept.state()["saved"] for _ in range(3)]
+    assert len(set(paths)) == 3
+    for path in paths:
+        saved = yaml.safe_load(Path(path).read_text())["/right/compensator"]["ros__parameters"]
+        assert saved["mode"] == "one_g" and saved["robot"] == {"mass": [0.5] * 4} and "anfis" not in saved
+    shutil.rmtree(kept.out)
+    kept.out.write_text("")
+    for kind in ("save", "record"):
+        assert kept.ask(kind).startswith(f"{kept.out}/")
+
+
+def test_a_recorder_that_has_ended_by_itself_is_stopped_with_its_exit_code(kept, run_instead):
+    run_instead("raise SystemExit(1)")
+
+    async def stopped():
+        assert await kept.record() == ""
+        while kept.state()["recording"]["on"]:
+            await asyncio.sleep(0.01)
+        return await kept.stop_recording()
+
+    assert "exit code 1" in asyncio.run(stopped())
+
+
+@pytest.mark.parametrize("problem", ["", "stopped by the operator"])
+def test_a_trial_is_followed_to_its_report(kept, run_instead, tmp_path, problem):
+    run_instead(problem=problem)
+    first, *_, last = kept.followed()
+    assert first["recording"]["on"] and (first["trial"]["phase"], first["trial"]["step"]) == ("running", -1)
+    assert not first["trial"]["guided"] and kept.device.performed == [str(tmp_path / "short.yaml"), ""]
+    name = "short_20260314_120000"
+    assert last["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
+    assert not last["recording"]["on"] and kept.report(name) == kept.out / name / "report.html"
+    (tmp_path / "report.html").touch()
+    assert kept.report("..") is kept.report(str(tmp_path)) is None  # no other file is served
+
+
+def test_a_trial_that_cannot_start_says_why(kept, run_instead):
+    run_instead(CANNOT_START)
+    assert kept.followed()[-1]["trial"]["problem"] == "trial: no rclpy"
+    kept.device.state = "disabled"
+    assert "every arm is active" in asyncio.run(kept.trial("short"))
+
+
+def test_the_virtual_wearer_ends_with_a_trial_that_an_arm_ended(kept, run_instead):
+    run_instead(last="{'step': 0, 'left': 3.0}")
+    assert kept.followed() and kept.device.performed[-1] == ""
+
+
+def test_a_trial_of_a_subject_is_in_the_list_with_its_report_after_a_restart(kept, run_instead, tmp_path):
+    run_instead()
+    assert kept.begin("P01") == ""
+    kept.followed()
+    restarted = Kept(tmp_path)
+    name = "P01/2026-03-14/short_20260314_120000"
+    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name}
+    assert restarted.past() == {"subjects": ["P01"], "past": [entry]}
+    assert restarted.report(name) == kept.out / name / "report.html"
+    assert restarted.state()["session"]["subject"] == ""
+
+
+def test_a_name_is_refused_as_a_code_and_does_not_reach_the_log(kept):
+    problem = kept.begin("Anna Meier")
+    assert problem.startswith("subject ") and problem in kept.notes[-1] and "Anna" not in kept.notes[-1]
+    assert kept.begin("P01", note="x" * 1001).startswith("note ")
+    assert kept.begin("P01", note="calm \ud83d").startswith("note must be")
+    assert kept.state()["session"]["subject"] == ""
+
+
+@pytest.mark.parametrize("text", ["wearer.body_mass: 7000.0", "robot.mass: 1.0", "- 1", "{"])
+def test_what_belongs_to_the_wearer_is_kept_in_a_file_and_read_again_with_the_subject_unless_it_is_wrong(kept, text):
+    assert kept.ask("keep_wearer")
+    kept.begin("P01")
+    assert kept.state()["session"]["wearer"] == {} and kept.ask("keep_wearer") == ""
+    for subject, wearer in (("P02", {}), ("P01", WEARER_FILE), ("P02", {})):
+        kept.begin(subject)
+        assert kept.state()["session"]["wearer"] == wearer
+    assert kept.past()["subjects"] == ["P01"]
+    (kept.out / "P01" / "wearer.yaml").write_text(text)
+    assert kept.begin("P01") and kept.state()["session"]["subject"] == "P02"
+
+
+def test_a_marker_without_a_text_is_called_marker_and_half_of_a_character_reaches_no_page(kept):
+    assert kept.ask("marker", text="") == "" and kept.device.marked == "marker"
+    assert kept.ask("marker", text=["a"]).startswith("text ")
+    assert kept.ask("marker", text="calm \ud83d").startswith("text must be")
+    json.dumps(kept.state(), ensure_ascii=False).encode()
+    assert [kept.report(name) for name in ("\0", "a" * 3000, "../etc")] == [None] * 3  # no report's names
+
+
+# After a fault
+
+
+LOAD = {"mode": "zero_g", "support": 0.1, "wearer.body_mass": 75.0, "payload.mass": 0.0}
+UNKNOWN = dict.fromkeys(LOAD)
+
+
+class PanelLook:
+    """The panel's look at one arm ten times a second; `cause` is what it names."""
+
+    def __init__(self, changing: str = "none") -> None:
+        self.changes, self.now, self.cause = LoadChanges(), 0.0, None
+        self.load: dict[str, Any] = LOAD
+        self.fault, self.changing = "none", changing
+        self.go(1.0)
+
+    def go(self, seconds: float, load: dict[str, Any] | None = None) -> Any:
+        self.load = {**self.load, **(load or {})}
+        known = {name: value for name, value in self.load.items() if value is not None}
+        for _ in range(round(10 * seconds)):
+            self.now += 0.1
+            state = {"bridge": {"fault": self.fault}, "compensator": {"changing load": self.changing}}
+            arms = self.changes.with_causes({"right": state}, {"right": ({}, known)}, self.now)
+            self.cause = arms["right"]["cause"]
+        return self.cause
+
+    def fail(self, seconds: float = 0.1) -> Any:
+        self.fault = "over_speed"
+        return self.go(seconds)
+
+
+SUPPORT = {"what": "support", "from": 0.1, "to": 0.6}
+RAISED = {"support": 0.6}
+CAUSES: dict[str, tuple[list[tuple[float, dict[str, Any]]], str, dict[str, Any] | None]] = {
+    # What is set, each with the seconds that follow; the joint whose load still changes; and what is named of a fault.
+    "support": ([(2.0, RAISED)], "none", SUPPORT),
+    "mode": ([(2.0, {"mode": "one_g", "support": 0.0})], "none", {"what": "mode", "from": "zero_g", "to": "one_g"}),
+    "never the wearer's data": ([(2.0, {"wearer.body_mass": 90.0, "support": 0.0})], "none", {"what": "wearer"}),
+    "payload": ([(2.0, {"payload.mass": 1.5})], "none", {"what": "payload", "from": 0.0, "to": 1.5}),
+    "long before": ([(CAUSE_TIME + 1.0, RAISED)], "none", None),
+    "long before, and still changing": ([(CAUSE_TIME + 1.0, RAISED)], "right_elbow_flexion", SUPPORT),
+    "a slider on its way": ([(0.5, {"support": support}) for support in (0.2, 0.4, 0.6)], "none", SUPPORT),
+    "support that does not act": ([(CAUSE_TIME + 1.0, {"mode": "one_g"}), (1.0, RAISED)], "none", None),
+    "parameters that become known": ([(1.0, UNKNOWN), (1.0, LOAD)], "none", None),
+}
+
+
+@pytest.mark.parametrize(("steps", "changing", "cause"), CAUSES.values(), ids=CAUSES)
+def test_a_change_of_load_shortly_before_a_fault_is_named(steps, changing, cause):
+    look = PanelLook(changing)
+    for seconds, load in steps:
+        assert look.go(seconds, load) is None
+    assert look.fail() == look.go(NEWS_DELAY) == cause
+    assert look.go(60.0, {"support": 0.3}) == cause  # set while the arm is off
+    look.fault, look.changing = "none", "none"
+    assert look.go(10.0) is None and look.fail() is None
+
+
+@pytest.mark.parametrize(("delay", "cause"), [(-0.5, SUPPORT), (0.5, None)])
+def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_later_one_is_not(delay, cause):
+    look = PanelLook()
+    look.fail(NEWS_DELAY + delay)
+    assert look.go(0.1, RAISED) == cause
+
+
+def test_the_limit_of_a_joint_is_the_smaller_one_and_a_compensator_without_a_limit_of_its_own_has_none():
+    bridge = values_of(
+        CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "test", "max_effort": [3.0, 9.0, 3.0, 3.0]}
+    )
+    compensator = values_of(COMPENSATOR, {}) | {"max_effort": [0.0, 5.0, 0.0, 12.0]}
+    assert setup_of({"right": (bridge, compensator)})["arms"]["right"]["max_effort"] == [3.0, 5.0, 3.0, 3.0]
+
+
+def test_nodes_of_other_programs_and_of_other_arms_that_have_an_arms_names_leave_the_page_its_setup():
+    bridge = fitting("/right/can_bridge", {"max_effort": "much", "can.channel": ["vcan0"], "rate": math.nan, "own": 1})
+    assert bridge == {"own": 1}
+    compensator = fitting("/right/compensator", {"max_effort": 3.0, "support": 0.5, "payload.mass": math.inf})
+    assert compensator == {"support": 0.5}
+    shown = setup_of({"right": (bridge, compensator)})["arms"]["right"]
+    assert shown["max_effort"] is None and shown["settings"]["support"] == 0.5
+    others = {"right": ({"max_effort": [3.0, 9.0, 3.0]}, {"max_effort": [2.0] * 4})}
+    assert setup_of(others)["arms"]["right"]["max_effort"] == [2.0] * 3
+
+
+# Texts
+
+FOLDER = Path(exo_gravity.panel.__file__).parent
+CONTENT = json.loads((FOLDER / "strings.json").read_text(encoding="utf-8"))
+TEXTS = CONTENT["texts"]
+(MARKERS,) = (param.default for param in PANEL if param.name == "markers")
+WORDS = {  # of the nodes, that an operator must understand
+    "fault": FaultCode, "do": FaultCode, "state": [state.value for state in State], "step": (*TIMED, *VALUED),
+    "sentence": [state.value for state in State], "wait": vocabulary.Wait, "reason": vocabulary.Withdrawal,
+    "trouble": vocabulary.WeighingTrouble, "source": vocabulary.Source, "marker": MARKERS,
+    "weighing": set(vocabulary.WeighingPhase) - {vocabulary.WeighingPhase.NONE},
+}  # fmt: skip
+
+
+def test_every_word_of_the_nodes_and_all_that_the_page_asks_for_has_its_text_in_every_language():
+    for key, texts in TEXTS.items():
+        assert len(texts) == len(CONTENT["languages"]) and all(text.strip() for text in texts), key
+        assert len({tuple(sorted(set(re.findall(r"\{\d\}", text)))) for text in texts}) == 1, key
+    assert {f"{kind}.{word}" for kind, words in WORDS.items() for word in words} <= TEXTS.keys()
+    static = FOLDER / "static"
+    asked = set(re.findall(r'data-text="([^"]+)"', (static / "index.html").read_text(encoding="utf-8")))
+    for script in static.glob("*.js"):
+        asked |= set(re.findall(r'\bt\("([^"]+)"', script.read_text(encoding="utf-8")))
+    assert asked <= TEXTS.keys() and len(asked) > 50

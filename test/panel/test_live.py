@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -18,33 +19,26 @@ from ..support.ros_probe import RosProbe
 
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Page
 
 from ..support.panel_browser import IN_BROWSER, chromium, enable, open_page, wait_for_state
 
 pytestmark = [*IN_BROWSER, pytest.mark.real_time]
 
 
+@dataclass
 class Clinic:
-    """The nodes with a panel, a probe, and the page."""
+    """The nodes with a panel, a probe, and the page; out: where the panel writes."""
 
-    def __init__(self, folder: Path, page: Page, nodes: LaunchedNodes, probe: RosProbe) -> None:
-        self.folder, self.page, self.nodes, self.probe = folder, page, nodes, probe
-
-    def notes(self) -> str:
-        """Return what the panel has logged."""
-        return "\n".join(line for line in self.nodes.log if line.startswith("/panel"))
+    out: Path
+    page: Page
+    nodes: LaunchedNodes
+    probe: RosProbe
 
 
 RECORDING = 50_000  # bytes of a file into which joint states are written
-
-
-def carried_on_page(nodes: LaunchedNodes, probe: RosProbe, browser: Browser, url: str) -> Page:
-    """Return the open page of an arm that is carried."""
-    probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
-    page = open_page(browser, url)
-    probe.wait_until_carried()  # last: a browser that starts can stall the simulated device
-    return page
+LONG = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
+AWAY = {"name": "away", "steps": [{"move": [0.0, 0.9, 0.6, 0.8], "over": over} for over in (2.0, 60.0)]}
 
 
 def panel_diagnostics(bag: Path) -> list[str]:
@@ -57,18 +51,20 @@ def panel_diagnostics(bag: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
-    """The nodes of the right arm, with a trial, and the open page; one set of them for all tests."""
+    """The nodes of the right arm, with trials, and the open page; one set of them for all tests."""
     folder = tmp_path_factory.mktemp("clinic")
-    (folder / "scripts").mkdir()
-    script = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
-    (folder / "scripts" / "long.yaml").write_text(yaml.safe_dump(script))
+    for script in (LONG, AWAY):
+        (folder / f"{script['name']}.yaml").write_text(yaml.safe_dump(script))
     nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
-    url = nodes.add_panel(trials=str(folder / "scripts"))
+    url = nodes.add_panel(trials=str(folder))
     nodes.start()
     probe = RosProbe()
     try:
         with chromium(gives_way=True) as browser:
-            yield Clinic(folder, carried_on_page(nodes, probe, browser, url), nodes, probe)
+            probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
+            page = open_page(browser, url)
+            probe.wait_until_carried()  # last: a browser that starts can stall the simulated device
+            yield Clinic(folder / "out", page, nodes, probe)
     finally:
         probe.close()
         nodes.stop()
@@ -83,8 +79,13 @@ def clinic(running: Clinic) -> Clinic:
     return running
 
 
+def let_down(page: Page) -> None:
+    page.keyboard.press("Space")
+    wait_for_state(page, "disabled")
+
+
 def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
-    page, probe, out = clinic.page, clinic.probe, clinic.folder / "out"
+    page, probe, out = clinic.page, clinic.probe, clinic.out
     page.click("#record")
     page.wait_for_selector("#record-stop:enabled")
     probe.wait_until(lambda: any(path.stat().st_size > RECORDING for path in out.glob("recording_*/bag/*.mcap")))
@@ -94,8 +95,7 @@ def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
     page.focus(".support input:enabled")
     page.keyboard.press("ArrowRight")
     probe.wait_until(lambda: float(probe.diagnostic("compensator", "support") or 0.0) == pytest.approx(0.005))
-    page.keyboard.press("Space")
-    wait_for_state(page, "disabled")
+    let_down(page)
     page.click("#record-stop")
     page.wait_for_selector("#record:enabled")
     (recording,) = out.glob("recording_*")
@@ -105,19 +105,17 @@ def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
     page.wait_for_selector("#saved:has-text('params.yaml')")
     (saved,) = out.glob("parameters_*/params.yaml")
     assert yaml.safe_load(saved.read_text())["/right/compensator"]["ros__parameters"]["mode"] == "zero_g"
+    notes = "\n".join(line for line in clinic.nodes.log if line.startswith("/panel"))
     for what in ("record", "set right mode = zero_g, support = 0.0", "let down", "save"):
-        assert f"127.0.0.1 page 1: {what}: done" in clinic.notes()
+        assert f"127.0.0.1 page 1: {what}: done" in notes
     enable(page)
     wait_for_state(page, "active")
 
 
 def test_an_arm_that_hangs_astray_is_put_back_and_carried(clinic):
-    page, probe, away = clinic.page, clinic.probe, clinic.folder / "away.yaml"
-    pose = [0.0, 0.9, 0.6, 0.8]
-    away.write_text(yaml.safe_dump({"name": "away", "steps": [{"move": pose, "over": over} for over in (2.0, 60.0)]}))
-    page.keyboard.press("Space")
-    wait_for_state(page, "disabled")
-    assert probe.set_parameters("simulator", trial=str(away)).successful
+    page, probe = clinic.page, clinic.probe
+    let_down(page)
+    assert probe.set_parameters("simulator", trial=str(clinic.out.with_name("away.yaml"))).successful
     probe.wait_until(lambda: probe.joint_states[-1].position[1] > 0.8)
     page.click(".home")
     probe.wait_until(lambda: max(map(abs, probe.joint_states[-1].position)) < 0.15)
@@ -126,9 +124,8 @@ def test_an_arm_that_hangs_astray_is_put_back_and_carried(clinic):
 
 
 def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_and_marker(clinic):
-    page, out = clinic.page, clinic.folder / "out"
-    page.keyboard.press("Space")
-    wait_for_state(page, "disabled")
+    page = clinic.page
+    let_down(page)
     page.fill("#session [name=subject]", "P01")
     page.click("#session button:not([type])")
     page.wait_for_selector("#session-text:has-text('P01')")
@@ -142,7 +139,7 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     page.wait_for_selector("#message:has-text('marker')")
     page.click("#trial-stop")
     page.wait_for_selector("#trial-report:visible")
-    (trial,) = out.glob("P01/*-*-*/long_*")
+    (trial,) = clinic.out.glob("P01/*-*-*/long_*")
     bag = read_bag(trial / "bag")
     assert bag.session.subject == "P01" and [marker.text for marker in bag.markers] == ["marker"]
     report = (trial / "report.html").read_text(encoding="utf-8")
@@ -159,5 +156,4 @@ def test_the_death_of_the_panel_changes_nothing(clinic):  # the last test: the p
     wait_for_state(clinic.page, "unseen")
     seen = len(probe.joint_states)
     probe.wait_until(lambda: len(probe.joint_states) > seen + 200)  # 2 s
-    assert probe.state == "active"
-    assert not clinic.nodes.have_ended
+    assert probe.state == "active" and not clinic.nodes.have_ended

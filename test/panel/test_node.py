@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,25 +32,24 @@ MAX_EFFORT = [9.0, 18.0, 9.0, 9.0]
 
 
 class PanelProcess:
-    """The process of a panel, which answers at `url`."""
+    """The process of a panel, which answers at `url`; address: the line of its log with that."""
 
     def __init__(self, folder: Path, **parameters: object) -> None:
         self.port = free_port()
         given = {"port": self.port, "output": str(folder), **parameters}
         options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
         self.url = f"http://127.0.0.1:{self.port}/"
-        self.process = subprocess.Popen(
-            [executable("panel"), "--ros-args", *options], stdout=sys.stderr, stderr=subprocess.PIPE, text=True
-        )
-
-    def wait_for_address(self) -> str:
-        """Return the log line with the address."""
+        command = [executable("panel"), "--ros-args", *options]
+        self.process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
         assert self.process.stderr is not None
-        return next(line for line in self.process.stderr if "http://" in line)
+        self.address = next(line for line in self.process.stderr if "http://" in line)
 
     def close(self) -> None:
         self.process.kill()
         self.process.wait()
+
+    def get(self, path: str = "", **options: Any) -> httpx.Response:
+        return httpx.get(self.url + path, verify=False, **options)
 
 
 class PlayedArm:
@@ -124,21 +124,42 @@ def stranger() -> Iterator[str]:
     thread.close()
 
 
+@dataclass
+class Visitor:
+    """A page of a panel without a browser."""
+
+    panel: PanelProcess
+    connection: ClientConnection
+    secret: str = ""
+
+    @property
+    def origin(self) -> str:
+        return self.panel.url.rstrip("/")
+
+    def message(self, kind: str, condition: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
+        """Return the first message of this type for which `condition` holds."""
+        while (content := json.loads(self.connection.recv(timeout=PATIENCE)))["type"] != kind or not condition(content):
+            pass
+        return content
+
+    def ask(self, kind: str, **body: Any) -> tuple[int, str]:
+        headers = {"origin": self.origin, "x-panel-page": self.secret}
+        given = {"json": {"do": kind, **body}, "headers": headers, "verify": False}
+        answer = httpx.post(self.panel.url + "action", **given)
+        return answer.status_code, answer.json()["error"]
+
+
 @pytest.fixture
-def panel(tmp_path: Path) -> Iterator[PanelProcess]:
-    """A panel on loopback whose page holds the arms' control."""
+def page(tmp_path: Path) -> Iterator[Visitor]:
+    """A page of a panel on loopback, which holds the arms' control."""
     panel = PanelProcess(tmp_path, dead_man=True)
-    assert "on this machine only" in panel.wait_for_address()
-    yield panel
+    assert "on this machine only" in panel.address
+    with connect(panel.url.replace("http", "ws") + "live", origin=panel.url.rstrip("/")) as connection:
+        connection.send(json.dumps({"page": ""}))
+        visitor = Visitor(panel, connection)
+        visitor.secret = visitor.message("page")["page"]
+        yield visitor
     panel.close()
-
-
-def message(connection: ClientConnection, kind: str, condition: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
-    """Return the first message of this type for which `condition` holds."""
-    while True:
-        content = json.loads(connection.recv(timeout=PATIENCE))
-        if content["type"] == kind and condition(content):
-            return content
 
 
 def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
@@ -146,67 +167,53 @@ def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
     return bool(arm) and arm["max_effort"] == MAX_EFFORT and arm["settings"]["support"] == support
 
 
-def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_another_program(panel, stranger):
-    origin = panel.url.rstrip("/")
-    with connect(panel.url.replace("http", "ws") + "live", origin=origin) as connection:
-        connection.send(json.dumps({"page": ""}))
-        secret = message(connection, "page", lambda _: True)["page"]
-
-        def ask(**body: Any) -> tuple[int, str]:
-            headers = {"origin": origin, "x-panel-page": secret}
-            answer = httpx.post(panel.url + "action", json=body, headers=headers, verify=False)
-            return answer.status_code, answer.json()["error"]
-
-        wait_until(lambda: stranger in httpx.get(panel.url + "parameters", verify=False).json())
-        assert ask(do="let_down") == (409, "no arm is present")
-        arm = PlayedArm()
-        try:
-            message(connection, "setup", is_known)
-            state = message(connection, "state", lambda state: state["arms"]["right"]["joints"])["arms"]["right"]
-            assert [joint["position"] for joint in state["joints"]] == [0.1] * 4
-            name = f"panel {panel.process.pid}, 127.0.0.1 page 1"
-            while (name, "hold") not in arm.leases:
-                connection.send(json.dumps({"seen": message(connection, "state", lambda _: True)["number"]}))
-            arm.holder = "anna"
-            message(connection, "state", lambda state: state["control"]["elsewhere"] == "anna")
-            assert ask(do="enable", arm="right") == (403, "enable right: anna holds control of this arm")
-            assert ask(do="take") == (200, "")
-            arm.holder = name
-            message(connection, "state", lambda state: not state["control"]["elsewhere"])
-            while (name, "take") not in arm.leases:
-                message(connection, "state", lambda _: True)
-            assert ask(do="enable", arm="right") == (200, "")
-            assert ask(do="clear_fault", arm="right") == (409, "refused: there is no fault")
-            for begin in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE):
-                arm.lifecycle = begin
-                assert ask(do="activate", arm="right") == (200, "")
-                assert arm.lifecycle == State.PRIMARY_STATE_ACTIVE
-            refusal = "the bridge does not wait for its operator: it is played"
-            assert ask(do="activate", arm="right") == (409, refusal)
-            assert ask(do="set", arm="right", values={"support": 0.2}) == (200, "")
-            answer = httpx.get(panel.url + "settings/right", verify=False)  # also before the panel has heard of it
-            assert answer.json() == {"settings": {"support": 0.2}}
-            message(connection, "setup", lambda setup: is_known(setup, 0.2))
-            assert ask(do="let_down") == (200, "")
-            steps = (Transition.TRANSITION_CONFIGURE, *[Transition.TRANSITION_ACTIVATE] * 2)
-            activated = [("change_state", step) for step in steps]
-            assert arm.asked == [("enable", True), ("clear_fault", None), *activated, ("enable", False)]
-        finally:
-            arm.close()
-        message(connection, "state", lambda state: state["arms"]["right"]["bridge"] is None)
-        assert ask(do="let_down") == (409, "right: /right/can_bridge/enable does not answer")
+def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_another_program(page, stranger):
+    wait_until(lambda: stranger in page.panel.get("parameters").json())
+    assert page.ask("let_down") == (409, "no arm is present")
+    arm = PlayedArm()
+    try:
+        page.message("setup", is_known)
+        shown = page.message("state", lambda state: state["arms"]["right"]["joints"])["arms"]["right"]
+        assert [joint["position"] for joint in shown["joints"]] == [0.1] * 4
+        name = f"panel {page.panel.process.pid}, 127.0.0.1 page 1"
+        while (name, "hold") not in arm.leases:
+            page.connection.send(json.dumps({"seen": page.message("state")["number"]}))
+        arm.holder = "anna"
+        page.message("state", lambda state: state["control"]["elsewhere"] == "anna")
+        assert page.ask("enable", arm="right") == (403, "enable right: anna holds control of this arm")
+        assert page.ask("take") == (200, "")
+        arm.holder = name
+        page.message("state", lambda state: not state["control"]["elsewhere"])
+        while (name, "take") not in arm.leases:
+            page.message("state")
+        assert page.ask("enable", arm="right") == (200, "")
+        assert page.ask("clear_fault", arm="right") == (409, "refused: there is no fault")
+        for arm.lifecycle in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE):
+            assert page.ask("activate", arm="right") == (200, "")
+            assert arm.lifecycle == State.PRIMARY_STATE_ACTIVE
+        refusal = "the bridge does not wait for its operator: it is played"
+        assert page.ask("activate", arm="right") == (409, refusal)
+        assert page.ask("set", arm="right", values={"support": 0.2}) == (200, "")
+        settings = page.panel.get("settings/right").json()  # also before the panel has heard of it
+        assert settings == {"settings": {"support": 0.2}}
+        page.message("setup", lambda setup: is_known(setup, 0.2))
+        assert page.ask("let_down") == (200, "")
+        steps = (Transition.TRANSITION_CONFIGURE, *[Transition.TRANSITION_ACTIVATE] * 2)
+        activated = [("change_state", step) for step in steps]
+        assert arm.asked == [("enable", True), ("clear_fault", None), *activated, ("enable", False)]
+    finally:
+        arm.close()
+    page.message("state", lambda state: state["arms"]["right"]["bridge"] is None)
+    assert page.ask("let_down") == (409, "right: /right/can_bridge/enable does not answer")
 
 
 def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(tmp_path):
-    panel = PanelProcess(tmp_path, token=TOKEN)
-    probe = RosProbe()
+    panel, probe = PanelProcess(tmp_path, token=TOKEN), RosProbe()
     try:
-        assert TOKEN in panel.wait_for_address()
-        assert httpx.get(panel.url, verify=False).status_code == 401
-        assert httpx.get(panel.url, params={"token": TOKEN}, verify=False).status_code == 303
+        assert TOKEN in panel.address
+        assert [panel.get(params=given).status_code for given in ({}, {"token": TOKEN})] == [401, 303]
         values = probe.dump_parameters(["/panel"])["/panel"]["ros__parameters"]
-        assert values["port"] == panel.port
-        assert "token" not in values
+        assert values["port"] == panel.port and "token" not in values
         panel.process.terminate()
         assert panel.process.wait(PATIENCE) == 0
     finally:
