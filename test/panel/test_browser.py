@@ -455,17 +455,19 @@ def test_a_subject_is_chosen_with_its_wearer_and_the_past_sessions_have_their_re
         assert {key: settings[key] for key in WEARER_FILE} == WEARER_FILE, arm
 
 
-def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_key_and_digit(visit, stage):
+def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_key_and_digit(page, visit, stage):
+    page.fill("#markers [name=marker_text]", "cramp at 3")
     stage.arms.states = dict(BOTH_ACTIVE)
-    page = visit()
     wait_for_state(page, "active")
-    assert page.is_disabled("#presets button") and page.is_disabled("[name=marker_text]")
+    page.wait_for_selector("[name=marker_text]:disabled")
+    assert page.is_disabled("#presets button")
     page.click("#plots-head")
     page.keyboard.press("m")  # nothing is recorded yet
     page.click("#record")
     page.click("#presets button:has-text('Task begins')")
     page.keyboard.press("2")
     page.keyboard.press("m")
+    wait_for_text(page, "#message", "cramp at 3")
     page.click('#presets button:has-text("a text of one\'s own")')
     wait_until(page, lambda: len(stage.files.calls) == 5)
     watching = visit()
@@ -476,20 +478,10 @@ def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_
     page.click("#trial-start")
     page.click("#save")
     wait_until(page, lambda: "save" in stage.files.calls)
-    markers = ["marker begin", "marker end", "marker ", "marker a text of one's own", "marker "]
+    markers = ["marker begin", "marker end", "marker cramp at 3", "marker a text of one's own", "marker "]
     assert stage.files.calls == ["record", *markers, "stop_recording", "trial two_poses", "save"]
     page.keyboard.press("Space")
     wait_for_state(page, "letting down")
-
-
-def test_a_marker_has_the_text_that_was_entered_before(page, stage):
-    page.fill("#markers [name=marker_text]", "cramp at 3")
-    page.click("#record")
-    page.wait_for_selector("#marker:enabled")
-    page.click("#plots-head")
-    page.keyboard.press("m")
-    wait_for_text(page, "#message", "cramp at 3")
-    assert stage.files.calls == ["record", "marker cramp at 3"]
 
 
 # 8. The page for everyone

@@ -7,7 +7,7 @@ import asyncio
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -178,11 +178,13 @@ class PlayedFiles:
         self.content["recording"] = {"on": False, "foreign": False, "folder": "", "seconds": 0}
         return self._noted("stop_recording")
 
-    async def trial(self, name: str) -> str:
-        return self._noted(f"trial {name}")
+    def __getattr__(self, call: str) -> Callable[..., Coroutine[None, None, str]]:
+        """Return what notes any other call with its words."""
 
-    async def stop_trial(self) -> str:
-        return self._noted("stop_trial")
+        async def noted(**words: str) -> str:
+            return self._noted(" ".join((call, *words.values())))
+
+        return noted
 
     def past(self) -> dict[str, Any]:
         return {"subjects": sorted(self.wearers), "past": self.recorded}
@@ -191,15 +193,6 @@ class PlayedFiles:
         present = {"subject": subject, "protocol": protocol, "note": note, "folder": f"/data/{subject}"}
         self.content["session"] = {**present, "wearer": self.wearers.get(subject, {})}
         return self._noted(f"session {subject}, {protocol}, {note}")
-
-    async def keep_wearer(self) -> str:
-        return self._noted("keep_wearer")
-
-    async def marker(self, text: str) -> str:
-        return self._noted(f"marker {text}")
-
-    async def save(self) -> str:
-        return self._noted("save")
 
     def _noted(self, call: str) -> str:
         self.calls.append(call)
