@@ -200,10 +200,11 @@ def test_each_fault_says_what_happened_and_what_to_do(page, stage):
     wait_for_text(page, of_arm(".sentence"), "Die Neigung des Rumpfs kommt zu spät")
 
 
-def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_cleared_or_resumed(page, stage):
-    buttons = [page.locator(of_arm(name)) for name in (".enable", '[data-mode="zero_g"]')]
+def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_cleared_or_resumed(visit, stage):
     stage.arms.settings["right"].update({"mode": "zero_g", "support": 0.05})
     stage.arms.states["right"] = "active"
+    page = visit()
+    buttons = [page.locator(of_arm(name)) for name in (".enable", '[data-mode="zero_g"]')]
     wait_for_state(page, "active")
     before = [button.bounding_box() for button in buttons]
     for support in (0.3, 0.65):  # a slider on its way

@@ -18,6 +18,7 @@ from vqf import VQF
 from exo_gravity.core.arm.tilt import angle_between, rotation_matrix
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.imu import ImuRecord, mounting, six_rests
+from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.inputs.parameter_file import load
 
 from ..support import CONFIG
@@ -195,4 +196,13 @@ def test_a_recording_that_shows_nothing_is_refused_and_nothing_is_written(
 ) -> None:
     ended = calibrate("--bag", bag_of(tmp_path / "bag", samples, topic=topic))
     assert ended.code == 1 and sentence in ended.err
+    assert list(tmp_path.glob("new.*")) == []
+
+
+def test_a_result_that_is_refused_ends_with_1_and_is_not_written(tmp_path, calibrate, monkeypatch) -> None:
+    change = Change("/imu", "rotation_trunk_from_imu", [0.0, 0.0, 0.0, 1.0])
+    refused = CalibrationResult((change,), (), ("the bow slipped",))
+    monkeypatch.setattr("exo_gravity.lab.calibration.imu.calibrate_imu", lambda *_: refused)
+    ended = calibrate("--bag", tmp_path)
+    assert ended.code == 1 and "calibrate: not calibrated: the bow slipped" in ended.err
     assert list(tmp_path.glob("new.*")) == []
