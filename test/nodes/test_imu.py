@@ -31,7 +31,7 @@ from exo_gravity.sim.virtual_time import VirtualClock
 
 from ..support.fake_imu.chips import G as CHIP_G
 from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
-from ..support.imu_faults import bowing_and_walking
+from ..support.imu_motion import bowing_and_walking
 from ..support.node_thread import own_node
 from ..support.waiting import PATIENCE, wait_until
 
@@ -44,7 +44,7 @@ AHEAD = 25  # samples in flight: fewer than the node queues, so that none is los
 NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", "--ros-args"]
 
 
-# An IMU that the node reads itself. How a device is opened again: hardware/test_imu_reopening.py
+# An IMU that the node reads itself. How a device is opened again: hardware/test_imu_sources.py
 
 
 @pytest.fixture

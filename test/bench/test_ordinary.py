@@ -1,11 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The short version of `make study NAME=ordinary`: ordinary equipment refuses no start and lets no arm down."""
+"""Short versions of `make study NAME=ordinary`, where ordinary equipment lets no arm down, and of the IMU report."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from bench.imu_report import report
+from bench.imu_trials import read_trials
 from bench.ordinary.__main__ import is_quiet
 from bench.ordinary.motors import Electronics, OrdinaryMotor
 from bench.ordinary.rows import EQUIPMENT, Row
@@ -59,3 +61,9 @@ def test_noise_of_the_torque_does_not_depend_on_the_torque():
     motor = entered(1e-9, 1e-9, 0.1)
     replied = [reply_to(motor, command()).torque for _ in range(500)]
     assert np.std(replied) == pytest.approx(0.1, rel=0.2)
+
+
+def test_the_imus_report_has_a_row_for_each_trial_and_a_column_for_each_method():
+    lines = report(list(read_trials())[:1]).splitlines()
+    assert len(lines) == 4 and lines[0].startswith("| trial | here | published |")
+    assert lines[2].startswith("| 03 undisturbed slow rotation C | 0.")

@@ -1,24 +1,22 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The trunk's orientation from an IMU, on simulated motions known exactly; test_broad.py has recorded ones."""
+"""The trunk's orientation from an IMU: on simulated motions known exactly, and on recorded ones (BROAD)."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY as G
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import TUNING, ImuSample, TrunkEstimator
 
+from ..support.imu_motion import RECORDED, Motion, angles, by_vqf, down, follow, recorded
+from ..support.thorough import quick
+
 ALIGNED = (0.0, 0.0, 0.0, 1.0)
-G = 9.80665
-
-
-def angle(a, b):
-    """Angle in degrees between vectors (..., 3)."""
-    cross = np.linalg.norm(np.cross(a, b), axis=-1)
-    return np.degrees(np.arctan2(cross, np.sum(np.multiply(a, b), axis=-1)))
 
 
 def gravity(estimate):
@@ -46,7 +44,7 @@ def last(estimator, samples):
 @pytest.mark.parametrize("report", [False, True])
 def test_any_mounting_of_the_imu_gives_the_tilt_of_the_trunk(report):
     world_from_trunk = Rotation.from_euler("xyz", (0.2, -0.5, 1.0))
-    for mounting in Rotation.random(5, random_state=1):
+    for mounting in (*Rotation.random(5, random_state=1), Rotation.from_quat((1, 0, 0, 0))):  # also upside down
         estimator = TrunkEstimator(mounting.as_quat())
         answer = last(estimator, samples_of(lambda t, fixed=world_from_trunk * mounting: fixed, report=report))
         assert (answer.pitch, answer.roll) == pytest.approx((-0.5, 0.2), abs=1e-4)
@@ -57,23 +55,16 @@ def test_the_orientation_agrees_with_pitch_and_roll(report):
     mounting = Rotation.from_euler("zyx", (2.0, 0.4, -1.0))
     bow = samples_of(lambda t: Rotation.from_euler("xyz", (0.3, 0.2 * t, 0.1)) * mounting, report=report)
     answer = last(TrunkEstimator(mounting.as_quat()), bow)
-    down = Rotation.from_quat(answer.orientation).inv().apply((0, 0, -1))
-    assert down == pytest.approx(gravity(answer), abs=1e-6)
-
-
-def test_an_imu_mounted_upside_down_settles_the_right_way_up():
-    upside_down = Rotation.from_quat((1, 0, 0, 0))
-    answer = last(TrunkEstimator((1, 0, 0, 0)), samples_of(lambda t: upside_down))
-    assert (answer.pitch, answer.roll) == pytest.approx((0, 0), abs=1e-3)
+    assert down(answer.orientation) == pytest.approx(gravity(answer), abs=1e-6)
 
 
 def test_a_bow_through_90_degrees_is_followed_without_a_jump():
     estimator = TrunkEstimator(ALIGNED)
     last(estimator, samples_of(lambda t: Rotation.identity()))
     bow = samples_of(lambda t: Rotation.from_euler("y", t), duration=2.0, start=5.0)
-    down = np.array([gravity(estimator.update(sample)) for sample in bow])
-    assert angle(down[1:], down[:-1]).max() < 0.6  # 1 rad/s is 0.573 degrees a sample
-    assert down[-1] == pytest.approx((math.sin(2), 0, -math.cos(2)), abs=0.01)  # within one sample
+    seen = np.array([gravity(estimator.update(sample)) for sample in bow])
+    assert angles(seen[1:], seen[:-1]).max() < 0.6  # 1 rad/s is 0.573 degrees a sample
+    assert seen[-1] == pytest.approx((math.sin(2), 0, -math.cos(2)), abs=0.01)  # within one sample
 
 
 def test_the_gyroscope_bias_is_estimated_at_rest():
@@ -181,6 +172,95 @@ def test_without_vqf_an_imu_must_report_its_orientation(monkeypatch):
         estimator.update(GOOD)
 
 
-def test_the_mounting_must_be_a_unit_quaternion():
-    with pytest.raises(ParameterError, match="rotation_trunk_from_imu"):
-        TrunkEstimator((0, 0, 0, 0))
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("rotation_trunk_from_imu", (0, 0, 0, 0)), ("gyroscope_range", 0.0), ("accelerometer_range", 9.0)],
+)
+def test_a_mounting_or_a_range_that_no_sensor_has_is_refused(name, value):
+    with pytest.raises(ParameterError, match=name):
+        TrunkEstimator(**{"rotation_trunk_from_imu": ALIGNED, name: value})
+
+
+def test_values_beyond_the_given_ranges_are_refused_and_at_the_range_accepted():
+    estimator = TrunkEstimator(ALIGNED, 100.0, gyroscope_range=4.4, accelerometer_range=19.6)
+    last(estimator, samples_of(lambda t: Rotation.identity()))
+    for wrong, problem in (
+        (GOOD._replace(angular_velocity=(0.0, 5.0, 0.0)), "gyroscope_range = 4"),
+        (GOOD._replace(acceleration=(0.0, 25.0, G)), "accelerometer_range = 19"),
+    ):
+        with pytest.raises(ParameterError, match=problem):
+            estimator.update(wrong)
+    assert estimator.update(GOOD._replace(acceleration=(0.0, 19.6, G))) is not None
+
+
+def test_a_saturated_sample_is_carried_as_uncertainty():
+    estimator, untouched = settled(), settled()
+    before = untouched.update(GOOD)
+    after = estimator.update(GOOD._replace(angular_velocity=(0.0, 0.0, math.radians(2000.0))))
+    assert after is None or after.uncertainty > before.uncertainty
+
+
+def test_a_knock_beyond_the_range_is_followed_by_the_new_tilt_after_a_second_of_rest():
+    estimator, random = settled(), np.random.default_rng(8)
+    turned = np.array((0.0, math.sin(1.0), math.cos(1.0)))  # the true turn: 1 rad; the saturated rate shows 1.4
+    times, answers = 5.0 + 0.01 * np.arange(1, 405), []
+    for time in times:
+        rate, force = random.normal(0.0, 0.002, (2, 3)) + np.array((np.zeros(3), G * turned))
+        rate[0] += math.radians(2000.0) if time < 5.045 else 0.0
+        answers.append(estimator.update(ImuSample(time, rate, force)))
+    first = next(k for k, answer in enumerate(answers) if k >= 4 and answer)
+    assert answers[3] is None and times[first] < 6.5
+    assert all(answer.roll == pytest.approx(1.0, abs=0.02) for answer in answers[first:] if answer)
+
+
+EACH = pytest.mark.parametrize("path", quick(RECORDED[:2], RECORDED), ids=[path.stem for path in RECORDED])
+
+
+def score(motion, gravity, counts):
+    """Errors in degrees of the published tilts that count: RMS, largest; and the share of those published."""
+    published = counts & np.isfinite(gravity[:, 0])
+    errors = angles(gravity[published], motion.gravity[published])
+    return np.sqrt(np.mean(errors**2)), errors.max(), published.sum() / counts.sum()
+
+
+@EACH
+def test_on_real_motion_the_tilt_is_as_good_as_vqfs_and_never_off_by_5_degrees(path):
+    motion, counts = recorded(path)
+    kept = np.random.default_rng(0).random(len(counts)) >= 0.03
+    rms, largest, published = score(motion.at(kept), follow(motion.at(kept)).gravity, counts[kept])
+    vqf, _, _ = score(motion, down(by_vqf(motion)), counts)
+    assert rms <= max(1.1 * vqf, vqf + 0.1) and largest < 5.0 and published >= 0.99
+
+
+def test_evenly_spaced_samples_give_vqf_alone():
+    motion, _ = recorded(RECORDED[0])
+    here, alone = follow(motion).gravity, down(by_vqf(motion))
+    published = np.isfinite(here[:, 0])
+    assert published.mean() > 0.9
+    # The bias is read every tenth sample, and matters only to rounding.
+    np.testing.assert_allclose(here[published], alone[published], atol=1e-5)
+
+
+def test_jitter_of_the_stamps_costs_little():
+    motion, counts = recorded(RECORDED[2])
+    jitter = np.random.default_rng(1).uniform(-0.3, 0.3, len(motion.times)) / motion.rate
+    jittered = replace(motion, times=motion.times + jitter)
+    rms, _, published = score(motion, follow(jittered).gravity, counts)
+    assert rms < score(motion, follow(motion).gravity, counts)[0] + 0.1 and published >= 0.99
+
+
+@EACH
+def test_a_start_amid_strong_motion_gives_a_tilt_within_12_seconds(path):
+    motion, counts = recorded(path)
+    # Motion that is played forward and then backward has no jump: rates change their sign, forces do not.
+    order = np.arange(2 * len(counts))
+    order = np.minimum(order, order[::-1])
+    sign = np.where(np.arange(len(order)) < len(counts), 1.0, -1.0)[:, None]
+    shaken = motion.at(order)
+    for start in np.linspace(np.flatnonzero(counts)[0], len(counts) - 2.0 * motion.rate, 5).astype(int):
+        part = slice(start, start + round(12.0 * motion.rate))
+        times = np.arange(part.stop - part.start) / motion.rate
+        rates = (sign * shaken.gyroscope)[part]
+        nothing = np.zeros_like(rates)
+        began = Motion(motion.rate, times, rates, shaken.accelerometer[part], nothing)
+        assert np.isfinite(follow(began).gravity).any()
