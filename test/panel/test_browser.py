@@ -207,19 +207,21 @@ def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_clear
     buttons = [page.locator(of_arm(name)) for name in (".enable", '[data-mode="zero_g"]')]
     wait_for_state(page, "active")
     before = [button.bounding_box() for button in buttons]
+    stage.arms.fail("right", "over_temperature")
+    wait_for_state(page, "fault")
+    assert [button.bounding_box() for button in buttons] == before
+    assert page.is_disabled(of_arm(".enable")) and not page.is_visible(of_arm(".resume"))
+    page.click(of_arm(".clear"))
+    wait_for_state(page, "disabled")
+    assert "hot" not in page.inner_text(of_arm(".tell"))
     for support in (0.3, 0.65):  # a slider on its way
         stage.arms.settings["right"]["support"] = support
         page.wait_for_timeout(300)
     stage.arms.fail("right", "over_speed")
     change = "the support was changed from 5.0 % to 65.0 %"
     wait_for_text(page, of_arm(".tell"), "A joint moved too fast", change, "Set it back")
-    assert [button.bounding_box() for button in buttons] == before
-    assert page.is_disabled(of_arm(".enable")) and not page.is_visible(of_arm(".resume"))
     page.reload()
     wait_for_text(page, of_arm(".tell"), change)
-    page.click(of_arm(".clear"))
-    wait_for_state(page, "disabled")
-    assert "changed" not in page.inner_text(of_arm(".tell"))
     stage.arms.fail("right", "command_stale")  # it leaves nothing to repair
     page.click(of_arm(".resume"))
     wait_for_state(page, "active")
