@@ -71,7 +71,7 @@ def safety_case() -> Iterator[str]:
 
     An asterisk in a name stands for any text.
     """
-    found = re.findall(r"\| cause \|.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
+    found = re.findall(r"\| cause.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
     cells = (line.split(" | ")[-1] for table in found for line in table.splitlines())
     names = [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
     rows = [case.name for case in CASES]

@@ -11,7 +11,7 @@ import argparse
 import re
 import runpy
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -19,7 +19,6 @@ from typing import Any
 
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.families import OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
 from exo_gravity.core.params import Param
@@ -29,7 +28,6 @@ from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL
-from exo_gravity.sim.motors.firmware import FIRMWARES, FIRST_SPECIAL, SHUT_OFF_AT, WARM_ABOVE, Firmware
 from exo_gravity.sim.params import SIMULATOR
 
 DOCS = Path(__file__).parent
@@ -65,108 +63,50 @@ MOTOR_HEAD = (
 TABLE = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
-def _is_v3(firmware: Firmware) -> bool:
-    return firmware.wire_format == MIT_V3.name
-
-
-def _enter(f: Firmware) -> str:
-    if f.exit_clears:
-        return "carries out a command that came while off; EXIT clears the last one"
-    return "resumes the last command" + ("" if f.remembers_off else " of motor mode")
-
-
-def _set_zero(f: Firmware) -> str:
-    reply = f"no reply, silent for {f.zero_silence:g} s" if f.zero_silence else "replies at once"
-    return reply + ("" if f.zero_while_on else "; ignored while on")
-
-
-def _timeout(f: Firmware) -> str:
-    return f"{1000.0 * f.timeout:g} ms" if f.timeout else "none"
-
-
-def _reply(f: Firmware) -> str:
-    if not _is_v3(f):
-        sender = "the ID 0" if f.reply_to_master else "its own ID"
-        return f"{f.reply_length} bytes with {sender}, within {1e6 * f.reply_delay[1]:.0f} us"
-    return f"{f.status_rate:g} status frames a second" if f.reports else "none: silent until asked"
-
-
-def _special(f: Firmware) -> str:
-    return "FF x 7 and FC, FD, FE" if f.first_special == FIRST_SPECIAL else "FF x 7 and EE to FE: FB leaves the bus"
-
-
-def _also_obeyed(f: Firmware) -> str:
-    also = [
-        "IDs with the same lowest 7 bits" if f.id_bits < 11 else "",
-        "frames of 1 to 7 bytes" if f.shortest_command == 1 else "",
-        "frames of 1 to 7 bytes and remote frames" if f.shortest_command == 0 else "",
-        "ID 0xFF" if f.obeys_broadcast else "",
-    ]
-    return ", ".join(filter(None, also)) or "nothing"
-
-
-# What docs/motors.md asks of a firmware, the fields that may be assumed, and the answer.
-Question = tuple[str, tuple[str, ...], Callable[[Firmware], str]]
-MIT_QUESTIONS: tuple[Question, ...] = (
-    (
-        "a command while off",
-        ("remembers_off",),
-        lambda f: "kept for ENTER; replies" if f.remembers_off else "ignored; replies",
-    ),
-    ("ENTER", ("remembers_off", "exit_clears"), _enter),
-    ("SET_ZERO", ("zero_silence", "zero_while_on"), _set_zero),
-    ("zero after a power cycle", ("zero_kept",), lambda f: "the new one" if f.zero_kept else "the old one"),
-    (
-        "error byte",
-        (),
-        lambda f: f"mask: 2 above {WARM_ABOVE:g} degC, 6 and off at {SHUT_OFF_AT:g}" if f.error_is_mask else "a code",
-    ),
-    ("position range", (), lambda f: f"{f.position_range} rad" if f.position_range else "usual"),
-    ("special frames", (), _special),
-)
-QUESTIONS: tuple[Question, ...] = (
-    ("CAN time-out", ("timeout",), _timeout),
-    (
-        "switching on with an encoder error",
-        ("refuses_encoder_error",),
-        lambda f: "refused in silence" if f.refuses_encoder_error else "obeyed",
-    ),
-    ("reply or status", ("reports",), _reply),
-    ("also obeyed", ("shortest_command",), _also_obeyed),
-    ("after a bus error", ("retransmits",), lambda f: "sends again" if f.retransmits else "the frame is lost"),
-)
-
-
 def parameter_table(node: str) -> str:
-    """Return the Markdown tables of one node's parameters: the usual ones, then those for experts, without ranges."""
+    """Return the Markdown lists of one node's parameters: the usual ones, then the names of those for experts."""
     bases = [base for base in BASES if base != node]
-    shared: dict[str, list[str]] = defaultdict(list)
+    shared: dict[str, list[Param]] = defaultdict(list)
     own = []
     for param in PARAMETERS[node]:
-        base = next((base for base in bases if any(_same(param, other) for other in PARAMETERS[base])), None)
+        same = _plays if node == "simulator" else _same
+        base = next((base for base in bases if any(same(param, other) for other in PARAMETERS[base])), None)
         if base and node in REPEATING:
-            shared[base].append(f"`{param.name}`")
+            shared[base].append(param)
         else:
             own.append(param)
-    as_in = "; ".join(f"as of `{base}`: {', '.join(names)}" for base, names in shared.items())
-    usual, expert = ([p for p in own if p.expert is wanted] for wanted in (False, True))
-    before = (f"A{as_in[1:]}.\n\n" if as_in else "") + _live_ones(PARAMETERS[node])
-    text = before + _parameter_rows(usual, with_range=True)
-    return f"{text}\nFor experts:\n\n{_parameter_rows(expert, with_range=False)}" if expert else text
+    whose = "true values of" if node == "simulator" else "as of"
+    as_in = "; ".join(f"{whose} `{base}`: {_runs(params, PARAMETERS[node])}" for base, params in shared.items())
+    rare = [
+        p for p in own if (p.fixed if node == "simulator" else p.expert)
+    ]  # those of the simulated arm that are live
+    usual, expert = [p for p in own if p not in rare], rare
+    before = (f"{as_in[0].upper()}{as_in[1:]}.\n\n" if as_in else "") + _live_ones(PARAMETERS[node])
+    text = before + _parameter_items(usual, with_range=node != "simulator")
+    names = ", ".join(f"`{param.name}`" for param in expert)
+    return f"{text}\nFurther ones, which `ros2 param describe` explains: {names}.\n" if expert else text
+
+
+def _runs(params: Sequence[Param], table: Sequence[Param]) -> str:
+    """Return the names of these parameters; of three or more that follow each other in the table the first and last."""
+    numbers = [index for index, param in enumerate(table) if param in params]
+    runs = [[index for _, index in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    names = [[f"`{table[index].name}`" for index in run] for run in runs]
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(run) for run in names)
 
 
 def _live_ones(params: Sequence[Param]) -> str:
     """Return a sentence that says which parameters a running node accepts; '' where it accepts none."""
-    live, fixed = ([f"`{p.name}`" for p in params if p.fixed is wanted] for wanted in (False, True))
+    live, fixed = ([p for p in params if p.fixed is wanted] for wanted in (False, True))
     if not live:
         return ""
     few, what = (fixed, "All but these are live") if len(fixed) < len(live) else (live, "Live")
-    return f"{what}: {', '.join(few)}.\n\n" if few else "All are live.\n\n"
+    return f"{what}: {_runs(few, params)}.\n\n" if few else "All are live.\n\n"
 
 
-def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
-    """Return a Markdown table, with one row for the components x, y and z of a vector."""
-    rows = []
+def _parameter_items(params: Sequence[Param], with_range: bool) -> str:
+    """Return a Markdown list, with one item for the components x, y and z of a vector."""
+    items = []
     for _, group in groupby(params, lambda param: re.sub("_[xyz]$", "_", param.name)):
         first, *others = group
         names = ", ".join(f"`{param.name}`" for param in (first, *others))
@@ -174,9 +114,10 @@ def _parameter_rows(params: Sequence[Param], with_range: bool) -> str:
         meaning = (
             re.sub(r"\b(along|about) [xyz](_n)?\b", rf"\1 {axes}", first.description) if others else first.description
         )
-        permitted = _range(first) if with_range else ""
-        rows.append((names, f"{_default(first)} {permitted}".rstrip(), meaning))
-    return markdown(("parameter", "default (range)" if with_range else "default", "meaning"), rows)
+        permitted = _range(first) if with_range or first.choices else ""
+        value = " ".join(filter(None, (_default(first), permitted)))
+        items.append(f"- {names}, {value}: {meaning}\n")
+    return "".join(items)
 
 
 def _same(param: Param, other: Param) -> bool:
@@ -184,27 +125,14 @@ def _same(param: Param, other: Param) -> bool:
     return replace(param, fixed=other.fixed, expert=other.expert, vector=other.vector) == other
 
 
-def fault_table() -> str:
-    """Return the Markdown table of the fault codes."""
-    return markdown(("fault", "meaning"), ((f"`{code}`", code.meaning) for code in FaultCode))
+def _plays(param: Param, other: Param) -> bool:
+    """Whether the simulated arm has a parameter of the real one: its true value."""
+    return param.name == other.name
 
 
-def firmware_table() -> str:
-    """Return the Markdown tables of what each firmware does, of V1 and V2 boards, then of V3 boards.
-
-    What is not known is marked: there the worst case is played.
-    """
-    mit, v3 = ({name: f for name, f in FIRMWARES.items() if _is_v3(f) is wanted} for wanted in (False, True))
-    both = _answers("V1 and V2 boards", mit, (*MIT_QUESTIONS, *QUESTIONS)), _answers("V3 boards", v3, QUESTIONS)
-    return "\n".join(both)
-
-
-def _answers(boards: str, firmwares: Mapping[str, Firmware], questions: Iterable[Question]) -> str:
-    rows = []
-    for question, names, answer in questions:
-        marks = ("*" if firmware.assumed & set(names) else "" for firmware in firmwares.values())
-        rows.append((question, *(f"{answer(f)}{mark}" for f, mark in zip(firmwares.values(), marks, strict=True))))
-    return markdown((boards, *(f"`{name}`" for name in firmwares)), rows)
+def fault_list() -> str:
+    """Return the Markdown list of the fault codes."""
+    return "".join(f"- `{code}`: {code.meaning}\n" for code in FaultCode)
 
 
 def motor_table() -> str:
@@ -239,20 +167,20 @@ def _has_ranges(board: WireFormat, spec: MotorSpec) -> bool:
     return True
 
 
-def topic_table() -> str:
-    """Return the Markdown table of the policy's publishers and subscribers of each topic.
+def topic_list() -> str:
+    """Return the Markdown list of each topic's publishers and subscribers, as the policy has them.
 
     Raises ValueError for a topic that docs/topics.md does not describe.
     """
     topics = runpy.run_path(str(POLICY))["TOPICS"]
-    described = set(re.findall(r"^\| `([\w/]+)` \| \w+_msgs/", TOPICS.read_text(encoding="utf-8"), re.MULTILINE))
+    described = set(re.findall(r"^- `([\w/]+)`, \w+_msgs/", TOPICS.read_text(encoding="utf-8"), re.MULTILINE))
     if missing := topics.keys() - EVERY_NODES - described:
         raise ValueError(f"{TOPICS}: must describe {', '.join(sorted(missing))}")
-    rows = [
-        (f"`{name}`", *(", ".join(sorted(f"`{node.rpartition('/')[2]}`" for node in way)) for way in topics[name]))
-        for name in sorted(topics.keys() - EVERY_NODES, key=lambda name: (name.lstrip("/"), name))
-    ]
-    return markdown(("topic", "published by", "subscribed by"), rows)
+    items = []
+    for name in sorted(topics.keys() - EVERY_NODES, key=lambda name: (name.lstrip("/"), name)):
+        ways = [", ".join(sorted(f"`{node.rpartition('/')[2]}`" for node in way)) or "any" for way in topics[name]]
+        items.append(f"- `{name}`: {ways[0]} to {ways[1]}\n")
+    return "".join(items)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -264,10 +192,9 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def renewed(text: str) -> str:
     """Return a document's text with every table as the code declares it. Raises KeyError for an unknown table."""
     tables = {node: parameter_table(node) for node in PARAMETERS} | {
-        "faults": fault_table(),
-        "firmwares": firmware_table(),
+        "faults": fault_list(),
         "motors": motor_table(),
-        "topics": topic_table(),
+        "topics": topic_list(),
     }
     return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)
 
@@ -289,7 +216,7 @@ def _default(param: Param) -> str:
 def _range(param: Param) -> str:
     """Return the values other than the default that are permitted, in parentheses; '' if all of the type are."""
     if param.name == "motor":
-        return "([motors.md](motors.md))"
+        return "([motors](motors.md))"
     if others := [choice for choice in param.choices if choice not in _shown(param.default).split(", ")]:
         return f"(or {', '.join(others)})"
     return f"({param.bounds[0]:g}..{param.bounds[1]:g})" if param.bounds else ""

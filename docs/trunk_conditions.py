@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Prints what the benefit of `inertial` depends on: the figures of docs/imu.md that are not in its first two tables.
+"""Prints what the benefit of `inertial` depends on: the figures at the end of docs/imu.md.
 
 `python docs/trunk_conditions.py` takes about ten minutes and does not need ROS.
 """

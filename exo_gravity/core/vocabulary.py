@@ -8,7 +8,7 @@ tells both at once.
 
 from enum import Enum
 
-INTERFACE = 1  # the version of the keys and words: docs/stability.md
+INTERFACE = 1  # the version of the keys and words: docs/topics.md
 NONE, UNKNOWN = "none", "unknown"  # nothing to tell; something that the node does not know
 TEXT = " text"  # a key that ends so has a sentence, which no program may read
 

@@ -251,7 +251,7 @@ class Access:
         scope, headers = connection.scope, connection.headers
         host = headers.get("host", "")
         if self.is_open and not is_loopback(re.sub(r":\d*$", "", host).strip("[]")):
-            return PlainTextResponse("403: the panel answers on loopback only: see docs/panel.md", 403)
+            return PlainTextResponse("403: the panel answers on loopback only: see docs/operating.md", 403)
         changes = scope.get("method") not in ("GET", "HEAD")  # a live connection has no method
         if changes and not is_same_origin(headers.get("origin", ""), host):
             return PlainTextResponse("403: this request does not come from the panel's page", 403)

@@ -17,7 +17,7 @@ from exo_gravity.lab.view.urdf import described, urdf
 PANEL = (
     Param("host", "127.0.0.1", "address of the page; other than loopback only with a token", fixed=True),
     Param("port", 8080, "TCP port of the page", (1, 65535), fixed=True),
-    Param("token", "", "secret that opens the page; empty: none on loopback, elsewhere a random one in the log",
+    Param("token", "", "secret that opens the page; empty: random beyond loopback, in the log",
           fixed=True),
     Param("dead_man", False, "let the arms down when the page that holds control has been gone for 1 s", fixed=True),
     Param("language", "auto", "language of the page until its user chooses another; auto: the browser's",

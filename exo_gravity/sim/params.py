@@ -56,7 +56,7 @@ FIRMWARE = (
     Param(
         "firmware.variant",
         [USUAL] * JOINT_COUNT,
-        "what the boards' firmware does, docs/motors.md; usual: ak, v3, or that of the motor's family",
+        "what the boards' firmware does (sim/motors/firmware.py); usual: ak, v3, or that of the motor's family",
         choices=(USUAL, *FIRMWARES),
         fixed=True,
     ),
@@ -104,11 +104,11 @@ SIMULATOR = (
     *(replace(param_of(ImuConfig, field, fixed=True), name=f"imu.{field}") for field in IMU_FIELDS),
     Param("trunk.pitch", 0.0, "forward tilt of the trunk, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
     Param("trunk.roll", 0.0, "tilt of the trunk to the right, approached at 0.5 rad/s", (-3.1, 3.1), "rad"),
-    Param("trial", "", "script file of the virtual wearer, who starts at once if it is set live; empty ends it"),
+    Param("trial", "", "script of the virtual wearer; empty ends it"),
     Param(
         "trial_delay",
         until_carried(JOINT_COUNT),
-        "time from the motors being on to the wearer's first step, by default that until the arm is carried",
+        "time from the motors being on to the wearer's first step",
         (0.0, 60.0),
         "s",
         fixed=True,

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The files of a47959f4 work unchanged, except that a person confirms the pose: what docs/stability.md promises."""
+"""The files of a47959f4 work unchanged, except that a person confirms the pose: what docs/topics.md promises."""
 
 from __future__ import annotations
 

@@ -44,11 +44,10 @@ def sections() -> dict[str, str]:
     return dict(zip(heads, parts[1::2], strict=True))
 
 
-def tables(section: str) -> Iterator[list[list[str]]]:
-    """Yield the cells of each table in a section, its head first."""
-    for table in re.findall(r"(?:^\|.*\n?)+", section, re.MULTILINE):
-        head, _, *rows = ([cell.strip() for cell in line.strip("|\n ").split(" | ")] for line in table.splitlines())
-        yield [head, *rows]
+def items(section: str) -> list[tuple[str, str]]:
+    """Return the items of a section's list: what is in backticks before the first colon, and what follows it."""
+    joined = re.sub(r"\n  +", " ", section)
+    return re.findall(r"^- (`[^:]*`): (.*)$", joined, re.MULTILINE)
 
 
 @lru_cache
@@ -56,13 +55,8 @@ def documented() -> Mapping[str, Mapping[str, Row]]:
     """Return what the page says, by executable and key; '' has what it says of every node."""
     found: dict[str, dict[str, Row]] = {"": {}}
     for anchor, section in sections().items():
-        for head, *rows in tables(section):
-            if head == ["key", "values"]:
-                owner = "" if anchor == "every-node" else anchor
-                found.setdefault(owner, {}).update(pair for keys, cell in rows for pair in _of_row(keys, cell))
-            elif head == ["node", "key", "values"]:
-                for node, keys, cell in rows:
-                    found.setdefault(node.strip("`"), {}).update(_of_row(keys, cell))
+        owner = "" if anchor == "every-node" else anchor
+        found.setdefault(owner, {}).update(pair for keys, cell in items(section) for pair in _of_row(keys, cell))
     return found
 
 
@@ -75,13 +69,12 @@ def _of_row(keys: str, cell: str) -> Iterator[tuple[str, Row]]:
 
 
 def _below(key: str, cell: str) -> Iterable[str]:
-    """Return the words in the table to which a cell leads."""
+    """Return the words in the list to which a cell leads: those of the key, or else its items."""
     if (link := LINK.search(cell)) is None:
         return []
-    ((head, *rows),) = tables(sections()[link[1]])
-    if head[0] == "word":
-        return [word for word, *_ in rows for word in CODE.findall(word)]
-    return [word for own, words in rows if own == f"`{key}`" for word in CODE.findall(words)]
+    rows = items(sections()[link[1]])
+    own = [cell for keys, cell in rows if keys == f"`{key}`"]
+    return CODE.findall(own[0]) if own else [word for words, _ in rows for word in CODE.findall(words)]
 
 
 def row_of(node: str, key: str) -> Row | None:

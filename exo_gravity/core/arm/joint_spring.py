@@ -29,7 +29,7 @@ class JointSpring:
 
     stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "of the device's own springs across each joint, such as cables, by `calibrate`; 0: none. Not the term `spring`",
+        "of the device's own springs, such as cables, by `calibrate`",
         (0.0, MAX_STIFFNESS),
         "Nm/rad",
         expert=True,

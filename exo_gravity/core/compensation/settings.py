@@ -119,7 +119,7 @@ class Settings:
     joint_spring: JointSpring = field(default_factory=JointSpring)  #: the device's own; every law gets it
     joint_stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "stiffness of each joint between its motor, with the encoder, and its link; 0: rigid. Not `joint_spring`",
+        "stiffness between each motor and its link; 0: rigid. Not `joint_spring`",
         (0.0, STIFFEST),
         "Nm/rad",
         expert=True,
@@ -291,22 +291,21 @@ MODEL_PARAMETERS = tuple(replace(param, name=f"model_error.{param.name}") for pa
 WORN_MOMENTS = ("wearer.moment_x", "wearer.moment_y", "wearer.moment_z")  # of an arm from a URDF
 # What an arm from a URDF has in place of PAPER: the first also in `simulator`.
 URDF_FILE = Param("urdf.file", "", "path of the URDF; empty: the topic urdf.topic", fixed=True)
-URDF_HAND = Param("urdf.hand", "", "link of the URDF that holds the load; empty: there is no load, nor a wearer on the "
-                  "last link", fixed=True)
+URDF_HAND = Param("urdf.hand", "", "link that holds the load; empty: no load, no wearer on the last link", fixed=True)
 URDF = (
     URDF_FILE,
     Param("urdf.topic", "/robot_description", "latched topic of the URDF, a std_msgs/String", fixed=True),
     URDF_HAND,
-    Param("wearer.links", list(PAPER_LINKS), "which links carry the upper arm, and forearm and hand, from 1 on; 0: the "
-          "robot does not carry it", (0, MAX_JOINTS), vector=True, fixed=True),
-    *(Param(f"urdf.moment_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: what the first moment of each joint's "
-            f"link has beyond the URDF's, along {axis} of the joint's frame", (-MAX_MOMENT, MAX_MOMENT), "kg m",
+    Param("wearer.links", list(PAPER_LINKS), "links that carry upper arm, and forearm and hand, from 1 on; 0: none",
+          (0, MAX_JOINTS), vector=True, fixed=True),
+    *(Param(f"urdf.moment_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: each link's first moment beyond the "
+            f"URDF's, along {axis} of the joint's frame", (-MAX_MOMENT, MAX_MOMENT), "kg m",
             fixed=True, expert=True) for axis in "xyz"),
-    *(Param(f"urdf.turn_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: by what the place of each joint, and so "
-            f"its axis, is turned beyond the URDF's, about {axis} of the joint's frame", (-0.2, 0.2), "rad",
+    *(Param(f"urdf.turn_{axis}", [0.0] * JOINT_COUNT, "by `calibrate gravity`: turn of each joint's axis beyond the "
+            f"URDF's, about {axis} of the joint's frame", (-0.2, 0.2), "rad",
             fixed=True, expert=True) for axis in "xyz"),
-    *(Param(name, [0.0] * JOINT_COUNT, "by `calibrate wearer`: what the wearer's arm adds to the first moment of each "
-            f"joint's link, along {name[-1]} of the joint's frame; all 0: by mass and cog",
+    *(Param(name, [0.0] * JOINT_COUNT, "by `calibrate wearer`: what the wearer's arm adds to each link's first "
+            f"moment, along {name[-1]} of the joint's frame; all 0: by mass and cog",
             (-MAX_WORN_MOMENT, MAX_WORN_MOMENT), "kg m", expert=True) for name in WORN_MOMENTS),
 )
 PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
@@ -327,7 +326,7 @@ def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
                 "description": "urdf computes the torque of any serial arm from its URDF"},
         "joint_names": {"vector": False,
-                        "description": "in the order of the commands; other joints: from the joint states, or at 0"},
+                        "description": "in the order of the commands"},
         "max_effort": {"default": [0.0] * count, "bounds": (0.0, LARGEST_EFFORT),
                        "description": "torque limit per joint; 0: the URDF's"},
         "spring.pose": {"default": [0.0] * count},

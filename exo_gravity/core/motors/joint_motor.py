@@ -204,7 +204,7 @@ VIRTUAL_CAN = "vcan"  # begins Linux's names of CAN interfaces without an adapte
 # `can_bridge` assumes these properties of its motors; `simulator` builds motors that have them.
 MOTOR_PARAMETERS = (
     Param("can.interface", "", "python-can interface, e.g. socketcan, udp_multicast", fixed=True, required=True),
-    Param("can.channel", "", "python-can channel, e.g. can0; with two buses one per motor, e.g. can0,can0,can1,can1",
+    Param("can.channel", "", "python-can channel, e.g. can0; with two buses can0,can0,can1,can1",
           fixed=True, required=True),
     Param("motor", list(USUAL_MOTORS), "motor types", choices=MOTORS, fixed=True),
     Param("can_id", [1, 2, 3, 4], "CAN IDs", (1, MAX_CAN_ID), fixed=True),
@@ -212,8 +212,8 @@ MOTOR_PARAMETERS = (
     Param("zero", [0.0] * 4, "motor angle at which the joint angle is 0", (-LARGEST_ZERO, LARGEST_ZERO), "rad",
           fixed=True),
     Param("torque_scale", [1.0] * 4, "real output torque per commanded Nm", TORQUE_SCALE_BOUNDS, fixed=True),
-    Param("torque_scale_slope", [0.0] * 4, "change of torque_scale per kelvin of the motor's temperature, about -0.001 "
-          "of a neodymium magnet; 0: none, or not known", SCALE_SLOPE_BOUNDS, "1/K", fixed=True),
+    Param("torque_scale_slope", [0.0] * 4, "change of torque_scale per kelvin, about -0.001 of a neodymium magnet",
+          SCALE_SLOPE_BOUNDS, "1/K", fixed=True),
     Param("torque_scale_temperature", [SCALE_TEMPERATURE] * 4, "motor temperature at which torque_scale is true",
           SCALE_TEMPERATURE_BOUNDS, "degC", fixed=True),
     Param("wire_format", ["mit"] * 4, "mit_v3 for V3 boards of AK motors, mit for others", choices=FORMATS, fixed=True),

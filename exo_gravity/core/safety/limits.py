@@ -106,7 +106,7 @@ class Limits:
     )
     driven_speed: float = owned(
         1.5,
-        "from this speed on, a joint that its motor drives is braked; 1 rad/s faster, its motor no longer drives it",
+        "speed from which a joint that its motor drives is braked, and no longer driven 1 rad/s above",
         (0.5, 4.0),
         "rad/s",
         expert=True,
@@ -116,8 +116,7 @@ class Limits:
     reply_timeout: float = READING.reply_timeout
     start_pose: str = owned(
         "confirm",
-        "who vouches, before a start from unknown zeros, that the arm hangs as its angles say: confirm: the operator; "
-        "hanging: who starts the nodes",
+        "who vouches that the arm hangs at a start from unknown zeros: the operator, or (hanging) who starts the nodes",
         choices=START_POSES,
     )
     enable_timeout: float = owned(10.0, "time in which the checks of a start must pass", (2.0, 60.0), "s")
@@ -126,15 +125,13 @@ class Limits:
     )
     largest_moment: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "M1 to M4 of robot plus heaviest wearer, by `budget`: efforts that no load up to these needs are a fault; "
-        "zeros: not checked",
+        "M1 to M4 of robot plus heaviest wearer, by `budget`; efforts beyond their need: a fault; zeros: not checked",
         (0.0, MAX_MOMENT),
         "kg m",
     )
     largest_addition: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "torque beyond what `largest_moment` needs: the sum of the bounds of assistance and terms in use, of "
-        "`inertial`, and of `joint_spring`",
+        "torque beyond what `largest_moment` needs, of assistance, terms, `inertial` and `joint_spring`",
         (0.0, 10.0),
         "Nm",
     )
@@ -238,7 +235,7 @@ CAN_BRIDGE = (
     Param(
         "can.serial",
         "",
-        "serial number of the adapter, with two buses one per motor; empty: any",
+        "serial number of the adapter; empty: any",
         fixed=True,
     ),
     *LIMIT_PARAMETERS,

@@ -2,7 +2,7 @@
 """What motors did while the control loop stood still: whether their own time-out took their torque away.
 
 A motor's firmware may let go of its joint if no command comes for a while, without damping and without a word, and the
-next command brings the torque back at once (docs/motors.md). A reply only follows that command: so the first one after
+next command brings the torque back at once (docs/wiring.md). A reply only follows that command: so the first one after
 a pause is given with full damping, and the readings that follow tell whether a joint fell meanwhile.
 """
 

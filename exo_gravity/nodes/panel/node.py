@@ -303,7 +303,7 @@ class Panel(Node):
             return
         log.info(f"the panel is at http://{shown}:{port}/?token={access.token}")
         if not access.on_loopback:
-            log.warning("anyone on the network path can read the token: put TLS before it (docs/panel.md)")
+            log.warning("anyone on the network path can read the token: put TLS before it (docs/operating.md)")
 
     def _note(self, text: str) -> None:
         """Write `text` to the log, and to /diagnostics, which recordings hold."""

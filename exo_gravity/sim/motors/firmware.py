@@ -2,7 +2,6 @@
 """What the firmwares of AK boards do that the wire format does not say: a record each.
 
 Where the firmware of a family was not run or read, the record holds the worst case, and `assumed` names the field.
-The table in docs/motors.md is made from these records.
 
 - `ak`: V1 and V2 boards as the manual V1.0.15 describes them and users report them: silent after SET_ZERO, without a
   time-out. What they do with a command while off is not known.

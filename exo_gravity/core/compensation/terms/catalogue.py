@@ -260,7 +260,7 @@ class Friction(TermParameters):
     #: The term leaves it to the joint, which it so overcompensates less.
     load: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
-        "share of a gear's torque that is friction, by `calibrate friction`, for the estimate of the wearer's torque",
+        "share of a gear's torque that is friction, by `calibrate friction`, for `wearer`",
         (0.0, MAX_LOAD_FRICTION),
     )
 
