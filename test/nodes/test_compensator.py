@@ -30,7 +30,9 @@ from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.nodes.compensator import arm
 from exo_gravity.nodes.ros.subscriptions import LATCHED
+from exo_gravity.tools import train_anfis
 
+from ..support import CONFIG
 from ..support.compensator_rig import CompensatorRig
 from ..support.joint_state_feeder import PARTS, POSE, ROBOT
 
@@ -288,6 +290,18 @@ def test_a_wrong_or_second_sender_of_requests_raises_no_support(make_rig):
     second = sender()
     rig.on_cycle = lambda _: (ask(share=0.8), second(share=0.9))
     rig.wait_for({"support in use": "0.4", "support request": "second_publisher"})
+
+
+@pytest.mark.thorough
+def test_the_anfis_law_runs_from_its_file_and_the_exact_law_replaces_it_outside_its_training(rig, tmp_path):
+    path = str(tmp_path / "anfis.json")
+    assert train_anfis.main(["--params", str(CONFIG / "sim.yaml"), "--output", path]) == 0
+    both = [Parameter("law", value="anfis"), Parameter("anfis_file", value=path)]
+    assert rig.node.set_parameters_atomically(both).successful
+    rig.wait_for({"law in use": "anfis", "state": "compensating"})
+    assert rig.set(mode="zero_g", support=1.0, wearer__body_mass=75.0) == [""] * 3
+    message = "the exact law replaces anfis: the ANFIS was trained for another arm"
+    rig.wait_until(lambda: message in rig.status.message)
 
 
 def is_zero(rig: CompensatorRig) -> bool:
