@@ -386,10 +386,12 @@ def test_an_arm_that_moves_is_not_called_carried_and_a_plot_without_a_curve_says
 
 def test_the_page_says_which_arm_is_simulated_as_the_devices_say(page, stage):
     wait_for_text(page, "#source", "SIMULATED")
+    assert page.inner_text("#connection") == "Connected" and page.is_visible(of_arm(".home"))
     stage.arms.simulator, stage.arms.reports["right"] = None, {"source": "real"}
     stage.arms.reports["left"] = {"source": "unknown"}
+    page.reload()  # until then it stays simulated
     wait_for_text(page, "#source", "Right arm: Real arm, Left arm: Source unknown")
-    page.wait_for_selector(of_arm(".home"), state="hidden")
+    assert not page.is_visible(of_arm(".home"))
     stage.arms.reports["left"] = {"source": "real"}
     wait_until(page, lambda: page.inner_text("#source") == "Real arm")
 
