@@ -29,7 +29,7 @@ from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
-from exo_gravity.core.safety import descent
+from exo_gravity.core.safety import descent, guidance, machine
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits
@@ -353,6 +353,8 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setattr(owned_bus, "ATTEMPT_TIME", 0.1)
     monkeypatch.setattr(descent, "DESCENT", replace(descent.DESCENT, rest_time=0.2))
+    monkeypatch.setattr(machine, "START_GATE", replace(machine.START_GATE, calm=0.2))
+    monkeypatch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, time=0.2))
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
     rig = SimulatedRig(friction=0.5, pose=NO_TORQUE)  # more friction than the pushes of the switch-on check
     yield rig

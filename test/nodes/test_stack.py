@@ -103,7 +103,7 @@ def carry_change_and_kill(nodes, launch, probe, tmp_path, machine):
     fault = probe.fault
     launch(without=WITHOUT_OTHERS, timing=CALM)
     probe.effort_commands.clear()
-    probe.wait_until(lambda: len(probe.effort_commands) > 100)
+    probe.wait_until(lambda: len(probe.effort_commands) > 20)
     assert (probe.state, probe.fault) == ("fault", fault)
     assert "refused" in probe.enable(True).message
     assert probe.trigger("clear_fault").success
