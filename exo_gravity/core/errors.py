@@ -62,11 +62,6 @@ class DataError(ExoGravityError):
     """A recording or a model file is missing, truncated or invalid."""
 
 
-def with_extra(extra: str) -> str:
-    """Return the command that installs an extra of this package, which no index has yet: from its source."""
-    return f"pip install '.[{extra}]' in the source folder of exo_gravity"
-
-
 def _shown(value: object) -> str:
     text = repr(value.tolist() if hasattr(value, "tolist") else value)
     return text if len(text) <= 200 else text[:197] + "..."

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Any serial arm, from its URDF, by Pinocchio (extra `urdf`).
+"""Any serial arm, from its URDF, by Pinocchio (`pip install pin`).
 
 A URDF gives each link's mass, centre of gravity and inertia, and each joint's place and axis. With the joint velocities
 and accelerations zero, recursive Newton-Euler leaves the torque that holds the arm (`computeGeneralizedGravity`).

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.errors import ParameterError, with_extra
+from exo_gravity import pip_install
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.hardware.urdf_checks import UrdfJoints
 from exo_gravity.hardware.urdf_tree import Frames, JointTree
@@ -185,5 +186,5 @@ def _pinocchio() -> Any:
     try:
         import pinocchio
     except ImportError:
-        raise ParameterError("law", "urdf", f"used with Pinocchio: {with_extra('urdf')}") from None
+        raise ParameterError("law", "urdf", f"used with Pinocchio: {pip_install('pin')}") from None
     return pinocchio

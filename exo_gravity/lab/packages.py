@@ -6,14 +6,17 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from exo_gravity.core.errors import ExoGravityError, with_extra
+from exo_gravity import pip_install, with_extra
+from exo_gravity.core.errors import ExoGravityError
 
 # Ubuntu 24.04 has these as python3-NAME; all others come from PyPI only.
-APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl", "yaml")
+APT = ("matplotlib", "rich", "scipy", "sklearn", "threadpoolctl")
+# No extra has these: what they do is rarely asked for.
+ALONE = {"distributed": "dask[distributed]", "pandas": "pandas"}
 # Nodes that need packages for which rosdep has no key, by executable: a module of each, and the extra that brings it.
 NODES = {
-    "panel": (("starlette", "panel"), ("uvicorn", "panel"), ("websockets", "panel")),
-    "recorder": (("rosbags", "bag"), ("mcap", "bag")),
+    "panel": (("starlette", "report"), ("uvicorn", "report"), ("websockets", "report")),
+    "recorder": (("rosbags", "report"), ("mcap", "report")),
     "simulator": (("mujoco", "sim"),),
 }
 
@@ -25,8 +28,9 @@ class MissingPackageError(ExoGravityError):
 def missing(module: str, extra: str) -> str:
     """Return a sentence that names the missing `module` and how to install it; extra: e.g. 'report'."""
     module = module.partition(".")[0]
+    command = pip_install(ALONE[module]) if module in ALONE else with_extra(extra)
     apt = f"apt install python3-{module}, or " if module in APT else ""
-    return f"the Python package {module} is not installed: {apt}{with_extra(extra)}"
+    return f"the Python package {module} is not installed: {apt}{command}"
 
 
 def check_packages(executables: Iterable[str]) -> None:

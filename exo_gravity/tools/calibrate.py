@@ -16,10 +16,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from exo_gravity import require_ros
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.lab.inputs.arms import any_arm
-from exo_gravity.tools.cli import extras, require_ros
+from exo_gravity.tools.cli import extras
 
 if TYPE_CHECKING:
     from exo_gravity.lab.calibration.live import Person
@@ -99,7 +100,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code."""
     options = _arguments(args)
     try:
-        with extras("calibrate", "calibrate"):
+        with extras("calibrate", "report"):
             return _run(options)
     except KeyboardInterrupt:
         print("calibrate: stopped; nothing was written", file=sys.stderr)

@@ -10,10 +10,9 @@ import math
 import os
 import sys
 from collections.abc import Callable
-from importlib.util import find_spec
 from io import TextIOWrapper
 
-from exo_gravity.core.errors import ExoGravityError, with_extra
+from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.lab.packages import extras
 
 
@@ -77,11 +76,3 @@ def _give_up_output() -> None:
             sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def require_ros(tool: str) -> None:
-    """End `tool` with exit code 2 and one line if ROS 2's Python library is not found."""
-    if not find_spec("rclpy"):
-        remedy = f"source /opt/ros/jazzy/setup.bash, or without ROS: {with_extra('ros')}"
-        print(f"{tool}: the Python package rclpy is not found: {remedy}", file=sys.stderr)
-        raise SystemExit(2)

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from exo_gravity import require_ros
 from exo_gravity.lab.findings import Finding, Level
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.tools.cli import exit_code, extras, non_negative, require_ros
+from exo_gravity.tools.cli import exit_code, extras, non_negative
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -16,12 +16,13 @@ from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
 
+from exo_gravity import require_ros
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
-from exo_gravity.tools.cli import print_any_character, require_ros
+from exo_gravity.tools.cli import print_any_character
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 

@@ -121,7 +121,7 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
     screen = Console(stderr=True)
     columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("left")
     with (
-        extras("report", "cluster"),
+        extras("report", "report"),
         Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as progress,
     ):
         task = progress.add_task("", total=len(recordings))

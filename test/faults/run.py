@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""`make faults`: run the fault matrix on the simulated device, with real processes; print a table and write JSON.
+"""`make study NAME=faults`: run the fault matrix on the simulated device, with processes; print a table and write JSON.
 
     python -m test.faults.run [--only TEXT ...] [--start N] [--output build/faults.json] [--busy] [--one-process]
 

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A SocketCAN link that goes down, on vcan0: `.ci/socketcan`."""
+"""A SocketCAN link that goes down, on vcan0: `make study NAME=socketcan`."""
 
 from __future__ import annotations
 

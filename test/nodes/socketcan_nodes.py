@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The nodes as processes on vcan0, and on vcan0 and vcan1, where SocketCAN exists: `.ci/socketcan`.
+"""The nodes as processes on vcan0, and on vcan0 and vcan1, where SocketCAN exists: `make study NAME=socketcan`.
 
 The test observes the frames on the bus and the nodes' log. An emulated machine is 10 to 20 times slower than a real
 one, so the nodes' clock is slowed down in proportion: the limits stay those of a worn arm.

@@ -60,7 +60,7 @@ ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no 
     "sudo": "the computer's own set-up",
     "export": "the computer's own set-up",
     "colcon": "ROS; the workflow ros.yml runs it",
-    "pip install": "`.ci/dist`, the workflow ros.yml",
+    "pip install": "the workflow ci.yml",
     ".ci/": "continuous integration",
     ". .venv/bin/activate": "every test runs in it",
     "PROCESS=$(pgrep -x compensator); kill -STOP": "the fault matrix, by process ID",

@@ -4,17 +4,22 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import subprocess
 import sys
+import sysconfig
 import tempfile
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
+import exo_gravity
+from exo_gravity import with_extra
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.lab import packages
 from exo_gravity.lab.processes import node_modules
@@ -218,15 +223,16 @@ def test_ctrl_c_is_one_line_and_a_terminal_without_a_character_shows_its_code(mo
 
 # Packages that are missing: of a tool or a node, and what installs each
 WITHOUT = {
-    "report b": ("exo_gravity.tools.report", "rosbags.typesys", ".[report]"),
-    f"budget {' '.join(BUDGET)} 75": ("exo_gravity.tools.budget", "matplotlib.figure", ".[report]"),
+    "report b": ("exo_gravity.tools.report", "rosbags.typesys", with_extra("report")),
+    f"budget {' '.join(BUDGET)} 75": ("exo_gravity.tools.budget", "matplotlib.figure", with_extra("report")),
     f"train_anfis {' '.join(LAW)}": ("exo_gravity.tools.train_anfis", "threadpoolctl", "python3-threadpoolctl"),
-    "validate --quick": ("exo_gravity.tools.validate", "pinocchio", "'.[report,validate]'"),
+    "validate --quick": ("exo_gravity.tools.validate", "pinocchio", with_extra("report,validate")),
     "launcher": ("exo_gravity.tools.launcher", "rclpy", "/opt/ros/jazzy/setup.bash"),
     "doctor --seconds 0": ("exo_gravity.tools.doctor", "rich", "python3-rich"),
-    "simulator": (node_modules()["simulator"], "mujoco", "pip install '.[sim]' in the source folder"),
-    "recorder": (node_modules()["recorder"], "rosbags", "pip install '.[bag]' in the source folder"),
-    "panel": (node_modules()["panel"], "uvicorn", "pip install '.[panel]' in the source folder"),
+    "can_bridge": (node_modules()["can_bridge"], "rclpy", with_extra("ros")),
+    "simulator": (node_modules()["simulator"], "mujoco", with_extra("sim")),
+    "recorder": (node_modules()["recorder"], "rosbags", with_extra("report")),
+    "panel": (node_modules()["panel"], "uvicorn", with_extra("report")),
 }
 PROGRAM = """
 import sys
@@ -237,7 +243,7 @@ sys.exit(import_module({module!r}).main())
 """
 
 
-@pytest.mark.parametrize("words", quick(["launcher", "recorder"], WITHOUT))
+@pytest.mark.parametrize("words", quick(["launcher", "can_bridge", "recorder"], WITHOUT))
 def test_a_missing_package_is_named_in_one_line_with_what_installs_it_and_help_still_works(words, tmp_path):
     module, package, installs = WITHOUT[words]
     helps = words.partition(" ")[0] not in node_modules()
@@ -249,13 +255,39 @@ def test_a_missing_package_is_named_in_one_line_with_what_installs_it_and_help_s
         assert (installs in ended.stderr and ended.stderr.count("\n") == 1) if code else "usage: " in ended.stdout
 
 
+@pytest.mark.parametrize(
+    ("came_from", "stands_in", "environment", "command"),
+    [
+        ("a.whl", "site", "venv", "pip install '{0}/a.whl[report,sim]'"),
+        ("my source", "site", "venv", "pip install '{0}/my source[report,sim]'"),
+        ("", "my source", "venv", "pip install '{0}/my source[report,sim]'"),
+        ("", "my source", "my source/.venv", "'{0}/my source/.ci/setup' report sim"),
+        ("", "site", "venv", "pip install '.[report,sim]' in the source folder of exo_gravity"),
+        ("a.whl", "site", "usr", "pip install --break-system-packages '{0}/a.whl[report,sim]' 'numpy<2'"),
+    ],
+    ids=["wheel", "source folder", "editable", "a clone's environment", "workspace", "Ubuntu's own Python"],
+)
+def test_the_command_for_a_missing_package_fits_how_this_one_was_installed(
+    came_from, stands_in, environment, command, tmp_path, monkeypatch
+):
+    (tmp_path / "my source").mkdir()
+    for name in ("a.whl", "my source/setup.py", "EXTERNALLY-MANAGED"):
+        (tmp_path / name).touch()
+    told = json.dumps({"url": (tmp_path / came_from).as_uri()}) if came_from else None
+    monkeypatch.setattr(metadata, "distribution", lambda name: SimpleNamespace(read_text=lambda name: told))
+    monkeypatch.setattr(exo_gravity, "__file__", str(tmp_path / stands_in / "exo_gravity" / "__init__.py"))
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / environment))
+    monkeypatch.setattr(sys, "base_prefix", str(tmp_path / "usr"))
+    monkeypatch.setattr(sysconfig, "get_path", lambda name: str(tmp_path))
+    assert with_extra("report,sim") == command.format(tmp_path)
+
+
 def test_a_node_whose_package_is_missing_is_refused_before_any_starts(monkeypatch, run_tool):
     monkeypatch.setattr(packages, "find_spec", lambda name: None)
     assert run_tool("launcher") == (
         2,
         "",
-        "launcher: simulator cannot start: the Python package mujoco is not installed: pip install '.[sim]' in the "
-        "source folder of exo_gravity\n",
+        f"launcher: simulator cannot start: the Python package mujoco is not installed: {with_extra('sim')}\n",
     )
 
 

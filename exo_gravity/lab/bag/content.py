@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.errors import with_extra
+from exo_gravity import pip_install
 from exo_gravity.core.params import Param, params_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.source import source_of
@@ -123,11 +123,11 @@ class Bag:
         return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
 
     def to_frame(self) -> "pandas.DataFrame":
-        """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas (extra `analysis`)."""
+        """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas."""
         try:
             import pandas
         except ModuleNotFoundError:
-            sentence = f"to_frame needs pandas, which is not installed: {with_extra('analysis')}"
+            sentence = f"to_frame needs pandas, which is not installed: {pip_install('pandas')}"
             raise ModuleNotFoundError(sentence, name="pandas") from None
         return pandas.DataFrame(self.columns())
 

@@ -56,7 +56,7 @@ def requested(video: str | None, speed: float) -> Clip | None:
         raise ParameterError("video", video, "a file in a folder that exists")
     frame_rate = FRAME_RATE[path.suffix.lower()]
     clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED) / frame_rate, frame_rate)
-    problems = [missing(module, "video") for module in NEEDED if not find_spec(module)]
+    problems = [missing(module, "sim") for module in NEEDED if not find_spec(module)]
     if not problems and not backend():
         problems = [NO_GRAPHICS]
     if problems:

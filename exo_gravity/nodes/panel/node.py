@@ -283,7 +283,7 @@ class Panel(Node):
         try:
             from exo_gravity.panel.server import PanelServer
         except ModuleNotFoundError as error:
-            raise ExoGravityError(missing(error.name or "", "panel")) from None
+            raise ExoGravityError(missing(error.name or "", "report")) from None
         self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(TIMING.state_period, self._send_state)
         self.create_timer(TIMING.discovery_period, self._arms.discover)

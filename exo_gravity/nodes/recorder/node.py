@@ -41,7 +41,7 @@ from exo_gravity.nodes.ros.parameters import OtherNodes, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import PITCH_YAW, PolledSubscription, Publishers
 
-with extras("recorder", "bag"):
+with extras("recorder", "report"):
     from exo_gravity.lab.bag.writer import BagWriter, offered_qos
 
 TYPES = {  # of each topic that is recorded, or of its last part in an arm's namespace
