@@ -1,12 +1,16 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the studies of random devices share: their options, and the table of what was shown against its limits."""
+"""What the studies of random devices share: their options, the devices one on each core, and the table of figures."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
+
+from exo_gravity.lab.parallel import in_processes
+
+Result = TypeVar("Result")
 
 
 class Row(NamedTuple):
@@ -14,23 +18,41 @@ class Row(NamedTuple):
 
     what: str
     shown: str
-    limit: str
-    held: bool
+    limit: str = ""
+    held: bool = True
+
+
+def run_study(
+    name: str,
+    work: Callable[[int], Result],
+    told: Callable[[Result], str],
+    verdict: Callable[[list[Result]], list[Row]],
+) -> int:
+    """Play `work` for each seed of the command line, print and write the table; return the exit code.
+
+    told: what to print of a result. verdict: the rows of all results, in the order of the seeds.
+    """
+    parser = argparse.ArgumentParser(prog=f"bench.{name}")
+    option = parser.add_argument
+    option("--devices", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
+    option("--first", type=int, default=0, metavar="SEED", help="of the first one (default: %(default)s)")
+    option("--output", type=Path, default=Path(f"build/{name}.md"), metavar="FILE", help="(default: %(default)s)")
+    options = parser.parse_args()
+    results: dict[int, Result] = {}
+    for outcome in in_processes(work, range(options.first, options.first + options.devices)):
+        if outcome.result is None:
+            raise RuntimeError(f"device {outcome.item}: {outcome.problem}")
+        results[outcome.item] = outcome.result
+        print(f"{len(results)} of {options.devices}, device {outcome.item}: {told(outcome.result)}", flush=True)
+    rows = verdict([results[seed] for seed in sorted(results)])
+    text = as_markdown(rows)
+    print(text)
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    options.output.write_text(f"{text}\n", encoding="utf-8")
+    return 0 if all(row.held for row in rows) else 1
 
 
 def as_markdown(rows: Sequence[Row]) -> str:
     """Return the table in Markdown."""
     lines = ["| what | shown | limit | |", "|---|---|---|---|"]
     return "\n".join([*lines, *(f"| {r.what} | {r.shown} | {r.limit} | {'' if r.held else 'missed'} |" for r in rows)])
-
-
-def options_of(program: str, description: str, output: Path) -> argparse.Namespace:
-    """Return `seeds` and `output` of the command line; output: without its suffix."""
-    parser = argparse.ArgumentParser(prog=program, description=description)
-    option = parser.add_argument
-    option("--devices", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
-    option("--first", type=int, default=0, metavar="SEED", help="of the first one (default: %(default)s)")
-    option("--output", type=Path, default=output, metavar="FILE", help="(default: %(default)s)")
-    options = parser.parse_args()
-    options.seeds = range(options.first, options.first + options.devices)
-    return options

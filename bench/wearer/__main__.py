@@ -1,63 +1,81 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""python -m bench.wearer [--devices 20] [--first 0] [--output build/wearer]: the study of `wearer_efforts`.
+"""python -m bench.wearer [--devices 20] [--first 0]: how far `wearer_efforts` is from what the wearer does.
 
-Random calibrated devices with a virtual wearer go through one trial each, weigh loads in the hand, and adapt to one who
-tires, offline, 1 to 2 minutes each, one on each core. It prints a table, writes it and a picture of the first trial,
-and exits with 1 if a limit is missed.
+Random calibrated devices with a virtual wearer go through one trial each, offline, one on each core.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
-from typing import NamedTuple
+from collections.abc import Sequence
 
 os.environ["OMP_NUM_THREADS"] = "1"
 
-from ..device_study import as_markdown, options_of
-from ..parts import play as part_by_part
-from . import payload, tiring
+import numpy as np
+
+from exo_gravity.core.errors import DataError
+from exo_gravity.core.numbers import COVER
+
+from ..device_study import Row, run_study
 from .devices import draw
-from .report import picture, points, verdict
-from .study import Trial, judge, play
+from .study import KINDS, Trial, judge, play
+
+COVERAGE = (0.92, 0.98)
+SHARE_ERROR = 0.05
 
 
-class Judged(NamedTuple):
-    """What was seen of one wearer. tired: with and without `support_adapts`."""
-
-    trial: Trial
-    weighed: payload.Weighings
-    tired: tuple[tiring.Tired, tiring.Tired]
-
-    @property
-    def line(self) -> str:
-        """What is printed of it."""
-        share = float(self.trial.share.value)
-        off = points(share - self.trial.true_share)
-        return f"device {self.trial.seed}: share {share:.1%}, off by {off} {self.trial.trouble}"
+def judged(seed: int) -> Trial | str:
+    """Play and judge one wearer; return the sentence that says why there was no calibration."""
+    try:
+        return judge(play(draw(seed)))
+    except DataError as error:
+        return str(error)
 
 
-def judged(seed: int) -> Judged:
-    """Play and judge one wearer."""
-    worn = draw(seed)
-    tired = tiring.tire(worn, adapts=True), tiring.tire(worn, adapts=False)
-    return Judged(judge(play(worn)), payload.weigh(worn), tired)
+def told(one: Trial | str) -> str:
+    """Return the line of one wearer."""
+    if isinstance(one, str):
+        return one
+    return f"share {float(one.share.value):.1%}, true {one.true_share:.1%} {one.trouble}"
 
 
-def main() -> int:
-    """Run the study; return the exit code."""
-    options = options_of("bench.wearer", "Judge the estimate of the wearer's torque.", Path("build/wearer"))
-    found = part_by_part("wearer", judged, options.seeds, lambda one: one.line)
-    trials, weighed, tired = zip(*found, strict=True)
-    rows = [*verdict(trials), *payload.verdict(weighed), *tiring.verdict(tired)]
-    text = as_markdown(rows)
-    print(text)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.with_suffix(".md").write_text(f"{text}\n", encoding="utf-8")
-    picture(trials[0]).savefig(options.output.with_suffix(".png"), dpi=120)
-    return 0 if all(row.held for row in rows) else 1
+def verdict(found: list[Trial | str]) -> list[Row]:
+    """Return the table: RMS error by joint and kind of motion, cover, errors of the share."""
+    trials = [one for one in found if isinstance(one, Trial)]
+    rows = [Row("wearers whose calibration is refused", f"{len(found) - len(trials)} of {len(found)}")]
+    for number, kind in enumerate(KINDS):
+        error = np.concatenate([trial.error[trial.kind == number] for trial in trials])
+        rms = " ".join(f"{value:.2f}" for value in np.sqrt(np.mean(error**2, axis=0)))
+        rows.append(
+            Row(f"{kind}: RMS error by joint, within the 95 % band", f"{rms} Nm, {cover(trials, [number]):.1%}")
+        )
+    whole = cover(trials, range(len(KINDS)))
+    low, high = COVERAGE
+    rows.append(Row("all: within the 95 % band", f"{whole:.1%}", f"{low:.0%} to {high:.0%}", low <= whole <= high))
+    off = np.array([abs(float(trial.share.value) - trial.true_share) for trial in trials])
+    shown = f"{np.median(off):.1%}, {off.max():.1%}"
+    what = "share over a trial, error: median, largest"
+    rows.append(Row(what, shown, f"{SHARE_ERROR:.0%}", bool(off.max() < SHARE_ERROR)))
+    for part, name in enumerate(("lifting", "resting", "tiring")):
+        errors = [
+            (abs(float(share.value) - true), float(share.deviation)) for share, true in (t.parts[part] for t in trials)
+        ]
+        inside = sum(error < COVER * deviation for error, deviation in errors)
+        shown = f"{max(error for error, _ in errors):.1%}; {inside} of {len(errors)} within their band"
+        rows.append(Row(f"share while {name}, largest error", shown))
+    carried = sum(not trial.trouble for trial in trials)
+    rows.append(Row("arms carried to the end", f"{carried} of {len(trials)}", "all", carried == len(trials)))
+    return rows
+
+
+def cover(trials: Sequence[Trial], kinds: Sequence[int]) -> float:
+    """Return the share of times and joints at which the 95 % band covers the truth."""
+    inside = [(np.abs(trial.error) <= COVER * trial.curve.deviation)[np.isin(trial.kind, kinds)] for trial in trials]
+    return float(np.concatenate(inside).mean())
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from bench.wearer.__main__ import judged as work  # other processes do not import the `__main__` of a package
+
+    sys.exit(run_study("wearer", work, told, verdict))

@@ -67,10 +67,6 @@ class Muscles(VirtualWearer):
         """Return False: the muscles always have a torque."""
         return False
 
-    def strength_at(self, elapsed: float, weight: float) -> float:
-        """Return the largest torque in Nm at a joint where the weight of the wearer's arm takes `weight` Nm."""
-        return STRENGTH
-
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> Torque:
         """Return the wearer's torque (4,) in Nm."""
         super().torque(elapsed, theta, velocity)  # follows the script's steps
@@ -92,9 +88,8 @@ class Muscles(VirtualWearer):
         wanted, given = [], []
         for n, (position, speed) in enumerate(path):
             error = position - theta[n]
-            most = self.strength_at(elapsed, weight[n])
             total = (1.0 - held) * (self._sum[n] + INTEGRAL[n] * error * STEP)
-            self._sum[n] = max(-most, min(most, total))
+            self._sum[n] = max(-STRENGTH, min(STRENGTH, total))
             wanted.append((1.0 - held) * (lifted * weight[n] + self._sum[n]))
             at_once = (1.0 - held) * STIFFNESS[n] * error
             self._active[n] += STEP / ACTIVATION * (self._late[0][n] - self._active[n])
@@ -102,7 +97,7 @@ class Muscles(VirtualWearer):
             self._noise[n] += -step * self._noise[n] + math.sqrt(2.0 * step) * self._random.gauss(0.0, 1.0)
             whole = at_once + self._active[n] * (1.0 + NOISE * self._noise[n])
             yielding = (1.0 - held) * DAMPING[n] * (speed - velocity[n])  # also beyond their strength
-            given.append(max(-most, min(most, whole)) + yielding)
+            given.append(max(-STRENGTH, min(STRENGTH, whole)) + yielding)
         self._late.popleft()
         self._late.append(wanted)
         self.log.append((elapsed, tuple(given), weight))

@@ -2,12 +2,8 @@
 """One device and its wearer through one trial, and how far what is estimated is from what the muscles did.
 
 The trial has three parts: they lift what the device does not, then rest in full support, then tire from 60 to 20 %
-while the support rises as much. Their trunk stands, bows and walks meanwhile. The observer and what it is compared with
-get the same recording, through CAN frames and their 12 bits, and the same IMU, once every 10 ms:
-
-    motor - gravity   the motors' torque beyond what the calibrated model needs at rest, with the sign changed
-    first order       a disturbance observer on each joint alone: a constant inertia, gravity, the same bandwidth; no
-                      friction and no coupling (Ohnishi, Shibata and Murakami 1996)
+while the support rises as much. Their trunk stands, bows and walks meanwhile. The observer gets what was recorded
+through CAN frames and their 12 bits, and an IMU, once every 10 ms.
 """
 
 from __future__ import annotations
@@ -19,15 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import gravity_torque
 from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver
 from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.recording import Recording
@@ -39,7 +32,6 @@ from exo_gravity.sim.virtual_arm import TrunkReading
 
 from .devices import Worn, turned
 from .muscles import Muscles, Phase, phase_at
-from .strapped_arm import StrappedArm
 
 RATE = 100.0  # Hz, of the control loop and the IMU
 DELAY = 2.0  # s until the wearer begins
@@ -51,7 +43,6 @@ TRUNK: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 TILT_NOISE = math.radians(0.6)  # of the filter, as core/trunk/uncertainty.py has it; it stays for about
 TILT_TIME = 3.0  # s
-METHODS = ("momentum observer", "first order", "motor - gravity")
 KINDS = ("reach", "hold", "rest", "trunk in motion")
 
 
@@ -77,8 +68,8 @@ class Played:
 class Trial:
     """What one trial showed, at n times.
 
-    error: Nm, estimate minus truth of each of METHODS, (3, n, 4). kind: (n,) index in KINDS. share, true_share: over
-    the trial. parts: of lifting, resting and tiring alike: (found, true).
+    error: Nm, estimate minus truth, (n, 4). kind: (n,) index in KINDS. share, true_share: over the trial. parts: of
+    lifting, resting and tiring alike: (found, true).
     """
 
     seed: int
@@ -145,18 +136,16 @@ def phases_of(seed: int) -> tuple[Phase, ...]:
     return (*lifts, *rests, *tires)
 
 
-def play(worn: Worn, arm: StrappedArm | None = None, trunk: Sequence[dict[str, Any]] = TRUNK) -> Played:
-    """Play the trial of `worn`. arm: with the wearer's strapped to the robot's; None for one that is a part of it."""
-    phases, device, imu = phases_of(worn.seed), worn.device(arm), WornImu(worn)
+def play(worn: Worn) -> Played:
+    """Play the trial of `worn`."""
+    phases, device, imu = phases_of(worn.seed), worn.device(), WornImu(worn)
     ends = np.cumsum([phase.move + phase.hold for phase in phases])
-    script = TrialScript.parse({"name": "wearer", "steps": list(trunk)})
+    script = TrialScript.parse({"name": "wearer", "steps": list(TRUNK)})
 
     def tilt() -> Tilt:
         return Tilt.of(worn.side, device.trunk.pitch, device.trunk.roll)
 
     wearer = Muscles(script, phases, worn.wearer, tilt, worn.seed)
-    if arm:
-        arm.hold(wearer)
     limits = Limits(JOINTS, max_effort=worn.settings.max_effort, max_velocity=(20.0,) * 4, sign_check_torque=0.0)
     compensator = Therapist(worn.settings, [DELAY + ends[2], DELAY + ends[4], DELAY + ends[7]])
     setup = ArmSetup(worn.side, device, worn.motors, limits, compensator.own, RATE, imu)
@@ -180,12 +169,11 @@ def judge(played: Played) -> Trial:
 
     joints = (recording.position, recording.velocity, recording.effort)
     whole = observed(worn.settings, recording.time, joints, trunk_at)
-    others = baselines(worn.settings, recording.time, joints, lambda now: trunk_at(now)[0])
     index = np.searchsorted(played.elapsed, recording.time[keep] - start).clip(max=len(played.elapsed) - 1)
     curve = only(whole, keep)
     exact = np.zeros_like(curve.torque)
     truth = WearerCurve(curve.time, played.torque[index], exact, played.weight[index], exact)
-    error = np.stack([curve.torque, *(other[keep] for other in others)]) - truth.torque
+    error = curve.torque - truth.torque
     at = [phase_at(phases, now) for now in (curve.time - start).tolist()]
     kind = np.array([_kind(phases[n], since) for n, since in at])
     kind[_trunk_moves(curve.time - start)] = KINDS.index("trunk in motion")
@@ -217,20 +205,3 @@ def _trunk_moves(elapsed: np.ndarray) -> np.ndarray:
 def only(curve: WearerCurve, keep: np.ndarray) -> WearerCurve:
     """Return the part of a curve where `keep` (n,) is true."""
     return WearerCurve(*(part[keep] for part in curve))
-
-
-def baselines(settings: Settings, time: np.ndarray, joints: Any, tilt_at: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first-order observer's torque (n, 4), and gravity minus the motors'."""
-    position, velocity, effort = joints
-    arm = papers(settings.loaded).with_wearer(settings.wearer_mass, settings.wearer_cog)
-    tilts = [tilt_at(now) for now in time.tolist()]
-    magnitude = np.array([tilt.magnitude for tilt in tilts])[:, None]
-    static = magnitude * gravity_torque(arm, position, np.array([tilt.direction for tilt in tilts])) - effort
-    inertia = np.diag(MomentumObserver(settings)._links.matrix(OBSERVER.reference))
-    residual, inner = static.copy(), OBSERVER.bandwidth * inertia * velocity[0] - static[0]
-    for n in range(1, len(time)):
-        share = 1.0 - math.exp(-OBSERVER.bandwidth * (time[n] - time[n - 1]))
-        mean = 0.5 * OBSERVER.bandwidth * inertia * (velocity[n] + velocity[n - 1])
-        inner = inner + share * (mean - static[n - 1] - inner)
-        residual[n] = OBSERVER.bandwidth * inertia * velocity[n] - inner
-    return residual, static

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The tests of the studies are long: `make test-all` runs them."""
+"""The tests of the studies are long: `.ci/test-long` runs them."""
 
 from __future__ import annotations
 
