@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench [--quick] [--only PARTS] [--output build/bench.json]: print one table and write it as JSON.
 
-PARTS are some of law,loop,work,recordings,starts. It takes 20 minutes on two quiet cores. A disturbed run is repeated
+PARTS are some of law,loop,recordings,starts. It takes 20 minutes on two quiet cores. A disturbed run is repeated
 once, and then says so.
 """
 
@@ -22,13 +22,11 @@ from .loops import measure_loops
 from .recordings import measure_recordings
 from .starts import measure_starts
 from .table import Row, save, show
-from .work import measure_work
 
 Progress = Callable[[str], None]
 PARTS: dict[str, Callable[[bool, Progress], Iterator[Row]]] = {
     "law": lambda quick, progress: measure_laws(quick),
     "loop": measure_loops,
-    "work": lambda quick, progress: measure_work(quick),
     "recordings": lambda quick, progress: measure_recordings(quick),
     "starts": lambda quick, progress: measure_starts(quick),
 }

@@ -1,16 +1,14 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""python -m bench.imu_report [FOLDER] [--write FILE]: the trunk's inclination error here, by VQF and by imufusion.
+"""python -m bench.imu_report [FOLDER]: the trunk's inclination error here, by VQF and by imufusion.
 
 Writes one table as Markdown: for each trial the error in degrees, RMS (largest), over the samples in motion. FOLDER
-holds trials as .npz files; by default it is test/data/broad. --write puts the table into FILE, between the lines
-`<!-- imu-report -->` and `<!-- end of imu-report -->`. imufusion is left out where it is not installed.
+holds trials as .npz files; by default it is test/data/broad.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib.util
-import re
 import sys
 from pathlib import Path
 
@@ -19,19 +17,15 @@ from exo_gravity.core.errors import DataError
 from .imu_trials import EXCERPTS, METHODS, Trial, lost_samples, read_trials, score
 
 LOST = 0.03  # share of samples
-MARKS = re.compile(r"(<!-- imu-report -->\n).*?(<!-- end of imu-report -->)", re.DOTALL)
 
 
 def main() -> None:
     """Print the table; exit code 2 for wrong files."""
     parser = argparse.ArgumentParser(prog="bench.imu_report", description="Compare the trunk estimator with its peers.")
     parser.add_argument("folder", nargs="?", type=Path, default=EXCERPTS, help="folder of trials (%(default)s)")
-    parser.add_argument("--write", type=Path, metavar="FILE", help="also put the table into this Markdown file")
     options = parser.parse_args()
     try:
         table = report(list(read_trials(options.folder)))
-        if options.write:
-            write(options.write, table)
     except DataError as error:
         sys.stderr.write(f"{error}\n")
         raise SystemExit(2) from None
@@ -55,18 +49,6 @@ def report(trials: list[Trial]) -> str:
     cost = [f"{min(costs[name]):.0f}" for name in methods]
     rows.append(["us of processor time a sample", cost[0], "", "", *cost[1:]])
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)
-
-
-def write(path: Path, table: str) -> None:
-    """Put `table` between its marks in the file. Raises DataError."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error})") from None
-    replaced, count = MARKS.subn(lambda match: f"{match[1]}{table}\n{match[2]}", text)
-    if count != 1:
-        raise DataError(f"{path}: must have the line <!-- imu-report --> once, and <!-- end of imu-report --> after it")
-    path.write_text(replaced, encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """One run of a loop from bus to bus, timed by an independent listener.
 
-The kinds of loop: the package's nodes, the same nodes with SCHED_FIFO threads, can_bridge and compensator of an arm in
-one process, one Python process without ROS, and bare rclpy. All run on the same simulated device, which a virtual
+The kinds of loop: the package's nodes, can_bridge and compensator of an arm in one process, one Python process without
+ROS, and bare rclpy. All run on the same simulated device, which a virtual
 wearer moves to and fro, with the same law and rate. The arms are those of a file in config.
 """
 
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,14 +38,11 @@ POSES = {  # rad; on the way between them the torque changes every cycle
 MOVE = 2.0  # s from one pose to the other: slow enough that the safety machine adds no damping
 START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
-THREAD_PRIORITY = {"nodes": 0, "fifo": 50, "one process": 0}  # of the kinds that run the package's nodes
+OURS = ("nodes", "one process")  # the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
 CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
 QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that is treated as quiet
 QUIET_OTHERS = 0.1  # the same for other programs: Linux counts that time in ticks
-
-Windows = list[tuple[float, float]]  # begin and end in s since 1970
-Watch = Callable[[dict[str, int]], Windows | None]
 
 
 @dataclass(frozen=True)
@@ -53,8 +50,7 @@ class LoopRun:
     """One run.
 
     arms: the timing of each. cpu: share of a core by process. stolen, others: share of the bench's cores that the
-    hypervisor and other programs took. start: s from launch to carried. windows: the first arm's timing in each of the
-    times that `watch` returned.
+    hypervisor and other programs took. start: s from launch to carried.
     """
 
     arms: list[LoopTiming]
@@ -62,7 +58,6 @@ class LoopRun:
     stolen: float
     others: float
     start: float
-    windows: list[LoopTiming]
 
     @property
     def is_disturbed(self) -> bool:
@@ -70,16 +65,14 @@ class LoopRun:
         return self.stolen > QUIET or self.others > QUIET_OTHERS
 
 
-def run_loop(kind: str, rate: float, file: str, seconds: float, watch: Watch | None = None) -> LoopRun:
-    """Run one `kind` of loop: 'nodes', 'fifo', 'one process', 'python' or 'rclpy'.
+def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
+    """Run one `kind` of loop: 'nodes', 'one process', 'python' or 'rclpy'.
 
-    file: of the arms, one of POSES.
-    watch: called with the process IDs during the measurement, in place of a wait for `seconds`. It may return times
-    that are timed separately too. Raises RuntimeError if the arm is not carried to the end.
+    file: of the arms, one of POSES. Raises RuntimeError if the arm is not carried to the end.
     """
     with tempfile.TemporaryDirectory() as folder_name, pinned(), contextlib.ExitStack() as stack:
         folder = Path(folder_name)
-        params, simulators = write_parameters(folder, rate, file, seconds, THREAD_PRIORITY.get(kind, 0))
+        params, simulators = write_parameters(folder, rate, file, seconds)
         namespaces = [node.removesuffix("/simulator") for node in load(simulators)]
         arms = [DirectArm(params, namespace) for namespace in namespaces]
         recordings = [folder / f"{namespace.strip('/')}.npz" for namespace in namespaces]
@@ -87,7 +80,7 @@ def run_loop(kind: str, rate: float, file: str, seconds: float, watch: Watch | N
             stack.enter_context(_listener(arm, recording)) for arm, recording in zip(arms, recordings, strict=True)
         ]
         log = NodeLog()
-        launched = params if kind in THREAD_PRIORITY else simulators
+        launched = params if kind in OURS else simulators
         launcher = Launcher(launched, log, one_process=kind == "one process")
         stack.callback(launcher.stop)
         begin = time.monotonic()
@@ -99,27 +92,24 @@ def run_loop(kind: str, rate: float, file: str, seconds: float, watch: Watch | N
                 pids[f"{namespace[1:]}/{part}"] = stack.enter_context(_process(*command)).pid
         log.wait_for("wearer: move (0", len(namespaces), START_LIMIT, launcher.dead)
         start = log.time_of_first("active") - begin
-        if line := log.find("not permitted"):
-            raise RuntimeError(line)
         time.sleep(SETTLING)
-        times, cpu, taken = _measure(pids, seconds, watch)
+        window, cpu, taken = _measure(pids, seconds)
         _check_run(launcher, log)
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
-        whole = [_timings(arm, recording, times[:1], rate)[0] for arm, recording in zip(arms, recordings, strict=True)]
-        return LoopRun(whole, cpu, *taken, start, _timings(arms[0], recordings[0], times[1:], rate))
+        timings = [_timing(arm, recording, window, rate) for arm, recording in zip(arms, recordings, strict=True)]
+        return LoopRun(timings, cpu, *taken, start)
 
 
-def _timings(arm: DirectArm, recording: Path, times: Windows, rate: float) -> list[LoopTiming]:
-    """Return the timing of an arm in each of `times`."""
+def _timing(arm: DirectArm, recording: Path, window: tuple[float, float], rate: float) -> LoopTiming:
+    """Return the timing of an arm between two times in s since 1970."""
     with np.load(recording) as frames:
-        content = dict(frames)
-    cycles = [split_cycles(content, arm.motors, begin, end) for begin, end in times]
-    return [analyse(part, arm.motors, arm.law, 1.0 / rate) for part in cycles]
+        cycles = split_cycles(dict(frames), arm.motors, *window)
+    return analyse(cycles, arm.motors, arm.law, 1.0 / rate)
 
 
-def write_parameters(folder: Path, rate: float, file: str, seconds: float, thread_priority: int) -> tuple[Path, Path]:
+def write_parameters(folder: Path, rate: float, file: str, seconds: float) -> tuple[Path, Path]:
     """Write a parameter file of all nodes, and one of the simulators alone; return their paths."""
     script = folder / "to_and_fro.yaml"
     steps = [{"move": pose, "over": MOVE} for pose in POSES[file]] * int((seconds + 5.0) / (2 * MOVE) + 1)
@@ -129,10 +119,10 @@ def write_parameters(folder: Path, rate: float, file: str, seconds: float, threa
         values = entry["ros__parameters"]
         if name.endswith("/can_bridge"):
             # The duration of the sign check varies: leave it out.
-            values.update(rate=float(rate), sign_check_torque=0.0, thread_priority=thread_priority)
+            values.update(rate=float(rate), sign_check_torque=0.0)
         elif name.endswith("/compensator"):
             # With the IMU's noise an answer could not be matched to its reply. The node `imu` still runs.
-            values.update(use_imu=False, thread_priority=thread_priority)
+            values.update(use_imu=False)
         elif name.endswith("/simulator"):
             # The delay ends after the torque has risen: it starts when the motors are switched on.
             values.update(trial=str(script), trial_delay=3.5, trunk={"pitch": 0.0, "roll": 0.0})
@@ -151,22 +141,16 @@ def _check_run(launcher: Launcher, log: NodeLog) -> None:
         raise RuntimeError(f"the arm was let down during the run: {line}")
 
 
-def _measure(
-    pids: dict[str, int], seconds: float, watch: Watch | None
-) -> tuple[Windows, dict[str, float], tuple[float, float]]:
-    """Let `seconds` pass; return that time and those of `watch`, each process's share of a core, and what was taken."""
+def _measure(pids: dict[str, int], seconds: float) -> tuple[tuple[float, float], dict[str, float], tuple[float, float]]:
+    """Let `seconds` pass; return when that was, each process's share of a core, and what was taken."""
     before, begin = {name: cpu_time(pid) for name, pid in pids.items()}, time.time()
     (stolen, used), ours = _core_times(), own_time()
-    windows: Windows = []
-    if watch:
-        windows = watch(pids) or []
-    else:
-        time.sleep(seconds)
+    time.sleep(seconds)
     end = time.time()
     shares = {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
     (stolen_later, used_later), total = _core_times(), (end - begin) * len(os.sched_getaffinity(0))
     others = max(0.0, used_later - used - (own_time() - ours))
-    return [(begin, end), *windows], shares, ((stolen_later - stolen) / total, others / total)
+    return (begin, end), shares, ((stolen_later - stolen) / total, others / total)
 
 
 @contextlib.contextmanager
@@ -193,7 +177,7 @@ def _siblings(cpu: int) -> str:
 
 def _peer_commands(kind: str, params: Path, namespace: str, rate: float) -> list[tuple[str, ...]]:
     """Return (name, module, arguments ...) of the processes that take the place of the nodes."""
-    if kind in THREAD_PRIORITY:
+    if kind in OURS:
         return []
     arguments = (str(params), namespace, str(rate))
     if kind == "python":

@@ -10,7 +10,7 @@ import numpy as np
 from exo_gravity.core.safety.gate import START_GATE
 from exo_gravity.core.safety.guidance import GUIDANCE
 
-from .loop import BOTH_ARMS, ONE_ARM, QUIET, QUIET_OTHERS, SEVEN_JOINTS, THREAD_PRIORITY, LoopRun, run_loop
+from .loop import BOTH_ARMS, ONE_ARM, QUIET, QUIET_OTHERS, SEVEN_JOINTS, LoopRun, run_loop
 from .table import Row
 from .timing import percentile
 
@@ -20,7 +20,7 @@ RATES = (
     ("seven joints on CAN FD", SEVEN_JOINTS, 500),
 )
 QUICK_RATES = (RATES[1], RATES[3])
-KINDS = ("nodes", "one process", "fifo", "python", "rclpy")
+KINDS = ("nodes", "one process", "python", "rclpy")
 PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
 ATTEMPTS = 2
 PARTS = 5  # of a run; the lowest and the highest of their figures are the spread
@@ -35,16 +35,12 @@ def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
     for arms, file, rate in QUICK_RATES if quick else RATES:
         runs: Runs = {}
         for kind in KINDS:
-            if kind == "fifo" and (file != ONE_ARM or rate < 500):  # two devices would get no processor
-                continue
             progress(f"loop, {arms}, {rate} Hz: {kind}")
             if run := quietest_run(kind, rate, file, 5.0 if quick else 20.0, progress):
                 runs[kind] = run
         name = f"loop, {arms}, {rate} Hz"
         yield from rows_of(name, rate, runs, "nodes")
         yield from rows_of(f"{name}, one process", rate, runs, "one process")
-        if "fifo" in runs:
-            yield from rows_of(f"{name}, thread_priority {THREAD_PRIORITY['fifo']}", rate, runs, "fifo")
         if "nodes" in runs:
             starts.append(runs["nodes"].start)
     if starts:

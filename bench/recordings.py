@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The rows of recordings: reading against rosbags and mcap's own reader, a report, many at once against one by one."""
+"""The rows of recordings: reading against rosbags and mcap's own reader."""
 
 from __future__ import annotations
 
@@ -16,16 +16,13 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from exo_gravity.lab.bag.content import JOINT_STATE, SESSION, STRING
+from exo_gravity.lab.bag.content import JOINT_STATE
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.parallel import in_processes
-from exo_gravity.lab.report import cohort, trial_report
-from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 
 from .table import Row, seconds_in_turns
 
-RATE = 500  # Hz of the recordings
+RATE, BEGIN = 500, 1_700_000_000  # Hz of the recordings, s since 1970
 FORMS = {
     "MCAP": (StoragePlugin.MCAP, None),
     "MCAP, zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
@@ -39,21 +36,11 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for number, (form, (plugin, compression)) in enumerate(FORMS.items()):
-            bag = write_recording(folder / f"form_{number}", seconds, plugin=plugin, compression=compression)
+            bag = write_recording(folder / f"form_{number}", seconds, plugin, compression)
             peers: dict[str, Callable[[], object]] = {"rosbags": partial(_read_by_rosbags, bag)}
             if plugin is StoragePlugin.MCAP:
                 peers["mcap's own reader"] = partial(_read_by_mcap, bag)
             yield from _speeds(f"reading, {form}", _size(bag), partial(read_bag, bag), peers, repeats)
-        bag = folder / "form_0"
-        whole = partial(_report, bag, folder / "report")
-        alone = {"rosbags reading the messages alone": partial(_read_by_rosbags, bag)}
-        yield from _speeds("report, whole", _size(bag), whole, alone, repeats)
-        bags = [write_recording(folder / "many" / str(n), seconds // 2) for n in range(8)]
-        judging = cohort.Judging(HoldCriteria(), MIN_HOLD, 1)
-        work = partial(cohort.summary, judging=judging)
-        paths = [str(bag) for bag in bags]
-        ours, peer = seconds_in_turns((lambda: [*in_processes(work, paths)], lambda: [*map(work, paths)]), repeats)
-        yield Row.of_times("report of 8 recordings: one by one", ours, peer)
 
 
 def _speeds(
@@ -75,16 +62,10 @@ def _size(bag: Path) -> float:
 def write_recording(
     path: Path,
     seconds: int,
-    rate: int = RATE,
-    begin: int = 1_700_000_000,
-    session: str = "",
-    plugin: StoragePlugin = StoragePlugin.MCAP,
-    compression: CompressionMode | None = None,
+    plugin: StoragePlugin,
+    compression: CompressionMode | None,
 ) -> Path:
-    """Write a rosbag2 with joint states and efforts of an arm that moves to a pose and holds it, four times a minute.
-
-    rate: Hz. begin: s since 1970. session: JSON of a Session.
-    """
+    """Write a rosbag2 of an arm that moves to a pose and holds it, four times a minute."""
     store = get_typestore(Stores.ROS2_JAZZY)
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     names = yaml.safe_load(packaged_config("sim.yaml").read_text())["/right/compensator"]["ros__parameters"]
@@ -97,21 +78,14 @@ def write_recording(
             writer.add_connection(f"/right/{topic}", JOINT_STATE, typestore=store)
             for topic in ("joint_states", "effort_commands")
         )
-        if session:
-            data = bytes(store.serialize_cdr(store.types[STRING](session), STRING))
-            writer.write(writer.add_connection(SESSION, STRING, typestore=store), begin * 10**9, data)
-        for index in range(seconds * rate):
-            at = begin * 10**9 + index * 10**9 // rate
+        for index in range(seconds * RATE):
+            at = BEGIN * 10**9 + index * 10**9 // RATE
             when = header(stamp(*divmod(at, 10**9)), "")
-            moving = 0.3 * np.sin(min(index / rate % 15.0, 3.0) * np.ones(4)) + 1e-4 * rng.standard_normal(4)
+            moving = 0.3 * np.sin(min(index / RATE % 15.0, 3.0) * np.ones(4)) + 1e-4 * rng.standard_normal(4)
             for connection, arrays in ((states, (moving, np.zeros(4), moving)), (commands, ([], [], moving))):
                 message = store.types[JOINT_STATE](when, names["joint_names"], *map(np.asarray, arrays))
                 writer.write(connection, at, bytes(store.serialize_cdr(message, JOINT_STATE)))
     return path
-
-
-def _report(bag: Path, folder: Path) -> None:
-    trial_report.write(trial_report.analyse(read_bag(bag)), folder)
 
 
 def _read_by_rosbags(bag: Path) -> None:

@@ -16,7 +16,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ..parts import play
+from exo_gravity.lab.parallel import in_processes
+
 from .arm import Result
 from .rows import Row, all_rows
 
@@ -49,8 +50,14 @@ def main() -> int:
     console = Console(width=None if Console().is_terminal else 180, highlight=False)
     rows = [row for row in all_rows() if options.only in row.name]
     share = 60.0 * options.minutes / len(rows)
-    found = play("ordinary", played, [(row, share) for row in rows], causes, options.workers)
-    results = dict(zip(rows, found, strict=True))
+    from bench.ordinary.__main__ import played as work  # other processes do not import the `__main__` of a package
+
+    results: dict[Row, Result] = {}
+    for outcome in in_processes(work, [(row, share) for row in rows], options.workers):
+        if outcome.result is None:
+            raise RuntimeError(f"{outcome.item}: {outcome.problem}")
+        results[outcome.item[0]] = outcome.result
+        console.print(f"{len(results)} of {len(rows)}: {outcome.item[0].name}: {causes(outcome.result)}", markup=False)
     table = Table(
         "", "minutes", "starts", "refused", "let down", "rides", "samples %", "no tilt s", "error Nm", box=None
     )

@@ -17,6 +17,8 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from ..sim.test_motor import SPEC, TORQUE_CODE, command, reply_to
 from ..support.thorough import quick
 
+pytestmark = pytest.mark.thorough
+
 ROWS = (
     (Row("paper", EQUIPMENT[1], False, 100.0, "loop, work of 0.5 and 2 ms"), 0.5),
     (Row("paper", EQUIPMENT[2], True, 100.0, "arrival, 16 ms timer of an FTDI adapter"), 0.5),

@@ -15,6 +15,8 @@ from bench.search.play import play_case
 from bench.search.stage import ACTS
 from exo_gravity.core.safety.drive import State
 
+pytestmark = pytest.mark.thorough
+
 POSE = (0.0, 0.5, 0.1, 0.3)
 
 
@@ -29,58 +31,45 @@ def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happe
     assert json.loads(json.dumps(cases[0].events)) == [list(event) for event in cases[0].events]
 
 
-def test_an_unseen_cause_has_a_bound_of_its_own():
-    dropped = Event(1.0, "payload_dropped", {})
-    assert bound_of(case_of(Event(0.0, "disable", {})), clamped=False) == Bound(0.6, 0.3)
-    assert bound_of(case_of(dropped), clamped=True).speed == 2.9
-    assert bound_of(replace(case_of(dropped), rate=100.0), clamped=True).speed == 7.0
+DROPPED, PUSH = Event(1.0, "payload_dropped", {}), Event(2.0, "push", {"torque": [0.0] * 4, "duration": 0.3})
+ZERO_G, LEAN = Event(1.0, "mode", {}), Event(1.0, "lean", {"lean": 0.5, "duration": 0.5})
+SILENT, RESISTS = Event(1.0, "bus_silent", {"duration": 0.5}), Event(0.2, "resist", {"duration": 1.0})
+SLIP, REARM = Event(1.0, "encoder_slip", {"joint": 0, "error": 0.3}), Event(9.0, "rearm", {"duration": 0.3})
+WRONG_TILT = Event(1.0, "imu_creeps", {"pitch": 1.0, "roll": 0.0, "duration": 0.2})
+ASKED = Bound(0.6, 0.3, slow=0.35)
+BOUNDS = {  # rad/s where only the speed is another one
+    "a disabled arm": ([Event(0.0, "disable", {})], Bound(0.6, 0.3)),
+    "a lost load": ([DROPPED], 2.9),
+    "what the operator asks for lifts an arm slowly": ([ZERO_G], ASKED),
+    "also after a push": ([PUSH._replace(time=0.5), ZERO_G], ASKED),
+    "a push after that is a lost load": ([ZERO_G, PUSH], 2.9),
+    "One-G carries no wearer": ([Event(1.0, "body_mass", {"mass": 100.0}), PUSH], ASKED),
+    "a load that is told": ([Event(1.0, "payload_taken", {"mass": 0.2, "told": 1.0}), PUSH], 0.6),
+    "a load that is told twice as heavy": ([Event(1.0, "payload_taken", {"mass": 0.2, "told": 2.0}), PUSH], 2.9),
+    "an arm that is enabled with a wrong zero": ([SLIP, REARM], Bound(slow=0.35)),
+    "one on a trunk that turns": ([LEAN, REARM], Bound(turning=True)),
+    "whose torques are late": ([LEAN, Event(1.1, "efforts_late", {"duration": 0.2})], 2.9),
+    "a load that is lost while the bus is silent": ([SILENT, DROPPED._replace(time=1.4)], math.inf),
+    "or after that": ([SILENT, DROPPED._replace(time=1.6)], 2.9),
+    "a wearer who resists until the bus is silent": ([SILENT, RESISTS], math.inf),
+    "and beyond": ([SILENT, RESISTS._replace(values={"duration": 2.0})], 1.5),
+    "a wrong tilt": ([WRONG_TILT], 1.0),
+    "a wrong tilt of an arm that is moved": ([WRONG_TILT, Event(8.0, "reach", {})], 2.9),
+}
 
 
-def test_what_the_operator_asks_for_may_lift_an_arm_slowly_and_a_push_after_it_as_a_lost_load():
-    zero_g, push = Event(1.0, "mode", {}), Event(2.0, "push", {"torque": [0.0] * 4, "duration": 0.3})
-    earlier = push._replace(time=0.5)
-    asked = bound_of(case_of(zero_g), clamped=False)
-    assert asked == bound_of(case_of(earlier, zero_g), clamped=False) == Bound(0.6, 0.3, slow=0.35)
-    assert bound_of(case_of(zero_g, push), clamped=False).speed == 2.9
-    heavier = Event(1.0, "body_mass", {"mass": 100.0})
-    assert bound_of(case_of(heavier, push), clamped=False) == asked  # One-G carries no wearer
-    assert bound_of(replace(case_of(heavier, push), worn=True), clamped=False).speed == 2.9
-    assert bound_of(replace(case_of(zero_g, push), worn=True), clamped=False) == asked  # to One-G
-    for told, speed in ((1.0, 0.6), (2.0, 2.9)):
-        taken = Event(1.0, "payload_taken", {"mass": 0.2, "told": told})
-        assert bound_of(case_of(taken, push), clamped=False).speed == speed
+@pytest.mark.parametrize(("events", "bound"), BOUNDS.values(), ids=BOUNDS)
+def test_each_cause_has_its_bound(events, bound):
+    found = bound_of(case_of(*events), clamped=False)
+    assert found == bound if isinstance(bound, Bound) else found.speed == bound
 
 
-def test_an_arm_that_is_enabled_with_a_wrong_zero_may_rise_slowly_and_one_on_a_trunk_that_turns_in_its_frame():
-    slip, rearm = Event(1.0, "encoder_slip", {"joint": 0, "error": 0.3}), Event(9.0, "rearm", {"duration": 0.3})
-    assert bound_of(case_of(slip), clamped=False) == bound_of(case_of(rearm, slip._replace(time=10.0)), clamped=False)
-    assert bound_of(case_of(slip, rearm), clamped=False) == Bound(slow=0.35)
-    lean = Event(1.0, "lean", {"lean": 0.5, "duration": 1.0})
-    assert bound_of(case_of(lean, rearm), clamped=False) == Bound(turning=True)
-
-
-def test_nothing_bounds_what_a_lost_load_leaves_while_no_command_reaches_the_motor():
-    silent, dropped = Event(1.0, "bus_silent", {"duration": 0.5}), Event(1.4, "payload_dropped", {})
-    assert bound_of(case_of(silent, dropped), clamped=False).speed == math.inf
-    assert bound_of(case_of(silent, dropped._replace(time=1.6)), clamped=False).speed == 2.9
-    resists = Event(0.2, "resist", {"duration": 1.0})  # until the motor's push is all that moves the joint
-    assert bound_of(case_of(silent, resists), clamped=False).speed == math.inf
-    assert bound_of(case_of(silent, resists._replace(values={"duration": 2.0})), clamped=False).speed == 1.5
-
-
-def test_an_arm_may_lag_behind_a_trunk_that_turns_while_its_torques_are_late_or_clamped():
-    lean, late = Event(1.0, "lean", {"lean": 0.5, "duration": 0.5}), Event(1.1, "efforts_late", {"duration": 0.2})
-    assert bound_of(case_of(lean), clamped=False) == Bound(turning=True)
-    assert bound_of(case_of(lean, late), clamped=False) == bound_of(case_of(lean), clamped=True)
-    assert bound_of(case_of(lean, late), clamped=False).speed == 2.9
-
-
-def test_a_wrong_tilt_drives_an_arm_that_is_moved_after_it_as_one_that_turned_slowly():
-    wrong = Event(1.0, "imu_creeps", {"pitch": 1.0, "roll": 0.0, "duration": 0.2})
-    reach = Event(8.0, "reach", {})
-    assert bound_of(case_of(wrong), clamped=False).speed == 1.0
-    assert bound_of(case_of(reach._replace(time=0.5), wrong), clamped=False).speed == 1.0
-    assert bound_of(case_of(wrong, reach), clamped=False).speed == 2.9
+def test_bounds_follow_the_rate_the_clamp_and_whether_the_arm_is_worn():
+    assert bound_of(replace(case_of(DROPPED), rate=100.0), clamped=True).speed == 7.0
+    assert bound_of(case_of(LEAN), clamped=True).speed == bound_of(case_of(DROPPED), clamped=True).speed == 2.9
+    worn = [replace(case_of(first, PUSH), worn=True) for first in (Event(1.0, "body_mass", {"mass": 100.0}), ZERO_G)]
+    assert bound_of(worn[0], clamped=False).speed == 2.9
+    assert bound_of(worn[1], clamped=False) == ASKED  # to One-G
 
 
 def test_an_arm_that_is_disabled_comes_down_within_its_bound():

@@ -10,10 +10,11 @@ import pytest
 
 from bench.timing import LoopTiming, analyse, split_cycles
 from exo_gravity.core.motors.ak import pack_reply
-from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import ENTER, MotorReply
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
+
+pytestmark = pytest.mark.thorough
 
 MOTOR_SPECS = ("AK60-6", "AK80-9", "AK60-6", "AK60-6")
 ARM_MOTORS = tuple(JointMotor(MOTORS[name], can_id) for can_id, name in enumerate(MOTOR_SPECS, 1))
@@ -77,19 +78,19 @@ def test_latency_runs_from_each_motors_reply_to_the_first_command_computed_from_
     assert (timing.missed, timing.late, timing.incomplete, timing.lost) == (0, 0, 0, 0)
 
 
-def test_a_period_without_commands_is_a_missed_cycle_and_shows_in_the_spacing():
-    timing = timing_of(loop_frames(200, missing=(50, 51)))
-    assert (timing.cycles, timing.missed, timing.late) == (199, 2, 1)
-    assert timing.spacing.max() == pytest.approx(3 * PERIOD, abs=1e-6)
-
-
-def test_a_late_cycle_is_not_missed_once_the_loop_has_caught_up():
-    timing = timing_of(loop_frames(200, late=(50, 120)))
-    assert (timing.cycles, timing.missed, timing.late) == (199, 0, 2)
-
-
-def test_a_cycle_without_all_replies_is_incomplete():
-    assert timing_of(loop_frames(200, without_replies=(50,))).incomplete == 1
+@pytest.mark.parametrize(
+    ("without", "counts", "longest"),
+    [
+        ({"missing": (50, 51)}, (199, 2, 1, 0), 3.0),
+        ({"late": (50, 120)}, (199, 0, 2, 0), 1.6),
+        ({"without_replies": (50,)}, (199, 0, 0, 1), 1.0),
+    ],
+    ids=["cycles that never came", "late ones, after which the loop has caught up", "without all replies"],
+)
+def test_what_went_wrong_is_counted(without, counts, longest):
+    timing = timing_of(loop_frames(200, **without))
+    assert (timing.cycles, timing.missed, timing.late, timing.incomplete) == counts
+    assert timing.spacing.max() == pytest.approx(longest * PERIOD, abs=1e-6)
 
 
 def test_an_answer_that_never_comes_is_lost():
@@ -98,29 +99,8 @@ def test_an_answer_that_never_comes_is_lost():
     assert timing.lost > 0 and len(timing.latency) == 0
 
 
-def test_an_arm_at_rest_shows_no_latency_because_all_its_answers_are_equal():
-    one_cycle = loop_frames(1)
-    frames = {name: np.concatenate([values] * 100) for name, values in one_cycle.items()}
-    frames["time"] = np.concatenate([one_cycle["time"] + k * PERIOD for k in range(100)])
-    assert len(timing_of(frames).latency) == 0
-
-
 def test_special_frames_and_foreign_frames_are_ignored():
     frames = loop_frames(100)
     extra = {"time": [START + 0.01, START + 0.0301], "id": [1, 77], "length": [8, 8], "data": [list(ENTER), [0] * 8]}
     both = {name: np.concatenate([values, np.array(extra[name], values.dtype)]) for name, values in frames.items()}
     assert timing_of(both).latency == pytest.approx(timing_of(frames).latency)
-
-
-def test_replies_under_an_id_of_their_own_belong_to_their_motor():
-    motor = JointMotor(MOTORS["DM-J4310"], 3, wire_format=DAMIAO_MIT, timeout=0.3)
-    reply = DAMIAO_MIT.pack_reply(motor.spec, MotorReply(3, 0.5, 0.0, 0.0, 30, 0), True)
-    rows = [(motor.command_id, motor.command(1.0, 0.0)), (motor.reply_id, reply)] * 3
-    frames = {
-        "time": START + 1e-3 * np.arange(len(rows)),
-        "id": np.array([own for own, _ in rows]),
-        "length": np.array([len(data) for _, data in rows]),
-        "data": np.array([list(data) for _, data in rows], dtype=np.uint8),
-    }
-    cycles = split_cycles(frames, [motor], START, START + 1.0)
-    assert [(cycle.commands[0][1], cycle.replies[0][1]) for cycle in cycles] == [(rows[0][1], reply)] * 2
