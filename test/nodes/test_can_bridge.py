@@ -483,13 +483,17 @@ def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_
     def spin_until(condition: Callable[[], object]) -> None:
         wait_until(condition, lambda: executor.spin_once(0.01))
 
+    def answer_to_enable() -> str:
+        enabled = asked(user, SetBool, "enable", data=True)
+        spin_until(enabled.done)
+        return enabled.result().message
+
     left = asked(user, ChangeState, "change_state", transition=leave)
-    spin_until(lambda: bridge.loop.safety.state is State.LETTING_DOWN)
-    enabled = asked(user, SetBool, "enable", data=True)
+    wait_until(lambda: answer_to_enable() == can_bridge.LEAVING)
     again = asked(user, ChangeState, "change_state", transition=leave)
-    spin_until(lambda: enabled.done() and again.done())
-    assert not left.done()
-    assert enabled.result().message == can_bridge.LEAVING and not again.result().success
+    spin_until(again.done)
+    assert not left.done() and not again.result().success
+    assert bridge.loop.safety.state is State.LETTING_DOWN
     monkeypatch.setattr(descent, "DESCENT", usual)
     spin_until(left.done)
     assert left.result().success
