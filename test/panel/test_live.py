@@ -53,10 +53,11 @@ def panel_diagnostics(bag: Path) -> list[str]:
 def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
     """The nodes of the right arm, with trials, and the open page; one set of them for all tests."""
     folder = tmp_path_factory.mktemp("clinic")
-    for script in (LONG, AWAY):
-        (folder / f"{script['name']}.yaml").write_text(yaml.safe_dump(script))
+    (folder / "scripts").mkdir()
+    (folder / "scripts" / "long.yaml").write_text(yaml.safe_dump(LONG))
+    (folder / "away.yaml").write_text(yaml.safe_dump(AWAY))
     nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
-    url = nodes.add_panel(trials=str(folder))
+    url = nodes.add_panel(trials=str(folder / "scripts"))
     nodes.start()
     probe = RosProbe()
     try:
