@@ -25,7 +25,6 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
@@ -34,7 +33,7 @@ from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
 from exo_gravity.lab.calibration.tours import moments_from
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.lab.calibration.worn_arm import WORN
-from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -60,8 +59,7 @@ NOTHING = (0.0,) * 4
 class Worn:
     """A device with a wearer in it. settings, motors: as calibrated; the rest is the truth.
 
-    mounting: (3,) rad, the rotation of gravity that calibration leaves. calibrated: the arm with all but its wearer, as
-    it was when `relaxed` was seen. refusals: of the calibration of the wearer.
+    mounting: (3,) rad, the rotation of gravity that calibration leaves.
     """
 
     seed: int
@@ -71,9 +69,6 @@ class Worn:
     settings: Settings
     motors: tuple[JointMotor, ...]
     mounting: np.ndarray
-    calibrated: ConfiguredArm
-    relaxed: tuple[Observation, ...]
-    refusals: tuple[str, ...]
 
     @property
     def wearer(self) -> ArmModel:
@@ -174,7 +169,7 @@ def draw(seed: int) -> Worn:
         settings_of(found), max_effort=[min(MOST, motor.peak_effort) for motor in motors],
         terms=TermSettings(friction=Friction(0.0, coulomb * wrong[0], viscous * wrong[1])),
     )  # fmt: skip
-    return Worn(seed, side, config, scale, settings, motors, left, arm, relaxed, result.refusals)
+    return Worn(seed, side, config, scale, settings, motors, left)
 
 
 def turned(vector: Vector, turn: np.ndarray) -> np.ndarray:
