@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,9 @@ import numpy as np
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
@@ -27,9 +27,12 @@ from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.truth import TruthRecords
-from exo_gravity.sim.virtual_arm import VirtualArm
+from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
 from exo_gravity.sim.virtual_time import Wire
 from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from ..support.copies import prepared
+from ..support.simulated_device import joints_of
 
 RATE = 125.0  # Hz
 REAL_RATE = 250.0  # Hz, of config/exo.yaml: how far a joint moves until a loss is seen depends on it
@@ -38,10 +41,28 @@ WORN_MASS, WORN_COG = Wearer(75.0).on_links(DEFAULT_LINKS.length)
 DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause
 # While a motor has no power and it is not yet known, the others push on with the torque of the pose before.
 UNKNOWN_LOSS = 1.9, 0.5  # rad/s and J
+RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
+Hand = Callable[[float, Sequence[float], Sequence[float]], Sequence[float]]  # s, angles, velocities -> (n,) Nm
+
+
+class Person(VirtualWearer):
+    """Brings the arm to a pose in `over` s, lets go, and then applies the torque of `hand`, if there is one."""
+
+    def __init__(self, pose: Sequence[float], over: float) -> None:
+        super().__init__(TrialScript.parse({"name": "raise", "steps": [{"move": list(pose), "over": over}]}))
+        self.hand: Hand | None = None
+
+    def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
+        return tuple(self.hand(elapsed, theta, velocity)) if self.hand else super().torque(elapsed, theta, velocity)
+
+    def idle(self, elapsed: float, duration: float) -> bool:
+        return self.hand is None and super().idle(elapsed, duration)
 
 
 class JudgedArm(VirtualArm):
-    """An arm whose motors are judged by its true motion. truth: since it was last forgotten."""
+    """An arm whose motors are judged by its true motion. truth: since it was last forgotten. person: who raised it."""
+
+    person: Person
 
     def __init__(self, device: SimulatedDevice, *args: Any, **options: Any) -> None:
         super().__init__(device, *args, **options)
@@ -59,8 +80,8 @@ class JudgedArm(VirtualArm):
 
     def raise_to(self, pose: Sequence[float], over: float = 2.0, hold: float = 1.0) -> None:
         """Let the wearer bring the arm to a pose in `over` s, and leave it to the motors for `hold` s."""
-        script = TrialScript.parse({"name": "raise", "steps": [{"move": list(pose), "over": over}]})
-        self.device.start(VirtualWearer(script))
+        self.person = Person(pose, over)
+        self.device.start(self.person)
         self.run(over + hold)
         assert self.safety.state is State.ACTIVE, self.safety.fault
         self.forget()
@@ -81,6 +102,17 @@ class JudgedArm(VirtualArm):
         """The largest true speed of a joint in rad/s."""
         return float(np.abs(self.truth.records["velocity"]).max())
 
+    @property
+    def fastest_driven(self) -> float:
+        """The largest true speed of a joint along its motor's torque in rad/s."""
+        records = self.truth.records
+        return float(np.abs(records["velocity"][records["velocity"] * records["torque"] > 0.0]).max(initial=0.0))
+
+    @property
+    def largest_step(self) -> float:
+        """The largest change of a motor's torque within 2 ms, in Nm."""
+        return float(np.abs(np.diff(self.truth.records["torque"][::2], axis=0)).max())
+
     def assert_not_thrown(self, speed: float = DRIVEN, energy: float = ENERGY) -> None:
         """The motors caused less than `speed` rad/s and `energy` J."""
         caused = self.caused
@@ -99,7 +131,7 @@ class JudgedArm(VirtualArm):
 
 
 class CarriedArm(DirectController, JudgedArm):
-    """The arm of a 75 kg wearer, hanging, in Zero-G.
+    """The arm of a 75 kg wearer, hanging, in Zero-G. settings: of the compensator, what differs from that.
 
     joints: the motors as the parameters have them.
     motors: as they are.
@@ -110,6 +142,11 @@ class CarriedArm(DirectController, JudgedArm):
     stiffness, play: of all joints, Nm/rad and rad; 0: rigid. The compensator knows the stiffness.
     rate: cycles of the loop per s.
     proves_signs: whether the start pushes each joint.
+    friction: Nm of each joint.
+    has_wearer: whether the wearer's arm is in the device; the compensator believes so.
+    imu: of the trunk; None for a trunk that is upright.
+
+    is_late: whether no newer efforts arrive. spoilt: fields of the efforts that are replaced.
     """
 
     def __init__(
@@ -124,41 +161,73 @@ class CarriedArm(DirectController, JudgedArm):
         play: float = 0.0,
         rate: float = RATE,
         proves_signs: bool = True,
+        friction: float = 0.1,
+        has_wearer: bool = True,
+        imu: TrunkSensor | None = None,
+        **settings: Any,
     ) -> None:
+        worn = {"wearer_mass": WORN_MASS, "wearer_cog": WORN_COG}
+        elastic = {"joint_stiffness": (stiffness,) * len(joints)}
         config = ArmConfig(
-            wearer_mass=WORN_MASS,
-            wearer_cog=WORN_COG,
-            coulomb_friction=(0.1,) * len(joints),
+            coulomb_friction=(friction,) * len(joints),
             rotor_inertia=[joint.spec.rotor_inertia for joint in joints],
-            joint_stiffness=(stiffness,) * len(joints),
             backlash=(play,) * len(joints),
+            **elastic,
+            **(worn if has_wearer else {}),
         )
         device = SimulatedDevice(SimulatedArm(config), motors)
         device.is_fd = (is_fd,) * len(joints)
         for joint in joints if remembered else ():
             for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
                 device.exchange(*frame)
-        settings = Settings("right", DEFAULT_LINKS, mode="zero_g", support=1.0, max_effort=peak, use_imu=False,
-                            wearer_mass=WORN_MASS, wearer_cog=WORN_COG,
-                            joint_stiffness=(stiffness,) * len(joints))  # fmt: skip
+        given = {"mode": "zero_g", "support": 1.0, "max_effort": peak, "use_imu": bool(imu), **worn, **elastic}
+        self.settings = Settings("right", DEFAULT_LINKS, **{**given, **settings})
+        self.is_late, self.spoilt, self._last = False, dict[str, Any](), NO_EFFORTS
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         limits = Limits(JOINTS, max_effort=peak, home_tolerance=tolerance)
         if not proves_signs:
             limits = replace(limits, sign_check_torque=0.0)
-        DirectController.__init__(self, Compensator(settings, JOINTS), limits)
+        DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
         wire = Wire(start=0.0, bitrate=bitrate)
         JudgedArm.__init__(self, device, self, joints, limits, rate, wire)
+        if imu:
+            self.add_imu(imu, self.compensator, 0.01)
+
+    def efforts(self, latest: float) -> Efforts:
+        """Return the compensator's newest efforts that have arrived."""
+        if not self.is_late:
+            self._last = super().efforts(latest)
+        return self._last._replace(**self.spoilt)
+
+    def change(self, **settings: Any) -> None:
+        """Change the compensator's settings live."""
+        self.settings = replace(self.settings, **settings)
+        self.compensator.apply(self.settings)
+
+
+def usual_arm(
+    pose: Sequence[float] = (0.0, 0.4, 0.2, 0.5), peak: Sequence[float] = RATED, rate: float = REAL_RATE, **options: Any
+) -> CarriedArm:
+    """Return the arm on the usual motors, carried, raised to `pose` rad, in which the rated torques carry it."""
+    joints = joints_of((MIT,) * 4)
+    motors = [SimulatedMotor(joint) for joint in joints]
+    arm = CarriedArm(joints, motors, peak, rate=rate, proves_signs=False, **options)
+    arm.carry()
+    arm.raise_to(pose, hold=0.5)
+    return arm
+
+
+raised_usual_arm = prepared(usual_arm)
 
 
 class ShippedArm(JudgedArm):
     """The simulated arm of a file in config, without an IMU. kinds: of motors, by joint (0..), not as in the file."""
 
-    def __init__(
-        self, name: str, rate: float, kinds: Mapping[int, type[SimulatedMotor]] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, name: str, rate: float, kinds: dict[int, type[SimulatedMotor]] | None = None) -> None:
         nodes = load(packaged_config(f"{name}.yaml"))
         arm = carried_arm(nodes, "/right")
         given = device_of(node_values(nodes, "/right/simulator", simulator_table(nodes["/right/simulator"])))
+        kinds = kinds or {}
         motors = [kinds[n](motor.joint) if n in kinds else motor for n, motor in enumerate(given.motors)]
         settings = replace(arm.settings, use_imu=False)
         controller = DirectController(Compensator(settings, arm.limits.joint_names), arm.limits)
@@ -205,5 +274,6 @@ EVENTS = {
     "supply cut for 3 s": cut(3.0),
     "motor 2 restarts in 30 ms": cut(0.03, 1),
     "motor 2 loses its power for 1 s": cut(1.0, 1),
-    **{f"loop stalls for {ms} ms": stall(ms / 1000.0) for ms in (20, 40, 60, 75, 120)},
+    "motor 1 loses its power for 1 s": cut(1.0, 0),
+    **{f"loop stalls for {ms} ms": stall(ms / 1000.0) for ms in (20, 40, 60, 75, 120, 300)},
 }

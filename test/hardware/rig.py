@@ -15,7 +15,7 @@ import can
 from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import WireFormat
-from exo_gravity.core.motors.joint_motor import JointSample
+from exo_gravity.core.motors.joint_motor import JointSample, channels_of
 from exo_gravity.core.safety.drive import Drive, Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import Address, ArmOnBus
@@ -25,7 +25,7 @@ from exo_gravity.hardware.ownership.bus_lock import ArmNotes, BusLock, DriveNote
 from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.virtual_arm import VirtualArm
-from exo_gravity.sim.virtual_time import Wire
+from exo_gravity.sim.virtual_time import TICK, Played, Wire
 
 from ..support.copies import prepared
 from ..support.simulated_device import drive_of, joints_of, make_device
@@ -36,6 +36,7 @@ QUICK = replace(LIMITS, sign_check_torque=0.0)
 CYCLE = 0.008  # s
 POSE = (0.0, 0.6, 0.3, 0.3)  # rad
 SAFE_SPEED = 1.0  # rad/s
+FIRST, SECOND = f"first{os.getpid()}", f"second{os.getpid()}"  # buses
 AFTER_EXIT = 0.5  # s for which a joint that was dropped would turn
 
 
@@ -153,6 +154,60 @@ class VirtualRig(Rig):
         """Let down the arm that a dead process left with `drive` (default: what holds it); return whether it is off."""
         self.notes = self.notes_of(drive)
         return let_down(self.arm, ArmNotes([self.notes] * 4), log, lambda: is_wanted)
+
+
+class HalfPlayed(Played):
+    """Some motors of a device whose others are played on another wire. strays: frames to those that came here."""
+
+    def __init__(self, wire: Wire, rig: VirtualRig, joints: tuple[int, ...], other: HalfPlayed | None = None) -> None:
+        self._joints, self._other = joints, other
+        self.strays: list[can.Message] = []
+        super().__init__(wire, rig.device, rig.note_speed, TICK)
+
+    def deliver(self, message: can.Message) -> None:
+        if (message.arbitration_id & 0xFF) - 1 in self._joints:
+            super().deliver(message)
+        else:
+            self.strays.append(message)
+
+    def catch_up(self) -> None:
+        if self._other:
+            self._other.catch_up()
+        else:
+            super().catch_up()
+
+    def _report(self, joint: int) -> None:
+        if joint in self._joints:
+            super()._report(joint)
+
+
+class TwoBusRig(VirtualRig):
+    """Motors 1 and 2 are on the first bus, 3 and 4 on the second."""
+
+    def connect(self) -> None:
+        self.wires = {FIRST: self.wire, SECOND: Wire(self.clock)}
+        self.first, self.second = self.wires.values()
+        near = HalfPlayed(self.first, self, (0, 1))
+        self.halves = near, HalfPlayed(self.second, self, (2, 3), near)
+        address: Address = ("wire", f"{FIRST},{FIRST},{SECOND},{SECOND}", {})
+        limits = replace(LIMITS, channels=channels_of(address[1], 4))
+        self.arm = ArmOnWires(address, self.motors, limits, CYCLE, self.wires)
+
+    @property
+    def damping(self) -> list[float]:
+        return [motor.damping for motor in self.device.motors]
+
+
+class OnWatch:
+    """Notes on the clock of `rig` whether a motor was on since."""
+
+    def __init__(self, rig: VirtualRig) -> None:
+        self.was_on = False
+        self._rig = rig
+        self.end = rig.clock.every(0.002, self._look)
+
+    def _look(self) -> None:
+        self.was_on |= any(self._rig.motors_on)
 
 
 class Raising:

@@ -1,6 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Arms of any number of joints, from a URDF, on the whole path of a torque: compensator, safety machine, bus, motors.
 
+Torque that gravity cannot account for is a fault there, too.
+
 MuJoCo's model of the same URDF says what gravity needs, and the simulated device what the motors did.
 """
 
@@ -15,7 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
+from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
@@ -25,11 +27,12 @@ from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import Drive, Efforts, FaultCode, Send
 from exo_gravity.core.safety.limits import DAMPING, Limits
+from exo_gravity.core.safety.motion_monitor import GRAVITY, MotionMonitor
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
-from exo_gravity.hardware.ownership.owned_bus import let_down
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.controllers import DirectController
+from exo_gravity.lab.inputs.parameter_file import packaged_config
+from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.trunk_motion import TrunkState
@@ -40,7 +43,6 @@ from ..support.chains import random_chain
 from ..support.thorough import quick
 from ..support.urdf_oracle import MujocoArm
 from .carried_arm import DRIVEN, JudgedArm
-from .rig import SAFE_SPEED, ArmOnWires
 
 COUNTS = (1, 2, 3, 5, 6, 7, 9)
 FEW, MANY = 3, 60  # arms at random of each number of joints
@@ -100,13 +102,9 @@ class NotedController(DirectController):
 
 
 class CarriedChain(JudgedArm):
-    """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it.
+    """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it."""
 
-    notes: what its bridge has noted.
-    """
-
-    def __init__(self, count: int, home: Sequence[float] | None = None, trunk: TrunkState = UPRIGHT) -> None:
-        self.notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
+    def __init__(self, count: int, trunk: TrunkState = UPRIGHT) -> None:
         config, self.home = hanging_chain(count, trunk)
         text, self.names = config.text, config.joint_names
         self.oracle = MujocoArm(text, self.names)
@@ -121,15 +119,13 @@ class CarriedChain(JudgedArm):
             low,
             high,
             max_effort=(SPEC.peak_torque,) * count,
-            home=tuple(self.home if home is None else home),
+            home=tuple(self.home),
         )
         settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
         self.controller = NotedController(Compensator(settings, self.names), limits)
-        super().__init__(device, self.controller, joints, limits, RATE, note=self.notes.note)
+        super().__init__(device, self.controller, joints, limits, RATE)
         if trunk is not UPRIGHT:
             self.add_imu(resting(trunk.pitch, trunk.roll), self.controller.compensator, 0.01)
-        self.notes.clock = self.clock
-        self.on_wire = ArmOnWires(("wire", "any arm", {}), joints, limits, 1.0 / RATE, {"any arm": self.wire})
 
     def raise_it(self) -> None:
         """Let the wearer raise the arm, and let go."""
@@ -173,32 +169,12 @@ def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: 
     arm.let_down()
 
 
-def test_an_arm_that_a_dead_bridge_left_is_let_down_from_its_notes() -> None:
-    arm = CarriedChain(3)
-    arm.carry()
-    arm.raise_it()
-    assert let_down(arm.on_wire, ArmNotes([arm.notes] * 3), print, lambda: False)
-    assert not arm.device.powered
-    arm.clock.sleep(0.5)
-    arm.catch_up()
-    assert arm.fastest < SAFE_SPEED
-
-
 def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:
     notes = DriveNotes.from_buffer(bytearray(ctypes.sizeof(DriveNotes)))
     assert not ArmNotes([notes] * 2).drive.powered
     notes.note(Drive((1.0, 2.0, 3.0), (0.5,) * 3, (Send.COMMAND,) * 3, True))
     assert ArmNotes([notes] * 3).drive == notes.drive
     assert ArmNotes([notes] * 2).drive == Drive((0.0,) * 2, (DAMPING,) * 2, (Send.COMMAND,) * 2, True)
-
-
-def test_an_arm_that_does_not_hang_where_home_says_is_not_started() -> None:
-    arm = CarriedChain(3)
-    wrong = CarriedChain(3, home=[angle + 0.4 for angle in arm.home])
-    wrong.enable()
-    wrong.run(15.0)
-    assert wrong.safety.fault and wrong.safety.fault.code is FaultCode.IMPLAUSIBLE_ZERO
-    assert not wrong.device.powered
 
 
 @pytest.mark.parametrize("held", [{}, {"payload.mass": 1.5, "payload.cog": [0.02, -0.03, 0.05]}])
@@ -293,3 +269,64 @@ def test_what_an_arm_without_a_hand_cannot_hold_is_refused(given: dict[str, obje
     values = {"joint_names": names, "use_imu": False, "max_effort": [30.0, 30.0], **given}
     with pytest.raises(ParameterError, match=problem):
         urdf_settings_of(values_of(urdf_table(values), values), UrdfArm(text, names))
+
+
+# Torque that gravity cannot account for.
+
+CYCLE = 0.004
+
+
+def limits_of(arm: UrdfArm, **changes: object) -> Limits:
+    """What `budget` prints for the arm."""
+    found, count = arm.skeleton(), len(arm.names)
+    rows = {f"{name}_{axis}": tuple(column.round(4)) for name, of in (("axis", found.axes), ("link", found.ways))
+            for axis, column in zip("xyz", of.T, strict=True)}  # fmt: skip
+    addition = np.minimum(10.0, GRAVITY * found.beside)
+    limits = {"max_effort": (500.0,) * count, "position_min": (-3.0,) * count, "position_max": (3.0,) * count}
+    moments = {"largest_moment": tuple(found.moments), "largest_addition": tuple(addition)}
+    return Limits(arm.names, **{**limits, **moments, **rows, "max_command": (500.0,) * count, **changes})
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7, 9])
+def test_what_mujoco_needs_of_any_chain_is_explained_in_any_pose_at_any_tilt(count: int, side: str) -> None:
+    text, names = random_chain(count, seed=count)
+    arm, truth, random = UrdfArm(text, names, "hand"), MujocoArm(text, names), np.random.default_rng(count)
+    monitor, beside = MotionMonitor(limits_of(arm)), GRAVITY * arm.skeleton().beside
+    for _ in range(50):
+        theta, (pitch, roll) = random.uniform(-3.0, 3.0, count), random.uniform(-1.0, 1.0, 2)
+        tilt = Tilt.of(side, pitch, roll)
+        monitor.follow(tilt, None)
+        low, high = monitor.explained(theta.tolist())
+        torque = truth.torque(theta, 9.80665 * np.array(tilt.gravity_in_trunk))
+        assert np.all(low - beside - 0.01 <= torque) and np.all(torque <= high + beside + 0.01)
+
+
+@pytest.mark.parametrize("name", ["elbow", "three_joints", "seven_joints"])
+def test_the_torque_of_a_shipped_arm_is_no_fault_and_its_opposite_is(name: str) -> None:
+    text = packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")
+    names = {"elbow": ["elbow"], "three_joints": ["abduction", "flexion", "elbow"]}.get(
+        name, ["flexion", "abduction", "rotation", "elbow", "pronation", "wrist_deviation", "wrist_flexion"]
+    )
+    arm, theta = UrdfArm(text, names, "hand"), [0.5 + 0.1 * n for n in range(len(names))]
+    torque = MujocoArm(text, names).torque(theta, (0.0, 0.0, -9.80665))
+    samples = tuple(JointSample(angle, 0.0, 0.0, None, None, 0.0) for angle in theta)
+    for share, is_fault in ((1.0, False), (0.3, False), (-1.0, True), (3.0, True)):
+        monitor, fault = MotionMonitor(limits_of(arm)), None
+        for _ in range(100):
+            fault = fault or monitor.step(CYCLE, samples, (share * torque).tolist())[1]
+        assert bool(fault) is is_fault
+        assert fault is None or fault.code is FaultCode.UNEXPLAINED_TORQUE
+
+
+def test_axes_that_are_no_directions_and_moments_without_a_link_are_refused() -> None:
+    text, names = random_chain(3, seed=3)
+    arm = UrdfArm(text, names, "hand")
+    none = (0.0,) * 3
+    with pytest.raises(ParameterError, match=r"largest_moment = .*must be zeros without axis_x"):
+        limits_of(arm, axis_x=none, axis_y=none, axis_z=none)
+    with pytest.raises(ParameterError, match=rf"axis_x, _y, _z of {names[1]} = .*must be a vector of length 1"):
+        limits_of(arm, axis_x=(*limits_of(arm).axis_x[:1], 0.0, 0.0), axis_y=(*limits_of(arm).axis_y[:1], 0.0, 1.0),
+                  axis_z=(*limits_of(arm).axis_z[:1], 0.0, 0.0))  # fmt: skip
+    with pytest.raises(ParameterError, match=rf"largest_moment of {names[0]} = .*must be 0 for a link without"):
+        limits_of(arm, link_x=none, link_y=none, link_z=none)

@@ -1,5 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The control loop on the simulated arm, in virtual time: whatever raises an exception, the arm is let down."""
+"""The control loop on the simulated arm, in virtual time: whatever raises an exception, the arm is let down.
+
+Also where its motors are on two buses.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,22 @@ import pytest
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.motors.frames import EXIT
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.motors.ak import MIT, MIT_V3
+from exo_gravity.core.motors.frames import EXIT, WireFormat
+from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.power import Power
 from exo_gravity.hardware import control_loop
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can.can_port import CanPort, message_of
+from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, LOWERING, ControlLoop, NoController
+from exo_gravity.sim.virtual_time import Wire
 
 from ..support.simulated_device import frame
-from .rig import CYCLE, LIMITS, MOTORS_OF_ARM, CarriedArm, VirtualRig, raised_arm
+from ..support.thorough import quick
+from .rig import CYCLE, FIRST, LIMITS, MOTORS_OF_ARM, SECOND, CarriedArm, TwoBusRig, VirtualRig, raised_arm
 from .wires import Responder
 
 OPPOSED_SPEED = 0.5  # rad/s, of 6 unopposed
@@ -240,3 +248,101 @@ def test_a_foreign_command_refuses_the_start():
         loop.cycle()
     assert loop.safety.state is State.FAULT
     assert loop.safety.fault.code == "foreign_command"
+
+
+# An arm whose motors are on two buses: one safety unit.
+
+FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
+
+
+def carried(wire_format: WireFormat = MIT) -> CarriedArm:
+    return raised_arm(wire_format=wire_format, kind=TwoBusRig)
+
+
+def silence(wire: Wire, silent: bool = True) -> None:
+    wire.loss = float(silent)
+
+
+@FORMATS
+def test_an_arm_on_two_buses_is_carried_and_each_motor_is_commanded_on_its_own(wire_format: WireFormat) -> None:
+    arm = carried(wire_format)
+    before, counted = arm.loop.incomplete, arm.loop.cycles
+    arm.run(1.0)
+    assert arm.rig.is_raised and arm.loop.cycles > counted + 100
+    assert arm.loop.incomplete == before
+    assert not any(half.strays for half in arm.rig.halves)
+    arm.safety.disable(arm.clock.monotonic())
+    arm.assert_let_down()
+
+
+def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awaited() -> None:
+    """The replies take 0.2 to 0.4 ms on each bus: awaited one after the other they take longer than together."""
+    rig = TwoBusRig()
+    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
+    rig.first.batch = rig.second.batch = 0.003  # the adapters deliver both together
+    for _ in range(20):
+        start = rig.clock.monotonic()
+        assert bus.exchange(rig.drive, start + 0.007)
+        assert rig.clock.monotonic() - start < 0.005
+
+
+@FORMATS
+@pytest.mark.parametrize("dead", quick([SECOND], [FIRST, SECOND]), ids=["first", "second"])
+def test_a_silent_bus_lets_the_whole_arm_down_and_its_motors_once_they_reply(
+    wire_format: WireFormat, dead: str
+) -> None:
+    arm = carried(wire_format)
+    rig = arm.rig
+    live = [0, 1] if dead == SECOND else [2, 3]
+    silence(rig.wires[dead])
+    arm.run(0.2)
+    assert arm.safety.state is State.LETTING_DOWN and arm.safety.fault
+    assert arm.safety.fault.code is FaultCode.MOTOR_SILENT
+    assert f"no motor on {dead} replies: the bus is lost, or the supply is cut" in arm.safety.fault.reason
+    assert all(rig.damping[joint] > 0.3 * DAMPING for joint in live)
+    arm.run_until(lambda: arm.safety.is_unreached)
+    assert not any(arm.safety.limits.is_silent(arm.clock.monotonic(), arm.loop.samples[joint]) for joint in live)
+    assert not arm.loop.is_off
+    silence(rig.wires[dead], False)
+    arm.assert_let_down()
+
+
+def test_a_bus_that_fails_does_not_keep_the_other_from_its_commands() -> None:
+    arm = carried()
+    rig = arm.rig
+    rig.second.refusal = BusError("no such device")
+    rig.second.break_down(can.CanOperationError("No buffer space available"))
+    arm.run(0.2)
+    assert arm.safety.fault and arm.safety.fault.code is FaultCode.BUS_ERROR
+    assert all(damping > 0.3 * DAMPING for damping in rig.damping[:2])
+    assert rig.damping[2:] == [0.0, 0.0]
+    rig.second.refusal = None  # it is plugged in again
+    rig.second.broken = set()
+    arm.assert_let_down()
+
+
+def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_for_off() -> None:
+    arm = carried()
+    rig = arm.rig
+    arm.safety.disable(arm.clock.monotonic())
+    arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
+    rig.second.refusal = BusError("no such device")
+    rig.second.break_down(can.CanOperationError("Network is down"))
+    arm.run(0.5)
+    assert not arm.loop.is_off
+    rig.second.refusal = None
+    rig.second.broken = set()
+    arm.run_until(lambda: arm.loop.is_off)
+    assert rig.motors_on == [False] * 4
+
+
+def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -> None:
+    rig = TwoBusRig()
+    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
+    command = message_of((3, rig.motors[2].command(1.0, 0.0)))
+    rig.first.carry(None, command)
+    bus.receive_until(rig.clock.monotonic() + CYCLE)
+    assert bus.ignored == {"foreign frame": 1} and not bus.foreign_commands
+    rig.second.carry(None, command)
+    bus.receive_until(rig.clock.monotonic() + CYCLE)
+    assert bus.ignored[FOREIGN_COMMAND] == bus.foreign_commands == 1

@@ -14,32 +14,20 @@ from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import Drive, State
 
 from ..support.thorough import quick
-from .rig import QUICK, SAFE_SPEED, VirtualRig, raised_arm
+from .rig import QUICK, SAFE_SPEED, OnWatch, TwoBusRig, VirtualRig, raised_arm
 
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT_V3], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
 CAUSED_SPEED = 0.6  # rad/s that motors may cause
 
 
-class OnWatch:
-    """Notes on the clock of `rig` whether a motor was on since."""
-
-    def __init__(self, rig: VirtualRig) -> None:
-        self.was_on = False
-        self._rig = rig
-        self.end = rig.clock.every(0.002, self._look)
-
-    def _look(self) -> None:
-        self.was_on |= any(self._rig.motors_on)
+SUPPLY_RETURNS = [(VirtualRig, MIT, 2.0, True), (TwoBusRig, MIT, 2.0, False), (VirtualRig, MIT_V3, 9.0, False)]
 
 
-SUPPLY_RETURNS = [(MIT, 2.0, True), (MIT_V3, 9.0, False)]
-
-
-@pytest.mark.parametrize(("wire_format", "duration", "clears"), quick(SUPPLY_RETURNS[:1], SUPPLY_RETURNS))
+@pytest.mark.parametrize(("kind", "wire_format", "duration", "clears"), quick(SUPPLY_RETURNS[:2], SUPPLY_RETURNS))
 def test_motors_whose_supply_returns_stay_off_until_they_are_enabled(
-    wire_format: WireFormat, duration: float, clears: bool
+    kind: type[VirtualRig], wire_format: WireFormat, duration: float, clears: bool
 ) -> None:
-    arm = raised_arm(wire_format=wire_format)
+    arm = raised_arm(wire_format=wire_format, kind=kind)
     arm.rig.switch_supply(False)
     arm.run(duration)
     assert arm.safety.fault.code == "motor_silent"
@@ -115,21 +103,6 @@ def test_a_single_motor_whose_power_returns_late_does_not_get_its_old_torque(
     arm.run_until(lambda: arm.loop.is_off)
     assert arm.rig.motors_on == [False] * 4
     assert arm.rig.top_speed < SAFE_SPEED
-
-
-@pytest.mark.parametrize(("wire_format", "duration"), [(MIT, 10.0), (MIT_V3, 2.0)])
-def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFormat, duration: float) -> None:
-    rig = VirtualRig(wire_format=wire_format)
-    watches: list[OnWatch] = []
-
-    def release() -> None:
-        watches.append(OnWatch(rig))
-        rig.switch_supply(True)
-
-    rig.clock.later(0.5, lambda: rig.switch_supply(False))
-    rig.clock.later(0.5 + duration, release)
-    assert rig.let_down()
-    assert watches and not watches[0].was_on
 
 
 def test_the_last_resort_leaves_motors_off_whose_supply_returns() -> None:

@@ -1,14 +1,23 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Torques of arms from their URDF: against MuJoCo, and against the exact law on the exoskeleton's own description."""
+"""Torques of arms from their URDF: against MuJoCo, Pinocchio and the exact law on the exoskeleton's own description.
+
+In descriptions that are incomplete but not empty, what changes the torque is used or refused, and the rest is named.
+"""
+
+from __future__ import annotations
 
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
+import rtbdata
 
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import values_of
 from exo_gravity.hardware import urdf_tree
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import configured_arm
@@ -85,17 +94,28 @@ def test_the_joints_may_come_in_any_order():
     assert mixed.max_effort == tuple(ordered.max_effort[n] for n in order)
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(side):
-    params = packaged_config("sim_both.yaml")
-    own, random = configured_arm(params, side), np.random.default_rng(3)
-    for text in (urdf_of(params, side), urdf_of(params)):  # one arm, and both on one trunk
-        arm = UrdfArm(text, own.joint_names)
+@pytest.mark.parametrize(("side", "inward"), [("right", 1.0), ("left", -1.0)])
+def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law_bare_worn_and_loaded(side, inward):
+    """The description has the trunk's axes in every link while the arm hangs: x_4 down, y_4 forward, z_4 inward."""
+    params, random = packaged_config("sim_both.yaml"), np.random.default_rng(3)
+    own = configured_arm(params, side)
+    arm, both = (
+        UrdfArm(urdf_of(params, side), own.joint_names, f"{side}_end"),
+        UrdfArm(urdf_of(params), own.joint_names),
+    )
+    mass, cog, load = (0.0, 0.2, 2.0, 1.5), (0.0, 0.05, 0.16, 0.18), (0.03, 0.02, -0.01)
+    x, y, z = load
+    held = arm.with_wearer(mass, cog, 0.7).with_payload(1.2, (y, inward * z, -x))
+    law = own.robot.with_wearer(mass, cog, 0.7).with_payload(1.2, load)
+    for described, exact in ((arm, own.robot), (both, own.robot), (held, law)):
         for _ in range(POSES):
             theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
-            exact = gravity_torque(own.robot, theta, Tilt.of_gravity(side, gravity).direction)
-            assert np.allclose(torque_of(arm, theta, gravity), exact, rtol=0.0, atol=1e-9)
-        assert arm.total_mass == pytest.approx(own.robot.total_mass)
+            expected = gravity_torque(exact, theta, Tilt.of_gravity(side, gravity).direction)
+            assert np.allclose(torque_of(described, theta, gravity), expected, rtol=0.0, atol=1e-9)
+        assert described.total_mass == pytest.approx(exact.total_mass)
+    assert arm.length == pytest.approx(own.robot.length.tolist())
+    none = (0.0,) * 4
+    assert held.with_payload(0.0).with_wearer(none, none) == arm.with_payload(0.0).with_wearer(none, none)
 
 
 @pytest.mark.parametrize(("text", "joint", "problem"), [
@@ -116,27 +136,6 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law(sid
 def test_a_description_that_cannot_be_used_is_refused_with_the_reason(text, joint, problem):
     with pytest.raises(ParameterError, match=problem):
         UrdfArm(text, [joint])
-
-
-def test_the_papers_arm_as_a_urdf_carries_a_wearer_and_a_load_like_the_closed_form():
-    """The description has the trunk's axes in every link while the arm hangs: x_4 down, y_4 forward, z_4 inward."""
-    params, random = packaged_config("sim_both.yaml"), np.random.default_rng(4)
-    for side, inward in (("right", 1.0), ("left", -1.0)):
-        own = configured_arm(params, side)
-        arm = UrdfArm(urdf_of(params, side), own.joint_names, f"{side}_end")
-        assert arm.length == pytest.approx(own.robot.length.tolist())
-        mass, cog, load = (0.0, 0.2, 2.0, 1.5), (0.0, 0.05, 0.16, 0.18), (0.03, 0.02, -0.01)
-        x, y, z = load
-        held = arm.with_wearer(mass, cog, 0.7).with_payload(1.2, (y, inward * z, -x))
-        exact = own.robot.with_wearer(mass, cog, 0.7).with_payload(1.2, load)
-        assert held.total_mass == pytest.approx(exact.total_mass)
-        for _ in range(POSES):
-            theta, gravity = random.uniform(-3.0, 3.0, 4), random_gravity(random)
-            expected = gravity_torque(exact, theta, Tilt.of_gravity(side, gravity).direction)
-            assert np.allclose(torque_of(held, theta, gravity), expected, rtol=0.0, atol=1e-9)
-        assert held.with_payload(0.0).with_wearer((0.0,) * 4, (0.0,) * 4) == arm.with_payload(0.0).with_wearer(
-            (0.0,) * 4, (0.0,) * 4
-        )
 
 
 def worn(count: int, random: np.random.Generator) -> UrdfArm:
@@ -175,7 +174,7 @@ def test_many_poses_at_once_have_the_torques_that_pinocchio_computes_for_each(co
 
 def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
     random = np.random.default_rng(6)
-    arm, pin = branched(), pytest.importorskip("pinocchio")
+    arm = branched()
     model = pin.buildModelFromXML(BRANCHED)
     data = model.createData()
     theta = random.uniform(-3.0, 3.0, (POSES, 3))
@@ -209,7 +208,120 @@ def test_a_missing_joint_leaves_the_others_where_they_were():
     assert np.array_equal(arm.places(np.zeros((1, 3))), before)
 
 
-def test_one_link_takes_its_weight_times_its_lever():
-    arm = UrdfArm(ONE_LINK.format(mass=2, kind="continuous"), ["j"])
-    assert torque_of(arm, [np.pi / 2], (0.0, 0.0, -10.0)) == pytest.approx([10.0])
-    assert arm.max_effort == (5.0,)
+# Descriptions that are incomplete.
+
+PANDA, WHOLE = ARMS["panda"][0].read_text(encoding="utf-8"), ARMS["panda"][1]
+KR16 = Path(rtbdata.__path__[0], "xacro/kuka_description/kuka_kr16/urdf/kr16_2.urdf").read_text(encoding="utf-8")
+GRAVITY = (
+    STANDARD_GRAVITY * np.array((0.12, -0.35, -0.929)) / np.linalg.norm((0.12, -0.35, -0.929))
+)  # m/s^2, in the root link
+TILT = Tilt.of_gravity("left", GRAVITY / STANDARD_GRAVITY)
+BALL = 0.01 * np.array((1.0, 1.0, 1.0, 0.0, 0.0, 0.0))  # kg m^2: ixx, iyy, izz, ixy, ixz, iyz
+SHAPE = "<visual><geometry><box size='0.1 0.1 0.1'/></geometry></visual>"
+DEPENDS = "<mimic joint='j1' multiplier='-0.7' offset='0.2'/>"
+
+
+def link(name: str, mass: float = 1.0, cog: float = -0.2, extra: str = "") -> str:
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    inertia = " ".join(f"{key}='{value}'" for key, value in zip(names, BALL, strict=True))
+    inertial = f"<inertial><origin xyz='0.05 0 {cog}'/><mass value='{mass}'/><inertia {inertia}/></inertial>"
+    if not cog:
+        inertial = inertial.replace("0.05 0 0", "0 0 0")
+    return f"<link name='{name}'>{inertial if mass else ''}{extra}</link>"
+
+
+def joint(n: int, kind: str = "revolute", effort: float = 30.0, extra: str = "") -> str:
+    return (
+        f"<joint name='j{n}' type='{kind}'><parent link='l{n - 1}'/><child link='l{n}'/><origin xyz='0 0 -0.3'/>"
+        f"<axis xyz='0 1 {0.2 * n}'/><limit lower='-2' upper='2' effort='{effort}' velocity='1'/>{extra}</joint>"
+    )
+
+
+def chain(*parts: str) -> str:
+    return f"<robot name='chain'><link name='l0'/>{''.join(parts)}</robot>"
+
+
+THREE = (link("l1"), link("l2"), link("l3"), joint(1), joint(2), joint(3))
+
+
+def test_positions_of_other_joints_that_are_reported_give_the_torque_of_the_whole_arm() -> None:
+    arm, whole, random = UrdfArm(PANDA, WHOLE[:3]), MujocoArm(PANDA, WHOLE), np.random.default_rng(1)
+    low, high = np.array((-2.8, -1.7, -2.8, -3.0, -2.8, 0.0, -2.8)), np.array((2.8, 1.7, 2.8, -0.1, 2.8, 3.7, 2.8))
+    for _ in range(50):
+        theta = random.uniform(low, high)
+        arm.follow([*WHOLE[::-1], "gripper"], [*theta[::-1], np.nan])
+        expected = whole.torque(theta, GRAVITY)[:3]
+        # Of the other joints only the last does not change the torque by more than 3 %: it is left at 0.
+        assert np.allclose(arm.torque(theta[:3], TILT), expected, rtol=0.0, atol=0.03 * 50.0)
+        whole_but_last = whole.torque((*theta[:6], 0.0), GRAVITY)[:3]
+        assert np.allclose(arm.torque(theta[:3], TILT), whole_but_last, rtol=0.0, atol=1e-9)
+    assert arm.fixed == ()
+
+
+def test_a_joint_that_cannot_be_at_0_must_be_reported_and_one_that_was_must_stay() -> None:
+    arm = UrdfArm(PANDA, WHOLE[:3])
+    assert arm.fixed == ("panda_joint4", "panda_joint5", "panda_joint6") and "panda_joint5" in arm.notes[-1]
+    with pytest.raises(ParameterError, match=r"position of panda_joint4 .*limits -3\.0718 to -0\.0698"):
+        arm.torque((0.0, 0.6, 0.0), TILT)
+    with pytest.raises(ParameterError, match="position of panda_joint4"):
+        arm.follow(WHOLE[:3], (0.0,) * 3)
+    arm.follow(WHOLE[3:5], (-1.0, 0.3))
+    assert arm.fixed == ("panda_joint6",)
+    with pytest.raises(ParameterError, match="position of panda_joint5 = None: must be in the joint states"):
+        arm.follow(WHOLE[3:4], (-1.0,))
+    with pytest.raises(ParameterError, match="position of panda_joint5 = nan: must be finite"):
+        arm.follow(WHOLE[3:5], (-1.0, np.nan))
+
+
+def test_a_mimic_joint_carries_its_share_to_the_joint_that_it_follows() -> None:
+    text = chain(*THREE[:4], joint(2, extra=DEPENDS), joint(3))
+    arm, mujoco, random = UrdfArm(text, ["j1", "j3"]), MujocoArm(text, ["j1", "j2", "j3"]), np.random.default_rng(2)
+
+    def energy(first: float, last: float) -> float:
+        return mujoco.energy((first, -0.7 * first + 0.2, last), GRAVITY)
+
+    for first, last in random.uniform(-1.5, 1.5, (20, 2)):
+        small = 1e-5
+        expected = (
+            (energy(first + small, last) - energy(first - small, last)) / (2.0 * small),
+            (energy(first, last + small) - energy(first, last - small)) / (2.0 * small),
+        )
+        assert arm.torque((first, last), TILT) == pytest.approx(expected, abs=1e-8)
+    with pytest.raises(ParameterError, match="joint_names = 'j2': must be j1, which that joint follows"):
+        UrdfArm(text, ["j1", "j2", "j3"])
+
+
+def test_mimic_joints_that_follow_each_other_are_refused() -> None:
+    circle = DEPENDS.replace("j1", "j3")
+    with pytest.raises(ParameterError, match="a joint that does not follow it in turn"):
+        UrdfArm(chain(*THREE[:4], joint(2, extra=circle), joint(3, extra=DEPENDS.replace("j1", "j2"))), ["j1"])
+
+
+def test_a_link_with_a_shape_and_no_mass_is_refused_where_a_joint_of_the_arm_moves_it_and_named_elsewhere() -> None:
+    empty = link("l2", mass=0.0, extra=SHAPE)
+    with pytest.raises(ParameterError, match="link = 'l2': must be with a mass"):
+        UrdfArm(chain(link("l1"), empty, *THREE[2:]), ["j1", "j2", "j3"])
+    arm = UrdfArm(chain(link("l1"), empty, link("l3"), joint(1), joint(2, "fixed"), joint(3)), ["j1", "j3"])
+    assert arm.notes == ("these moving links have a shape and no mass: l2",)
+    assert UrdfArm(chain(link("l1"), link("l2", mass=0.0), *THREE[2:]), ["j1", "j2", "j3"]).notes == ()
+
+
+def test_equal_masses_in_the_joints_are_placeholders_and_refused_unless_they_hardly_matter() -> None:
+    with pytest.raises(ParameterError, match=r"mass of link_1, .* link_6 .* make 100% of the torque"):
+        UrdfArm(KR16, [f"joint_a{n}" for n in range(1, 7)])
+    two = (link("l2", 0.005, 0.0), link("l3", 0.005, 0.0))
+    (note,) = UrdfArm(chain(link("l1"), *two, *THREE[3:]), ["j1", "j2", "j3"]).notes
+    assert note.startswith("the masses of these links look like placeholders,") and note.endswith("l2, l3")
+    equal = UrdfArm(chain(*THREE), ["j1", "j2", "j3"])  # modules of one kind, with their centres of gravity
+    assert equal.notes == ()
+
+
+@pytest.mark.parametrize("effort", [2000.0, 0.5])
+def test_an_effort_limit_that_no_joint_of_such_an_arm_has_is_not_used(effort: float) -> None:
+    arm = UrdfArm(chain(*THREE[:3], joint(1), joint(2, effort=effort), joint(3)), ["j1", "j2", "j3"])
+    assert arm.max_effort == (30.0, 0.0, 30.0)
+    assert arm.notes[0].startswith(f"the effort limit of j2, {effort:g} Nm, is not used: gravity needs up to")
+    given = {"joint_names": ["j1", "j2", "j3"], "max_effort": [0.0, 20.0, 0.0], "use_imu": False}
+    assert urdf_settings_of(values_of(urdf_table(given), given), arm).max_effort == (30.0, 20.0, 30.0)
+    with pytest.raises(ParameterError, match=r"max_effort of j2 = 0\.0: must be greater than 0"):
+        urdf_settings_of(values_of(urdf_table(given), given | {"max_effort": [0.0] * 3}), arm)

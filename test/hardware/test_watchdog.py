@@ -1,13 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The watchdog's process: after the bridge has died, its arm is let down, whatever else froze.
+"""The watchdog: what it decides from notes and pipe, in virtual time; and its process, in real time.
 
-What it decides, and how it lets the arm down, is tested in virtual time: test_watchdog_decisions.py. What happens after
-both have died: test_bus_lock.py in virtual time, nodes/test_stack.py with processes.
+What happens after both have died: test_ownership.py in virtual time, nodes/test_stack.py with processes.
 """
 
 from __future__ import annotations
 
 import fcntl
+import mmap
 import os
 import pickle
 import signal
@@ -19,14 +19,226 @@ from pathlib import Path
 import pytest
 
 from exo_gravity.core.errors import BusError
+from exo_gravity.core.safety.limits import LOOP
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.ownership.bus_lock import ArmLock, BusLock, bridge_of
-from exo_gravity.hardware.ownership.owned_bus import Watchdog
+from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, DriveNotes, bridge_of
+from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence, Watchdog
+from exo_gravity.hardware.ownership.watchdog import SleepInhibitor, guard
+from exo_gravity.sim.virtual_time import VirtualClock
 
+from ..support.launched_nodes import children
+from ..support.simulated_device import OFF
 from ..support.waiting import PATIENCE, wait_until
+from .rig import CYCLE, VirtualRig
 from .simulated_rig import SimulatedRig
+from .wires import Responder
 
-pytestmark = pytest.mark.real_time
+LET_DOWN = ["letting the arm down", "the arm is down, its motors are off"]
+
+
+class Pipe:
+    """The watchdog's end of the pipe. messages: sent by the bridge, not yet received."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.messages: list[object] = []
+        self.is_broken = False
+        self._clock = clock
+
+    def poll(self, timeout: float) -> bool:
+        self._clock.run(timeout, self._is_ready)
+        return self._is_ready()
+
+    def recv(self) -> object:
+        if not self.messages:
+            raise EOFError
+        return self.messages.pop(0)
+
+    def _is_ready(self) -> bool:
+        return bool(self.messages) or self.is_broken
+
+
+class Bridge:
+    """A bridge that carries the arm and notes it every cycle. killed: when, in s."""
+
+    def __init__(self) -> None:
+        self.rig = VirtualRig()
+        self.clock = self.rig.clock
+        self.notes = DriveNotes.from_buffer(mmap.mmap(-1, mmap.PAGESIZE))
+        self.notes.clock = self.clock
+        self.notes.owner = "/right/can_bridge (PID 1)"
+        self.pipe = Pipe(self.clock)
+        self.pipe.messages.append(self.rig.arm)
+        self.killed: list[float] = []
+        self.log: list[str] = []
+        self.inhibited: list[bool] = []
+        self.drive = self.rig.drive
+        self.freeze = self.clock.every(CYCLE, lambda: self.notes.note(self.drive))
+        self.listener = Responder(self.rig.wire)
+
+    def kill(self) -> None:
+        assert not self.listener.received  # two processes must never command one motor
+        self.killed.append(self.clock.monotonic())
+        self.freeze()
+
+    def die(self) -> None:
+        self.freeze()
+        self.pipe.is_broken = True
+
+    def at(self, delay: float, happens: Callable[[], None]) -> float:
+        """Let something happen in `delay` s; return when."""
+        self.clock.later(delay, happens)
+        return self.clock.monotonic() + delay
+
+    def guard(self, is_wanted: Callable[[], bool] = lambda: False) -> int:
+        """Run the watchdog to its end; return its exit code."""
+        inhibit = self.inhibited.append
+        return guard(self.kill, ArmNotes([self.notes] * 4), self.pipe, self.log.append, is_wanted, inhibit)
+
+
+@pytest.fixture
+def bridge() -> Bridge:
+    return Bridge()
+
+
+Ending = Callable[[Bridge], float]
+
+
+def dies_first(happens: Callable[[Bridge], None]) -> Ending:
+    """Return the ending of a bridge that dies before the watchdog can kill it."""
+
+    def end(bridge: Bridge) -> float:
+        def find_none() -> None:
+            bridge.die()
+            raise ProcessLookupError
+
+        bridge.kill = find_none  # type: ignore[method-assign]
+        return bridge.at(1.0, lambda: happens(bridge))
+
+    return end
+
+
+def hand_over(bridge: Bridge) -> None:
+    bridge.pipe.messages.append("a test")
+
+
+# How a bridge ends, what the watchdog says, and within how many s it kills the bridge; None where it does not.
+ENDINGS: dict[str, tuple[Ending, str, float | None]] = {
+    "died": (lambda bridge: bridge.at(1.0, bridge.die), "has died", None),
+    "frozen": (
+        lambda bridge: bridge.at(1.0, bridge.freeze), "was frozen for 80 ms and has been killed", LOOP.frozen + 0.02),
+    "handed over": (
+        lambda bridge: bridge.at(1.0, lambda: hand_over(bridge)),
+        "handed the arm over and has been killed (a test)", 1e-6),
+    "frozen, died before it is killed": (dies_first(lambda bridge: bridge.freeze()), "has died", None),
+    "handed over, died before it is killed": (dies_first(hand_over), "has died", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("is_wanted", [False, True], ids=["", "wanted"])  # no descent whose motors reply is handed over
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_arm_of_a_bridge_that_has_ended_is_let_down_under_the_watchdogs_name(
+    bridge: Bridge, ending: str, is_wanted: bool
+) -> None:
+    happens, said, within = ENDINGS[ending]
+    when = happens(bridge)
+    assert bridge.guard(lambda: is_wanted) == 0
+    assert [0.0 <= time - when < (within or 0.0) for time in bridge.killed] == [True] * (within is not None)
+    assert bridge.log == [f"can_bridge {said}: {LET_DOWN[0]}", LET_DOWN[1]]
+    assert "of /right/can_bridge (PID 1); it is letting the arm down" in bridge.notes.owner
+    assert not bridge.notes.drive.powered
+    bridge.rig.assert_let_down()
+
+
+def test_a_watchdog_whose_motors_are_silent_hands_the_bus_over_and_the_next_bridge_lets_the_arm_down(
+    bridge: Bridge, lock_folder: Path
+) -> None:
+    """The lock is free once the watchdog's process has ended: test_ownership.py."""
+    bridge.at(1.0, lambda: setattr(bridge.rig.device, "bus_silent", True))
+    bridge.at(1.0, bridge.die)
+    asked = bridge.clock.monotonic() + 20.0
+    assert bridge.guard(lambda: bridge.clock.monotonic() > asked) == 1
+    assert asked < bridge.clock.monotonic() < asked + 0.5
+    assert bridge.notes.drive.powered
+    lock = BusLock(bridge.rig.arm.address, "left behind")
+    lock.notes.note(bridge.notes.drive)
+    lock.release()
+    bridge.clock.later(2.0, lambda: setattr(bridge.rig.device, "bus_silent", False))
+    OwnedBus(bridge.rig.arm, "the next bridge", bridge.log.append, bridge.clock).close()
+    assert bridge.log[-1] == LET_DOWN[1]
+    bridge.rig.assert_let_down()
+
+
+def test_the_computer_is_not_suspended_while_the_motors_are_on(bridge: Bridge) -> None:
+    bridge.drive = OFF
+    bridge.at(1.0, lambda: setattr(bridge, "drive", bridge.rig.drive))
+    seen: list[tuple[bool, bool]] = []
+    bridge.clock.every(0.1, lambda: seen.append((bridge.drive.powered, bridge.inhibited[-1])))
+    bridge.at(2.05, bridge.die)
+    assert bridge.guard() == 0
+    assert seen[0] == (False, False) and seen[15] == (True, True)
+
+
+def test_the_inhibiting_program_runs_until_it_is_released() -> None:
+    inhibitor, before = SleepInhibitor(("sh", "-c", "cat")), set(children(os.getpid()))
+    inhibitor.hold(True)
+    (program,) = set(children(os.getpid())) - before
+    inhibitor.hold(True)
+    assert set(children(os.getpid())) - before == {program}
+    inhibitor.hold(False)
+    assert os.waitpid(program, 0) == (program, 0)
+    for command in ((), ("no_such_program",)):
+        SleepInhibitor(command).hold(True)  # no error: the arm matters more
+
+
+@pytest.mark.parametrize("is_frozen", [False, True])
+def test_nothing_is_sent_for_a_bridge_whose_motors_are_off(bridge: Bridge, is_frozen: bool) -> None:
+    bridge.drive = OFF
+    if is_frozen:
+        bridge.at(0.5, bridge.freeze)
+    bridge.at(1.0, bridge.die)
+    assert bridge.guard() == 0
+    assert not bridge.listener.received
+    assert not bridge.log and not bridge.killed
+
+
+def test_a_bridge_that_dies_before_its_arm_is_known_leaves_motors_that_may_be_powered(bridge: Bridge) -> None:
+    bridge.pipe.messages.clear()
+    bridge.at(0.5, bridge.die)
+    assert bridge.guard() == 1
+    assert bridge.log == ["can_bridge has died: its motors may still be powered"]
+    assert bridge.notes.heartbeat == 0.0
+
+
+def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(bridge: Bridge) -> None:
+    def stall() -> None:
+        """Nothing runs for a while; then the watchdog runs first."""
+        bridge.clock.stall(5.0 * LOOP.frozen)
+
+    for delay in (0.5, 1.0):
+        bridge.at(delay, stall)
+    bridge.at(2.0, lambda: setattr(bridge, "drive", OFF))
+    bridge.at(2.5, bridge.die)
+    assert bridge.guard() == 0
+    assert not bridge.killed
+    assert bridge.notes.heartbeat > 100.0
+
+
+def test_silence_is_the_time_in_which_the_observer_ran_since_the_last_new_sign() -> None:
+    silence = Silence(10.0, HEARTBEAT.longest_look)
+    assert silence.look(10.1, 1.0) == 0.0
+    assert silence.look(10.2, 1.0) == pytest.approx(0.1)
+    assert (
+        silence.look(15.2, 1.0) == pytest.approx(0.1 + HEARTBEAT.longest_look)
+        and 0.1 + HEARTBEAT.longest_look < HEARTBEAT.timeout
+    )
+    assert silence.look(15.3, 1.0) > HEARTBEAT.timeout
+    assert silence.look(15.4, 2.0) == 0.0
+    assert silence.look(15.5, 2.0, is_due=False) == 0.0
+    assert silence.look(15.6, 2.0) == pytest.approx(0.1)
+
+
+# The process.
+
 REPO = Path(__file__).parents[2]
 
 
@@ -87,6 +299,7 @@ def carry(rig: SimulatedRig, tmp_path: Path) -> Iterator[Callable[..., Carrier]]
         carrier.close()
 
 
+@pytest.mark.real_time
 def test_the_arm_of_a_bridge_that_is_killed_is_let_down_by_the_watchdog_which_holds_its_bus_meanwhile(rig, carry):
     carrier = carry()
     assert "/right/can_bridge" in bridge_of(rig.arm.address)
@@ -99,6 +312,7 @@ def test_the_arm_of_a_bridge_that_is_killed_is_let_down_by_the_watchdog_which_ho
     rig.assert_let_down()
 
 
+@pytest.mark.real_time
 @pytest.mark.thorough
 def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
     reader, writer = os.pipe()
@@ -113,6 +327,7 @@ def test_a_full_pipe_of_the_log_does_not_delay_the_watchdog(rig, carry):
     rig.assert_let_down()
 
 
+@pytest.mark.real_time
 def test_a_frozen_watchdog_is_noticed_and_recovers_and_ends_with_its_bridge(rig):
     lock = ArmLock(rig.arm, "a test", 0.0, COMPUTER_CLOCK)
     watchdog = Watchdog(lock, rig.arm)

@@ -1,0 +1,322 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""Live changes of load, and what has thrown an arm where a torque began or a load went.
+
+With a person's arm in the device: judged by the true motion of the joints, and by how fast the motors drive them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from exo_gravity.core import ArmModel
+from exo_gravity.core.arm.rotation import ZERO
+from exo_gravity.core.arm.tilt import gravity_in_trunk
+from exo_gravity.core.compensation.terms.catalogue import Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.sim.arm import DEFAULT_LINKS
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_arm import TrunkReading
+from exo_gravity.sim.virtual_wearer import VirtualWearer
+
+from ..support.copies import prepared
+from ..support.thorough import quick
+from .carried_arm import PEAK, RATE, REAL_RATE, CarriedArm, raised_usual_arm, usual_arm
+
+SAFE_SPEED = 0.65  # rad/s, at which an arm without friction sinks under the damping of the motors
+CODE = 0.009  # Nm, of a torque of the AK80-9 on the wire
+RAISED, UPRIGHT = (0.0, 1.2, 0.3, 0.3), (0.0, 2.4, 0.3, 0.3)
+ONE_G, NO_WEARER = {"mode": "one_g"}, {"mode": "one_g", "has_wearer": False}
+SPRING = {"terms": TermSettings(spring=Spring((4.0, 14.0, 7.0, 3.9), (0.0, 0.0, -0.3, 1.3)))}
+CLAMPED = {"max_effort": (0.5,) * 4}
+HALVED = {"robot": ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)}
+
+POSE = (0.0, 0.4, 0.2, 0.5)  # rad, in which the rated torques carry the arm of 75 kg
+guided_arm = partial(raised_usual_arm, rate=RATE)
+# An arm, what changes, and whether its end is the hanging arm.
+CHANGES = {
+    # Without friction the damping alone holds it: at half the rate it sinks at 0.85 rad/s.
+    "Zero-G to One-G, above the shoulder": (
+        {"peak": PEAK, "pose": UPRIGHT, "friction": 0.01, "rate": REAL_RATE},
+        ONE_G,
+        True,
+    ),
+    "max_effort 18 to 0.5, raised": ({"peak": PEAK, "pose": RAISED}, CLAMPED, True),
+    "a spring without a wearer": (NO_WEARER, SPRING, False),
+    "gain": ({"peak": PEAK, "pose": RAISED}, HALVED, True),
+}
+# Of those, in which an arm whose motors do not damp comes near to SAFE_SPEED.
+FASTEST = ("gain",)
+QUICK = [("gain", True), ("gain", False)]
+
+
+@pytest.mark.parametrize(
+    ("name", "is_damped"), quick(QUICK, [*((name, True) for name in CHANGES), *((name, False) for name in FASTEST)])
+)
+def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
+    rig, change, hangs = CHANGES[name]
+    arm = guided_arm(**rig)
+    arm.spoilt = {} if is_damped else {"damped": False}
+    arm.change(**change)
+    arm.run(4.0)
+    for _ in range(20):
+        if hangs and arm.answer.remainder:
+            arm.run(0.5)
+    assert arm.fastest < SAFE_SPEED
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    if hangs:
+        arm.run(1.0)  # without friction it swings on, more slowly than a change is guided
+        assert max(map(abs, arm.device.arm.velocities)) < GUIDANCE.calm + 0.03
+        assert abs(arm.device.arm.positions[1]) < 0.1
+        assert arm.answer.remainder == ()
+
+
+def test_changes_during_changes_are_as_calm_as_one():
+    arm = guided_arm(pose=RAISED, peak=PEAK)
+    back = {"mode": "zero_g", "max_effort": PEAK}
+    for change in (ONE_G, back, ONE_G, CLAMPED, {"support": 0.3}, back, SPRING, ONE_G):
+        arm.change(**change)
+        arm.run(0.7)
+    for support in np.linspace(1.0, 0.0, 20):
+        arm.change(mode="zero_g", support=float(support))
+        arm.run(0.1)
+    arm.run_until(lambda: arm.answer.remainder == (), 9.0)
+    assert arm.fastest < SAFE_SPEED
+    assert arm.safety.state is State.ACTIVE
+    assert arm.answer.remainder == ()
+
+
+class Leading:
+    """A hand that leads joints 2 and 4 to and fro at up to `speed` rad/s, 0 to hold them. torques: (n, 4) Nm so far."""
+
+    def __init__(self, start: Sequence[float], speed: float) -> None:
+        self.torques: list[np.ndarray] = []
+        self._start, self._speed = np.array(start), speed
+        self._weight = np.zeros(4)
+        self._begin: float | None = None
+
+    def __call__(self, now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+        self._begin = now if self._begin is None else self._begin
+        pace, moving = 2.5, np.array((0.0, 1.0, 0.0, 1.0))
+        phase = pace * (now - self._begin)
+        error = self._start + moving * self._speed / pace * np.sin(phase) - theta
+        self._weight += np.array((120.0, 160.0, 150.0, 80.0)) * error * 0.001
+        damping = np.array((3.0, 6.0, 5.0, 2.0)) * (moving * self._speed * np.cos(phase) - velocity)
+        self.torques.append(np.array((60.0, 80.0, 60.0, 30.0)) * error + damping + self._weight)
+        return self.torques[-1].tolist()
+
+
+def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_else():
+    arm = guided_arm()
+    arm.person.hand = Leading(arm.device.arm.positions, 0.0)
+    arm.run(1.0)
+    arm.forget()
+    arm.change(**ONE_G)
+    arm.run(4.5)
+    assert arm.answer.remainder == ()
+    each_tenth = arm.truth.records["torque"][::100]
+    assert np.abs(np.diff(each_tenth, axis=0)).max() < 0.1 * GUIDANCE.rate + 2 * CODE
+    assert arm.fastest < 0.1
+
+
+def test_a_wearer_who_moves_on_is_not_stopped():
+    felt, speed = {}, 1.0
+    for is_damped in (True, False):
+        arm = guided_arm()
+        arm.spoilt = {} if is_damped else {"damped": False}
+        arm.person.hand = hand = Leading(arm.device.arm.positions, speed)
+        arm.run(1.0)
+        hand.torques.clear()
+        arm.forget()
+        arm.change(**ONE_G)
+        arm.run(3.5)
+        assert arm.safety.state is State.ACTIVE
+        assert arm.fastest < 1.3 * speed + 0.1
+        felt[is_damped] = np.array(hand.torques)
+    length = min(map(len, felt.values()))
+    assert np.abs(felt[True][:length] - felt[False][:length]).max() < GUIDANCE.brake + 1.0  # Nm that damping costs
+
+
+# What has thrown an arm.
+
+HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
+LEVEL = TrunkReading(gravity_in_trunk(0.0, 0.0).tolist())
+ZERO_G = {"mode": "zero_g"}
+
+
+def let_go(now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
+    return (0.0,) * 4
+
+
+def put_down(arm: CarriedArm) -> None:
+    arm.safety.disable(arm.now)
+    assert arm.run_until(lambda: arm.safety.state is State.DISABLED)
+
+
+def carry_again(arm: CarriedArm) -> None:
+    arm.enable()
+    assert arm.run_until(lambda: arm.safety.state is State.RAMPING_IN)
+    arm.forget()
+
+
+def test_an_empty_cuff_that_is_carried_again_rises_slowly():
+    arm = guided_arm(pose=LEANING, peak=PEAK, has_wearer=False, mode="one_g")
+    arm.person.hand = Leading(LEANING, 0.0)
+    put_down(arm)
+    arm.change(**ZERO_G)
+    arm.run(1.0)
+    carry_again(arm)
+    arm.person.hand = let_go
+    arm.run(8.0)
+    assert arm.device.arm.positions[1] > 1.0  # nobody's weight holds it
+    assert arm.fastest_driven < SAFE_SPEED
+
+
+class Imu:
+    """An IMU whose reading the test sets."""
+
+    def __init__(self) -> None:
+        self.reading = LEVEL
+
+    def __call__(self, now: float, state: TrunkState) -> TrunkReading:
+        return self.reading
+
+
+@pytest.mark.parametrize("roll", quick([30.0], [-30.0, 30.0]))
+def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
+    imu = Imu()
+    arm = usual_arm(HANGING, PEAK, RATE, has_wearer=False, imu=imu, mode="one_g")
+    put_down(arm)
+    for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
+        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
+        arm.run(0.05)
+    carry_again(arm)
+    arm.run(6.0)
+    assert 0.1 < arm.fastest_driven < SAFE_SPEED
+
+
+@prepared
+def carried_with_imu(**given: Any) -> tuple[CarriedArm, Imu]:
+    """Return a carried arm, and its IMU."""
+    imu = Imu()
+    return usual_arm(peak=PEAK, rate=RATE, imu=imu, **given), imu
+
+
+LOOSE = [({"pose": RAISED, "has_wearer": False, "mode": "one_g"}, 30.0), ({}, 30.0), ({}, 60.0)]
+
+
+@pytest.mark.parametrize(("given", "roll"), quick(LOOSE[:1], LOOSE), ids=["empty, 30 degrees", "worn, 30", "worn, 60"])
+def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll):
+    arm, imu = carried_with_imu(**given)
+    duration, steps = 0.2, 20
+    rate = math.radians(roll) / duration
+    for angle in np.linspace(0.0, math.radians(roll), steps + 1):
+        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist(), None, (rate, 0.0, 0.0))
+        arm.run(duration / steps)
+    imu.reading = imu.reading._replace(angular_velocity=ZERO)
+    arm.run(4.0)
+    assert 0.1 < arm.fastest_driven < SAFE_SPEED
+
+
+def sensed(now: float, state: TrunkState) -> TrunkReading:
+    """Return what a perfect IMU reads."""
+    return TrunkReading(gravity_in_trunk(state.pitch, state.roll).tolist(), None, state.angular_velocity)
+
+
+def bow(arm: CarriedArm, angle: float, duration: float) -> list[bool]:
+    """Let the trunk bow; return in which cycles of these 4 s the motors damped the joints."""
+    arm.device.start(VirtualWearer(TrialScript.parse({"name": "bow", "steps": [{"bow": angle, "over": duration}]})))
+    end, damped = arm.now + 4.0, []
+    while arm.now < end:
+        arm.loop.cycle()
+        damped.append(arm.answer.damped)
+    return damped
+
+
+def test_a_trunk_that_falls_takes_the_arm_along_and_one_that_bows_is_not_felt():
+    arm = usual_arm(rate=RATE, imu=sensed)
+    assert not any(bow(arm, 0.5, 1.0))
+    bow(arm, 0.0, 1.0)
+    arm.forget()
+    assert any(bow(arm, 1.4, 0.8))
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    assert arm.fastest < 4.0  # where the torque follows at once it is 7.7
+
+
+MODES = [ZERO_G, ONE_G] * 4
+ALL = [HALVED, ZERO_G, CLAMPED, {"max_effort": PEAK}, {"robot": DEFAULT_LINKS}, HALVED, ONE_G]
+
+
+@pytest.mark.parametrize("changes", quick([ALL], [MODES, ALL]), ids=["mode", "gain, mode and max_effort"])
+def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(changes):
+    arm = guided_arm(pose=RAISED, peak=PEAK, has_wearer=False, mode="one_g")
+    for change in changes:
+        arm.change(**change)
+        arm.run(0.3)
+    arm.run(4.0)
+    assert arm.fastest_driven < SAFE_SPEED
+
+
+@prepared
+def loaded(mass: float, pose: Sequence[float]) -> CarriedArm:
+    """Return a carried arm in `pose` with a load in its hand."""
+    arm = guided_arm(pose=pose, peak=PEAK)
+    arm.person.hand = Leading(pose, 0.0)
+    arm.device.arm.carry(mass)
+    arm.change(payload_mass=mass)
+    arm.run(7.0)
+    arm.person.hand = let_go
+    arm.run(0.5)
+    arm.forget()
+    return arm
+
+
+def test_one_wrong_velocity_takes_no_load_from_the_hand():
+    arm = loaded(2.0, POSE)
+    honest, calls = arm.compensator.step, iter(range(1000))
+
+    def once_wrong(now, theta, velocity=None):
+        wrong = (velocity[0], 3.0, *velocity[2:])
+        return honest(now, theta, wrong if next(calls) == 50 else velocity)
+
+    arm.compensator.step = once_wrong
+    arm.run(2.0)
+    assert next(calls) > 100
+    assert arm.compensator.dropped == 0.0 and arm.compensator.settings.payload_mass == 2.0
+    assert arm.fastest < 0.1
+
+
+@pytest.mark.thorough
+def test_a_cup_that_is_flicked_away_during_a_change_leaves_the_change_as_slow_as_it_was():
+    arm = loaded(0.2, RAISED)
+    arm.change(**ONE_G)
+    arm.run(0.5)
+    arm.device.arm.carry(0.0)
+    start, efforts = arm.now, []
+    arm.person.hand = lambda now, theta, velocity: (0.0, 6.0, 0.0, 4.0) if arm.now < start + 0.15 else (0.0,) * 4
+    for _ in range(200):
+        arm.run(0.02)
+        efforts.append(arm.answer.effort)
+    assert arm.compensator.dropped == 0.2
+    assert arm.device.arm.positions[1] < 2.5
+    still = np.abs(np.diff(efforts, axis=0))[50:]  # the flick is over
+    assert still.max() < 0.02 * (GUIDANCE.rate + GUIDANCE.gain * SAFE_SPEED)
+
+
+def test_a_load_of_2_kg_that_is_dropped_lets_the_arm_rise_but_not_fly():
+    arm = loaded(2.0, POSE)
+    start = np.array(arm.device.arm.positions)
+    arm.device.arm.carry(0.0)
+    arm.run(4.0)
+    assert arm.compensator.dropped == 2.0
+    assert arm.safety.state is State.ACTIVE
+    assert arm.fastest_driven < 4.0
+    assert np.abs(arm.device.arm.positions - start).max() < 1.2
