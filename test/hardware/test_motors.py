@@ -2,15 +2,18 @@
 """Arms on the motors of each firmware and family, in virtual time: judged by what the motors did, by the same bounds.
 
 The boards of AK motors, Damiao motors on classic CAN and CAN FD, both on one bus, and arms that ship with the package.
+At the start, signs are proven slowly, and exchanged IDs are found; elastic joints are carried.
 """
 
 from __future__ import annotations
 
 import itertools
 import struct
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from exo_gravity.core.motors.ak import MIT, USUAL_MOTORS
@@ -34,13 +37,19 @@ from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
+from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.copies import prepared
+from ..support.simulated_device import joints_of
 from ..support.thorough import quick
 from .carried_arm import (
+    DRIVEN,
     ENERGY,
     EVENTS,
+    PEAK,
     POSE,
+    RATED,
     REAL_RATE,
     UNKNOWN_LOSS,
     CarriedArm,
@@ -52,7 +61,7 @@ from .carried_arm import (
 )
 from .wires import Responder, motor_bus
 
-AK_PEAK, DAMIAO_PEAK = (9.0, 18.0, 9.0, 9.0), (9.0, 18.0, 9.0, 7.0)  # Nm
+DAMIAO_PEAK = (9.0, 18.0, 9.0, 7.0)  # Nm
 LIMIT = 0.2  # s, the time-out of the Damiao motors
 BY_NAME = {
     "damiao": ("DM-J4340", "DM-J8009", "DM-J4340", "DM-J4310"),
@@ -86,7 +95,7 @@ def arm_of(kind: str, **options: float) -> CarriedArm:
         return CarriedArm(joints, [simulated(joint) for joint in joints], DAMIAO_PEAK, **options)
     firmware = replace(FIRMWARES[kind], status_rate=500.0)  # as docs/wiring.md asks for
     joints = [board(firmware, name, number) for number, name in enumerate(USUAL_MOTORS, 1)]
-    return CarriedArm(joints, [SimulatedMotor(joint, firmware) for joint in joints], AK_PEAK, **options)
+    return CarriedArm(joints, [SimulatedMotor(joint, firmware) for joint in joints], PEAK, **options)
 
 
 @prepared
@@ -296,3 +305,129 @@ def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
     bus.receive_until(arm.now + 0.01)
     sentence = bus.boards.hindrance(arm.now, 250.0)
     assert sentence == "motor 2 replies with the ID 18: set master_id = 18, or 33 on the motor"
+
+
+# The start, and elastic joints.
+
+RIGHT, EXCHANGED = (1, 2, 3, 4), (1, 2, 4, 3)
+SLOWEST = 100.0  # Hz, the lowest in use: a light joint gains most speed in a cycle
+LIGHT = 6  # the seven-joint arm's last joint, 0.002 kg m^2
+
+
+class LateMotor(DamiaoMotor):
+    """A motor whose replies show what it read two commands ago."""
+
+    def __init__(self, joint: JointMotor) -> None:
+        super().__init__(joint)
+        self._past: deque[tuple[float, float, float]] = deque(maxlen=3)
+
+    def _readings(self, position: float, velocity: float) -> tuple[float, float, float]:
+        self._past.append(super()._readings(position, velocity))
+        return self._past[0]
+
+
+class ReversedMotor(DamiaoMotor):
+    """A motor whose torque turns the joint the other way."""
+
+    def advance(self, position: float, velocity: float, dt: float) -> float:
+        """Return the torque on the joint in Nm; see `DamiaoMotor.advance`."""
+        return -super().advance(position, velocity, dt)
+
+    def damps_at_once(self, torque: float) -> bool:
+        """Return False: its damping drives."""
+        return False
+
+
+def proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> ShippedArm:
+    """Return an arm whose signs are proven, or that is refused."""
+    arm = ShippedArm(name, SLOWEST, kinds)
+    arm.enable()
+    assert arm.run_until(lambda: arm.safety.state in (State.RAMPING_IN, State.FAULT))
+    return arm
+
+
+PROVEN: list[tuple[str, dict[int, type[DamiaoMotor]]]] = [
+    ("sim", {}),
+    ("elbow", {}),
+    ("three_joints", {}),
+    ("seven_joints", {}),
+    ("seven_joints", dict.fromkeys(range(LIGHT + 1), LateMotor)),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds"),
+    quick([PROVEN[0], PROVEN[-1]], PROVEN),
+    ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies"],
+)
+def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
+    arm = proven(name, kinds)
+    assert arm.safety.state is State.RAMPING_IN, arm.safety.fault
+    assert 0.0 < arm.fastest < DRIVEN
+
+
+def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
+    arm = proven("seven_joints", {LIGHT: ReversedMotor})
+    assert arm.safety.fault and arm.safety.fault.code is FaultCode.WRONG_SIGN
+    arm.run(1.0)
+    assert not arm.device.powered
+    assert arm.fastest < DRIVEN
+
+
+USUAL = joints_of((MIT,) * 4)
+IDS = [(EXCHANGED, True), (EXCHANGED, False), (RIGHT, True), (RIGHT, False)]
+
+
+@pytest.mark.parametrize(("ids", "is_worn"), quick([(EXCHANGED, True), (RIGHT, True)], IDS))
+def test_an_arm_with_exchanged_ids_of_shoulder_flexion_and_elbow_is_never_carried(
+    ids: Sequence[int], is_worn: bool
+) -> None:
+    arm = CarriedArm(joints_of((MIT,) * 4, ids), [SimulatedMotor(joint) for joint in USUAL], RATED)
+    if not is_worn:
+        arm.device.arm.config = replace(arm.device.arm.config, wearer_mass=(0.0,) * len(ids))
+        arm.device.arm.carry(0.0)
+    arm.enable()
+    assert arm.run_until(lambda: arm.safety.state in (State.ACTIVE, State.FAULT), 60.0)
+    if ids == RIGHT:
+        assert arm.safety.state is State.ACTIVE
+        return
+    assert arm.safety.fault and arm.safety.fault.code is FaultCode.JOINTS_EXCHANGED
+    assert "shoulder_flexion moved sooner than elbow_flexion" in arm.safety.fault.reason
+    arm.run(1.0)
+    assert not arm.device.powered
+    arm.assert_not_thrown()
+
+
+REACH = TrialScript.parse(
+    {
+        "name": "reach, come back, and wait there until the arm is at rest",
+        "steps": [
+            {"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5},
+            {"move": POSE, "over": 1.5},
+            {"move": POSE, "over": 2.0},
+        ],
+    }
+)
+
+
+ELASTIC = ((150.0, 0.0), (150.0, 0.02), (1000.0, 0.0), (1000.0, 0.01))  # Nm/rad, rad
+
+
+@pytest.mark.parametrize(("stiffness", "play"), quick([(150.0, 0.02)], ELASTIC))
+def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_leaves_it(
+    stiffness: float, play: float
+) -> None:
+    motors = [SimulatedMotor(joint) for joint in USUAL]
+    arm = CarriedArm(USUAL, motors, PEAK, stiffness=stiffness, play=play)
+    arm.carry()
+    arm.raise_to(POSE)
+    arm.device.start(VirtualWearer(REACH))
+    arm.run(5.2)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    left = np.array(arm.device.arm.positions)
+    arm.forget()
+    arm.run(2.0)
+    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    arm.assert_not_thrown()
+    # What the hand held bends the joint, and the link falls through its play.
+    assert np.abs(np.array(arm.device.arm.positions) - left).max() < 0.03 + play
