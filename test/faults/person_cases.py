@@ -205,7 +205,7 @@ CONNECTIONS = (
         "outside_limits", "motor_silent")),
 )
 FIRMWARE = (
-    # The steps are the firmware's own, also where the machine stands still; test_firmwares.py judges the return.
+    # The steps are the firmware's own, also where the machine stands still; test_motors.py judges the return.
     *(FaultCase(f"can_bridge stopped for {milliseconds} ms, motors with a time-out of 25 ms",
         stopped_for(milliseconds / 1000.0, "can_bridge"), TimeoutRig, None, speed_limit=FIRMWARE_FALL,
         steps_from=math.inf) for milliseconds in (40, 60, 75)),

@@ -49,7 +49,7 @@ MAX_STATUS_RATE, SLOW_STATUS_RATE = 500.0, 200.0
 SLOW_BITRATE = 500_000  # bit/s, below which a bus is slow
 REPLY_SHARE = 0.8  # of a cycle in which replies are awaited
 # python-can's interfaces that open a bus at another bit rate than the motors' unless they are given one, or at the one
-# that their adapter had last. test/hardware/test_bit_rates.py compares them with python-can's sources.
+# that their adapter had last. test/hardware/test_adapters.py compares them with python-can's sources.
 NEED_BITRATE = (
     "canalystii", "cantact", "gs_usb", "iscan", "ixxat", "kvaser", "neousys", "neovi", "nican", "nixnet", "pcan",
     "robotell", "seeedstudio", "slcan", "systec", "usb2can", "vector",
