@@ -10,24 +10,22 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS, Compensation
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, State
+from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import carried_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
-from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.judge import Driven, driven
+from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.params import device_of, simulator_table
-from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.truth import TruthRecords
-from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
+from exo_gravity.sim.rig import Rig
+from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.virtual_time import Wire
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
@@ -45,57 +43,38 @@ RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
 Hand = Callable[[float, Sequence[float], Sequence[float]], Sequence[float]]  # s, angles, velocities -> (n,) Nm
 
 
-class Person(VirtualWearer):
-    """Brings the arm to a pose in `over` s, lets go, and then applies the torque of `hand`, if there is one."""
+class Led(VirtualWearer):
+    """Applies the torque of a hand."""
 
-    def __init__(self, pose: Sequence[float], over: float) -> None:
-        super().__init__(TrialScript.parse({"name": "raise", "steps": [{"move": list(pose), "over": over}]}))
-        self.hand: Hand | None = None
+    def __init__(self, hand: Hand) -> None:
+        super().__init__(IDLE)
+        self._hand = hand
 
     def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
-        return tuple(self.hand(elapsed, theta, velocity)) if self.hand else super().torque(elapsed, theta, velocity)
+        return tuple(self._hand(elapsed, theta, velocity))
 
     def idle(self, elapsed: float, duration: float) -> bool:
-        return self.hand is None and super().idle(elapsed, duration)
+        return False
 
 
-class JudgedArm(VirtualArm):
-    """An arm whose motors are judged by its true motion. truth: since it was last forgotten. person: who raised it."""
+class JudgedArm(Rig):
+    """An arm whose motors are judged by its true motion."""
 
-    person: Person
-
-    def __init__(self, device: SimulatedDevice, *args: Any, **options: Any) -> None:
-        super().__init__(device, *args, **options)
+    def raise_to(self, pose: Sequence[float], over: float = 2.0, settle: float = 1.0) -> None:
+        """Let the wearer bring the arm to a pose, leave it to the motors for `settle` s, and forget that."""
+        super().raise_to(pose, over, settle)
+        assert self.state is State.ACTIVE, self.safety.fault
         self.forget()
 
-    def forget(self) -> None:
-        """Forget what the motors did so far."""
-        self.truth = self.device.truth = TruthRecords()
-
-    def carry(self) -> None:
-        """Enable the hanging arm, and run until it is carried."""
-        self.enable()
-        assert self.run_until(lambda: self.safety.state in (State.ACTIVE, State.FAULT), 90.0), self.safety.waiting_for
-        assert self.safety.state is State.ACTIVE, self.safety.fault
-
-    def raise_to(self, pose: Sequence[float], over: float = 2.0, hold: float = 1.0) -> None:
-        """Let the wearer bring the arm to a pose in `over` s, and leave it to the motors for `hold` s."""
-        self.person = Person(pose, over)
-        self.device.start(self.person)
-        self.run(over + hold)
-        assert self.safety.state is State.ACTIVE, self.safety.fault
-        self.forget()
-
-    def let_down(self) -> None:
-        """Let the arm down until its motors are off."""
-        self.safety.disable(self.now)
-        assert self.run_until(lambda: self.loop.is_off, 60.0)
-        assert not self.device.powered
+    def lead(self, hand: Hand) -> None:
+        """Let a hand act on the arm from now on."""
+        self.catch_up()
+        self.device.start(Led(hand))
 
     @property
-    def caused(self) -> Driven:
-        """What the motors caused."""
-        return driven(self.truth.records, [motor.joint.spec for motor in self.device.motors])
+    def answer(self) -> Compensation:
+        """The compensator's newest one."""
+        return self.direct.answer
 
     @property
     def fastest(self) -> float:
@@ -130,7 +109,7 @@ class JudgedArm(VirtualArm):
         self.assert_not_thrown(*(UNKNOWN_LOSS if is_loss else (DRIVEN, ENERGY)))
 
 
-class CarriedArm(DirectController, JudgedArm):
+class CarriedArm(JudgedArm):
     """The arm of a 75 kg wearer, hanging, in Zero-G. settings: of the compensator, what differs from that.
 
     joints: the motors as the parameters have them.
@@ -144,9 +123,6 @@ class CarriedArm(DirectController, JudgedArm):
     proves_signs: whether the start pushes each joint.
     friction: Nm of each joint.
     has_wearer: whether the wearer's arm is in the device; the compensator believes so.
-    imu: of the trunk; None for a trunk that is upright.
-
-    is_late: whether no newer efforts arrive. spoilt: fields of the efforts that are replaced.
     """
 
     def __init__(
@@ -163,7 +139,6 @@ class CarriedArm(DirectController, JudgedArm):
         proves_signs: bool = True,
         friction: float = 0.1,
         has_wearer: bool = True,
-        imu: TrunkSensor | None = None,
         **settings: Any,
     ) -> None:
         worn = {"wearer_mass": WORN_MASS, "wearer_cog": WORN_COG}
@@ -180,29 +155,13 @@ class CarriedArm(DirectController, JudgedArm):
         for joint in joints if remembered else ():
             for frame in (*joint.enter, (joint.command_id, joint.command(remembered, 0.0)), *joint.exit):
                 device.exchange(*frame)
-        given = {"mode": "zero_g", "support": 1.0, "max_effort": peak, "use_imu": bool(imu), **worn, **elastic}
-        self.settings = Settings("right", DEFAULT_LINKS, **{**given, **settings})
-        self.is_late, self.spoilt, self._last = False, dict[str, Any](), NO_EFFORTS
+        given = {"mode": "zero_g", "support": 1.0, "max_effort": peak, "use_imu": False, **worn, **elastic, **settings}
         tolerance = tuple(joint.spec.home_tolerance for joint in joints)
         limits = Limits(JOINTS, max_effort=peak, home_tolerance=tolerance)
         if not proves_signs:
             limits = replace(limits, sign_check_torque=0.0)
-        DirectController.__init__(self, Compensator(self.settings, JOINTS), limits)
         wire = Wire(start=0.0, bitrate=bitrate)
-        JudgedArm.__init__(self, device, self, joints, limits, rate, wire)
-        if imu:
-            self.add_imu(imu, self.compensator, 0.01)
-
-    def efforts(self, latest: float) -> Efforts:
-        """Return the compensator's newest efforts that have arrived."""
-        if not self.is_late:
-            self._last = super().efforts(latest)
-        return self._last._replace(**self.spoilt)
-
-    def change(self, **settings: Any) -> None:
-        """Change the compensator's settings live."""
-        self.settings = replace(self.settings, **settings)
-        self.compensator.apply(self.settings)
+        super().__init__(device, Settings("right", DEFAULT_LINKS, **given), joints, limits, rate, wire)
 
 
 def usual_arm(
@@ -213,7 +172,7 @@ def usual_arm(
     motors = [SimulatedMotor(joint) for joint in joints]
     arm = CarriedArm(joints, motors, peak, rate=rate, proves_signs=False, **options)
     arm.carry()
-    arm.raise_to(pose, hold=0.5)
+    arm.raise_to(pose, settle=0.5)
     return arm
 
 
@@ -230,8 +189,7 @@ class ShippedArm(JudgedArm):
         kinds = kinds or {}
         motors = [kinds[n](motor.joint) if n in kinds else motor for n, motor in enumerate(given.motors)]
         settings = replace(arm.settings, use_imu=False)
-        controller = DirectController(Compensator(settings, arm.limits.joint_names), arm.limits)
-        super().__init__(SimulatedDevice(given.arm, motors), controller, arm.motors, arm.limits, rate)
+        super().__init__(SimulatedDevice(given.arm, motors), settings, arm.motors, arm.limits, rate)
 
 
 def assert_switched_on_and_off_without_a_collision(arm: CarriedArm) -> None:
@@ -240,9 +198,7 @@ def assert_switched_on_and_off_without_a_collision(arm: CarriedArm) -> None:
     assert arm.run_until(lambda: arm.safety.state is State.PROVING and arm.safety.waiting_for == "", 5.0)
     arm.run(0.5)
     assert arm.device.powered
-    arm.safety.disable(arm.now)
-    assert arm.run_until(lambda: arm.loop.is_off, 1.0)
-    assert not arm.device.powered
+    assert arm.let_down(1.0)
     assert arm.wire.collisions == arm.wire.bus_offs == 0
 
 
@@ -250,7 +206,7 @@ def assert_held_and_let_down(arm: JudgedArm) -> None:
     """A raised arm stays where it is, and comes down gently."""
     arm.run(3.0)
     assert arm.caused.speed < 0.05
-    arm.let_down()
+    assert arm.let_down()
     arm.assert_not_thrown()
 
 
@@ -258,8 +214,8 @@ def cut(duration: float, *joints: int) -> Callable[[JudgedArm], None]:
     """Return the event that the motors of `joints`, by default of all, have no power for `duration` s."""
 
     def act(arm: JudgedArm) -> None:
-        for joint in joints or range(len(arm.device.motors)):
-            arm.device.unplug(joint, duration)
+        for joint in joints or range(len(arm.motors)):
+            ACTS["unplugged"](arm, joint, duration)
 
     return act
 

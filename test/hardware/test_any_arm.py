@@ -30,14 +30,12 @@ from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.motion_monitor import GRAVITY, MotionMonitor
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.sim.controllers import DirectController
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.urdf import UrdfConfig
-from exo_gravity.sim.virtual_arm import resting
 
 from ..support.chains import random_chain
 from ..support.thorough import quick
@@ -87,20 +85,6 @@ def hanging(config: UrdfConfig, trunk: TrunkState) -> list[float]:
     return list(data.qpos.tolist())
 
 
-class NotedController(DirectController):
-    """Notes what it has answered: positions (n,) rad and efforts (n,) Nm, the newest answer last."""
-
-    def __init__(self, compensator: Compensator, limits: Limits) -> None:
-        super().__init__(compensator, limits)
-        self.answers: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
-
-    def _efforts_for(self, now: float, samples: Sequence[JointSample]) -> Efforts:
-        efforts = super()._efforts_for(now, samples)
-        if efforts.effort:
-            self.answers.append((tuple(sample.position for sample in samples), tuple(efforts.effort)))
-        return efforts
-
-
 class CarriedChain(JudgedArm):
     """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it."""
 
@@ -122,10 +106,15 @@ class CarriedChain(JudgedArm):
             home=tuple(self.home),
         )
         settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
-        self.controller = NotedController(Compensator(settings, self.names), limits)
-        super().__init__(device, self.controller, joints, limits, RATE)
-        if trunk is not UPRIGHT:
-            self.add_imu(resting(trunk.pitch, trunk.roll), self.controller.compensator, 0.01)
+        self.answers: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
+        super().__init__(device, settings, joints, limits, RATE)
+        self.controller.change = self._note
+
+    def _note(self, efforts: Efforts) -> Efforts:
+        """Note positions (n,) rad and efforts (n,) Nm of an answer."""
+        if efforts.effort:
+            self.answers.append((tuple(sample.position for sample in self.loop.samples), tuple(efforts.effort)))
+        return efforts
 
     def raise_it(self) -> None:
         """Let the wearer raise the arm, and let go."""
@@ -162,11 +151,11 @@ def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: 
     arm.carry()
     assert arm.fastest < DRIVEN
     arm.raise_it()
-    (read, effort), _ = arm.controller.answers[-2:]  # the newest one leaves with the next cycle
+    (read, effort), _ = arm.answers[-2:]  # the newest one leaves with the next cycle
     assert np.abs(effort - arm.needed(read)).max() < ANSWERED
     applied = [motor.torque(0.0, 0.0) for motor in arm.device.motors]
     assert np.abs(np.subtract(applied, effort)).max() <= 0.5 * CODE + 1e-9
-    arm.let_down()
+    assert arm.let_down()
 
 
 def test_notes_of_an_arm_with_another_number_of_joints_are_no_torque_for_this_one() -> None:

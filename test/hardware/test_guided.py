@@ -9,23 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.rotation import ZERO
-from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.sim.virtual_arm import TrunkReading
-from exo_gravity.sim.virtual_wearer import VirtualWearer
+from exo_gravity.sim.events import ACTS
 
 from ..support.copies import prepared
 from ..support.thorough import quick
@@ -64,7 +58,7 @@ QUICK = [("gain", True), ("gain", False)]
 def test_no_change_of_load_drops_or_throws_a_passive_arm(name, is_damped):
     rig, change, hangs = CHANGES[name]
     arm = guided_arm(**rig)
-    arm.spoilt = {} if is_damped else {"damped": False}
+    arm.controller.change = None if is_damped else undamped
     arm.change(**change)
     arm.run(4.0)
     for _ in range(20):
@@ -94,6 +88,10 @@ def test_changes_during_changes_are_as_calm_as_one():
     assert arm.answer.remainder == ()
 
 
+def undamped(efforts: Efforts) -> Efforts:
+    return efforts._replace(damped=False)
+
+
 class Leading:
     """A hand that leads joints 2 and 4 to and fro at up to `speed` rad/s, 0 to hold them. torques: (n, 4) Nm so far."""
 
@@ -116,7 +114,7 @@ class Leading:
 
 def test_a_wearer_who_holds_still_feels_the_new_load_come_slowly_and_nothing_else():
     arm = guided_arm()
-    arm.person.hand = Leading(arm.device.arm.positions, 0.0)
+    arm.lead(Leading(arm.device.arm.positions, 0.0))
     arm.run(1.0)
     arm.forget()
     arm.change(**ONE_G)
@@ -131,8 +129,9 @@ def test_a_wearer_who_moves_on_is_not_stopped():
     felt, speed = {}, 1.0
     for is_damped in (True, False):
         arm = guided_arm()
-        arm.spoilt = {} if is_damped else {"damped": False}
-        arm.person.hand = hand = Leading(arm.device.arm.positions, speed)
+        arm.controller.change = None if is_damped else undamped
+        hand = Leading(arm.device.arm.positions, speed)
+        arm.lead(hand)
         arm.run(1.0)
         hand.torques.clear()
         arm.forget()
@@ -148,12 +147,7 @@ def test_a_wearer_who_moves_on_is_not_stopped():
 # What has thrown an arm.
 
 HANGING, LEANING = (0.0,) * 4, (0.0, 0.3, 0.2, 0.2)
-LEVEL = TrunkReading(gravity_in_trunk(0.0, 0.0).tolist())
 ZERO_G = {"mode": "zero_g"}
-
-
-def let_go(now: float, theta: Sequence[float], velocity: Sequence[float]) -> Sequence[float]:
-    return (0.0,) * 4
 
 
 def put_down(arm: CarriedArm) -> None:
@@ -169,45 +163,26 @@ def carry_again(arm: CarriedArm) -> None:
 
 def test_an_empty_cuff_that_is_carried_again_rises_slowly():
     arm = guided_arm(pose=LEANING, peak=PEAK, has_wearer=False, mode="one_g")
-    arm.person.hand = Leading(LEANING, 0.0)
+    arm.lead(Leading(LEANING, 0.0))
     put_down(arm)
     arm.change(**ZERO_G)
     arm.run(1.0)
     carry_again(arm)
-    arm.person.hand = let_go
+    arm.act()
     arm.run(8.0)
     assert arm.device.arm.positions[1] > 1.0  # nobody's weight holds it
     assert arm.fastest_driven < SAFE_SPEED
 
 
-class Imu:
-    """An IMU whose reading the test sets."""
-
-    def __init__(self) -> None:
-        self.reading = LEVEL
-
-    def __call__(self, now: float, state: TrunkState) -> TrunkReading:
-        return self.reading
-
-
 @pytest.mark.parametrize("roll", quick([30.0], [-30.0, 30.0]))
 def test_an_arm_whose_imu_is_wrong_by_30_degrees_at_the_start_moves_slowly(roll):
-    imu = Imu()
-    arm = usual_arm(HANGING, PEAK, RATE, has_wearer=False, imu=imu, mode="one_g")
+    arm = usual_arm(HANGING, PEAK, RATE, has_wearer=False, use_imu=True, mode="one_g")
     put_down(arm)
-    for angle in np.linspace(0.0, math.radians(roll), 20):  # a jump would be refused
-        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist())
-        arm.run(0.05)
+    ACTS["imu_wrong"](arm, 0.0, math.radians(roll), 1.0)  # a jump would be refused
+    arm.run(1.0)
     carry_again(arm)
     arm.run(6.0)
     assert 0.1 < arm.fastest_driven < SAFE_SPEED
-
-
-@prepared
-def carried_with_imu(**given: Any) -> tuple[CarriedArm, Imu]:
-    """Return a carried arm, and its IMU."""
-    imu = Imu()
-    return usual_arm(peak=PEAK, rate=RATE, imu=imu, **given), imu
 
 
 LOOSE = [({"pose": RAISED, "has_wearer": False, "mode": "one_g"}, 30.0), ({}, 30.0), ({}, 60.0)]
@@ -215,34 +190,24 @@ LOOSE = [({"pose": RAISED, "has_wearer": False, "mode": "one_g"}, 30.0), ({}, 30
 
 @pytest.mark.parametrize(("given", "roll"), quick(LOOSE[:1], LOOSE), ids=["empty, 30 degrees", "worn, 30", "worn, 60"])
 def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll):
-    arm, imu = carried_with_imu(**given)
-    duration, steps = 0.2, 20
-    rate = math.radians(roll) / duration
-    for angle in np.linspace(0.0, math.radians(roll), steps + 1):
-        imu.reading = TrunkReading(gravity_in_trunk(0.0, angle).tolist(), None, (rate, 0.0, 0.0))
-        arm.run(duration / steps)
-    imu.reading = imu.reading._replace(angular_velocity=ZERO)
-    arm.run(4.0)
+    arm = guided_arm(peak=PEAK, use_imu=True, **given)
+    ACTS["imu_wrong"](arm, 0.0, math.radians(roll), 0.2)
+    arm.run(4.2)
     assert 0.1 < arm.fastest_driven < SAFE_SPEED
-
-
-def sensed(now: float, state: TrunkState) -> TrunkReading:
-    """Return what a perfect IMU reads."""
-    return TrunkReading(gravity_in_trunk(state.pitch, state.roll).tolist(), None, state.angular_velocity)
 
 
 def bow(arm: CarriedArm, angle: float, duration: float) -> list[bool]:
     """Let the trunk bow; return in which cycles of these 4 s the motors damped the joints."""
-    arm.device.start(VirtualWearer(TrialScript.parse({"name": "bow", "steps": [{"bow": angle, "over": duration}]})))
+    arm.act({"bow": angle, "over": duration})
     end, damped = arm.now + 4.0, []
     while arm.now < end:
-        arm.loop.cycle()
+        arm.cycle()
         damped.append(arm.answer.damped)
     return damped
 
 
 def test_a_trunk_that_falls_takes_the_arm_along_and_one_that_bows_is_not_felt():
-    arm = usual_arm(rate=RATE, imu=sensed)
+    arm = usual_arm(rate=RATE, use_imu=True)
     assert not any(bow(arm, 0.5, 1.0))
     bow(arm, 0.0, 1.0)
     arm.forget()
@@ -269,11 +234,11 @@ def test_changes_upon_changes_of_an_empty_arm_drive_it_no_faster_than_one(change
 def loaded(mass: float, pose: Sequence[float]) -> CarriedArm:
     """Return a carried arm in `pose` with a load in its hand."""
     arm = guided_arm(pose=pose, peak=PEAK)
-    arm.person.hand = Leading(pose, 0.0)
+    arm.lead(Leading(pose, 0.0))
     arm.device.arm.carry(mass)
     arm.change(payload_mass=mass)
     arm.run(7.0)
-    arm.person.hand = let_go
+    arm.act()
     arm.run(0.5)
     arm.forget()
     return arm
@@ -301,7 +266,7 @@ def test_a_cup_that_is_flicked_away_during_a_change_leaves_the_change_as_slow_as
     arm.run(0.5)
     arm.device.arm.carry(0.0)
     start, efforts = arm.now, []
-    arm.person.hand = lambda now, theta, velocity: (0.0, 6.0, 0.0, 4.0) if arm.now < start + 0.15 else (0.0,) * 4
+    arm.lead(lambda now, theta, velocity: (0.0, 6.0, 0.0, 4.0) if arm.now < start + 0.15 else (0.0,) * 4)
     for _ in range(200):
         arm.run(0.02)
         efforts.append(arm.answer.effort)

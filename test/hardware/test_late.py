@@ -13,8 +13,7 @@ import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.hardware.can.request_age import AGE, Requests
-from exo_gravity.sim import VirtualWearer
-from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.events import ACTS
 
 from .carried_arm import REAL_RATE, CarriedArm, raised_usual_arm
 
@@ -25,9 +24,10 @@ STEP = 0.35  # Nm within 2 ms: a frame may change the torque by 0.2, and the han
 
 def gap(arm: CarriedArm, duration: float) -> None:
     """Let no newer efforts arrive for a while."""
-    arm.is_late = True
+    last = arm.controller.efforts(arm.now)
+    arm.controller.change = lambda efforts: last
     arm.run(duration)
-    arm.is_late = False
+    arm.controller.change = None
 
 
 def felt(arm: CarriedArm) -> float:
@@ -58,8 +58,7 @@ def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down
 def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
     arm = bare_arm()
     position = arm.device.arm.positions
-    steps = [{"move": np.add(position, (0.0, -0.5, 0.0, 0.5)).tolist(), "over": 1.25}]
-    arm.device.start(VirtualWearer(TrialScript.parse({"name": "move", "steps": steps})))
+    arm.act({"move": np.add(position, (0.0, -0.5, 0.0, 0.5)).tolist(), "over": 1.25})
     arm.run(0.45)
     assert max(map(abs, arm.device.arm.velocities)) > 0.9
     arm.forget()
@@ -71,14 +70,14 @@ def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
 
 def test_efforts_of_a_late_tilt_are_damped_at_once_and_withdrawn_ones_let_the_arm_down_at_once():
     arm = bare_arm()
-    arm.spoilt = {"held": True}
+    arm.controller.change = lambda efforts: efforts._replace(held=True)
     arm.run(2 * CYCLE)
     assert arm.safety.state is State.ACTIVE
     assert all(motor.damping > 0.0 for motor in arm.device.motors)
-    arm.spoilt = {}
+    arm.controller.change = None
     arm.run(0.5)
     assert not any(motor.damping for motor in arm.device.motors)
-    arm.spoilt = {"effort": None}
+    ACTS["efforts_withdrawn"](arm)
     arm.run(2 * CYCLE)
     assert arm.safety.state is State.LETTING_DOWN
     assert all(motor.damping > 0.0 for motor in arm.device.motors)

@@ -33,12 +33,11 @@ from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
-from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 from ..support.copies import prepared
 from ..support.simulated_device import joints_of
@@ -326,21 +325,11 @@ class LateMotor(DamiaoMotor):
         return self._past[0]
 
 
-class ReversedMotor(DamiaoMotor):
-    """A motor whose torque turns the joint the other way."""
-
-    def advance(self, position: float, velocity: float, dt: float) -> float:
-        """Return the torque on the joint in Nm; see `DamiaoMotor.advance`."""
-        return -super().advance(position, velocity, dt)
-
-    def damps_at_once(self, torque: float) -> bool:
-        """Return False: its damping drives."""
-        return False
-
-
-def proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> ShippedArm:
+def proven(name: str, kinds: dict[int, type[DamiaoMotor]], reversed_motor: int | None = None) -> ShippedArm:
     """Return an arm whose signs are proven, or that is refused."""
     arm = ShippedArm(name, SLOWEST, kinds)
+    if reversed_motor is not None:
+        ACTS["torque_reversed"](arm, reversed_motor)
     arm.enable()
     assert arm.run_until(lambda: arm.safety.state in (State.RAMPING_IN, State.FAULT))
     return arm
@@ -367,7 +356,7 @@ def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int
 
 
 def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
-    arm = proven("seven_joints", {LIGHT: ReversedMotor})
+    arm = proven("seven_joints", {}, LIGHT)
     assert arm.safety.fault and arm.safety.fault.code is FaultCode.WRONG_SIGN
     arm.run(1.0)
     assert not arm.device.powered
@@ -398,18 +387,8 @@ def test_an_arm_with_exchanged_ids_of_shoulder_flexion_and_elbow_is_never_carrie
     arm.assert_not_thrown()
 
 
-REACH = TrialScript.parse(
-    {
-        "name": "reach, come back, and wait there until the arm is at rest",
-        "steps": [
-            {"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5},
-            {"move": POSE, "over": 1.5},
-            {"move": POSE, "over": 2.0},
-        ],
-    }
-)
-
-
+# Reach, come back, and wait there until the arm is at rest.
+REACH = ({"move": [0.3, 1.0, 0.8, 1.0], "over": 1.5}, {"move": POSE, "over": 1.5}, {"move": POSE, "over": 2.0})
 ELASTIC = ((150.0, 0.0), (150.0, 0.02), (1000.0, 0.0), (1000.0, 0.01))  # Nm/rad, rad
 
 
@@ -421,7 +400,7 @@ def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_l
     arm = CarriedArm(USUAL, motors, PEAK, stiffness=stiffness, play=play)
     arm.carry()
     arm.raise_to(POSE)
-    arm.device.start(VirtualWearer(REACH))
+    arm.act(*REACH)
     arm.run(5.2)
     assert arm.safety.state is State.ACTIVE, arm.safety.fault
     left = np.array(arm.device.arm.positions)
