@@ -65,5 +65,5 @@ def require_ros(executable: str) -> None:
 
     if not find_spec("rclpy"):
         remedy = f"source /opt/ros/jazzy/setup.bash, or without ROS: {with_extra('ros')}"
-        print(f"{executable}: the Python package rclpy is not found: {remedy}", file=sys.stderr)
+        sys.stderr.write(f"{executable}: the Python package rclpy is not found: {remedy}\n")
         raise SystemExit(2)
