@@ -26,11 +26,6 @@ def wire():
     return Wire(bitrate=BITRATE)
 
 
-def sent(wire: Wire, bus: VirtualBus, *frames: can.Message) -> None:
-    for message in frames:
-        bus.send(message)
-
-
 @pytest.mark.parametrize(
     ("can_id", "data", "is_extended"),
     [
@@ -49,9 +44,9 @@ def test_the_bits_of_a_frame_are_those_of_the_specification(can_id, data, is_ext
 
 def test_frames_take_the_time_of_their_bits_and_the_lowest_waiting_id_is_next(wire):
     first, second, listener = wire.open(), wire.open(), wire.open()
-    sent(wire, first, frame(7, LOW), frame(9, LOW))
-    wire.clock.sleep(10e-6)
-    sent(wire, second, frame(8, LOW), frame(1, LOW))
+    for can_id, bus in ((7, first), (9, first), (8, second), (1, second)):
+        bus.send(frame(can_id, LOW))
+        wire.clock.sleep(10e-6 if can_id == 9 else 0.0)
     arrived = []
     start = wire.clock.monotonic() - 10e-6
     while message := listener.recv(0.01):
@@ -63,22 +58,21 @@ def test_frames_take_the_time_of_their_bits_and_the_lowest_waiting_id_is_next(wi
     assert (wire.collisions, wire.tec) == (0, 0)
 
 
-def test_two_senders_of_one_id_meet_again_until_they_are_error_passive(wire):
+@pytest.mark.parametrize(
+    ("second_data", "arrive", "collisions"),
+    [
+        (LOW, [LOW, HIGH], 16 + 1),  # the dominant bit goes through; 16 times 8 is 128; the next error flag is passive
+        (HIGH, [HIGH], 0),
+    ],
+    ids=["until they are error passive", "frames that are equal do not collide"],
+)
+def test_two_senders_of_one_id_meet_again(wire, second_data, arrive, collisions):
     first, second, listener = wire.open(), wire.open(), wire.open()
-    sent(wire, first, frame(1, HIGH))
-    sent(wire, second, frame(1, LOW))
+    first.send(frame(1, HIGH))
+    second.send(frame(1, second_data))
     wire.clock.sleep(0.02)
-    assert [bytes(listener.recv(0.0).data) for _ in range(2)] == [LOW, HIGH]  # the dominant bit goes through
-    assert wire.collisions == 16 + 1  # 16 times 8 is 128; the next error flag is passive
-    assert wire.tec == 17 * 8 and wire.bus_offs == 0
-
-
-def test_frames_that_are_equal_do_not_collide(wire):
-    first, second, listener = wire.open(), wire.open(), wire.open()
-    sent(wire, first, frame(1, LOW))
-    sent(wire, second, frame(1, LOW))
-    assert bytes(listener.recv(0.01).data) == LOW and listener.recv(0.01) is None
-    assert wire.collisions == 0
+    assert [bytes(listener.recv(0.0).data) for _ in arrive] == arrive and listener.recv(0.01) is None
+    assert (wire.collisions, wire.tec, wire.bus_offs) == (collisions, 8 * collisions, 0)
 
 
 def test_a_sender_that_fails_too_often_is_off_the_bus_for_a_while(wire):
@@ -112,24 +106,19 @@ def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
     return wire.collisions - before
 
 
-@pytest.mark.parametrize("name", ["ak", "vendor"])
-def test_three_frames_to_a_motor_that_owes_a_reply_collide_8_to_24_times_and_awaited_ones_never(wire, name):
-    device = make_device(FIRMWARES[name])
+LATE = replace(FIRMWARES["open_drive"], reply_delay=FIRMWARES["ak"].reply_delay)  # to the master's ID
+
+
+@pytest.mark.parametrize(
+    ("firmware", "at_once"),
+    [(FIRMWARES["ak"], (8, 24)), (FIRMWARES["vendor"], (8, 24)), (LATE, (1, 1000)), (FIRMWARES["open_drive"], (0, 0))],
+    ids=["ak", "vendor", "late to the master's ID", "at once to the master's ID: they follow each other"],
+)
+def test_frames_to_a_motor_that_owes_a_reply_collide_and_awaited_ones_never(wire, firmware, at_once):
+    device = make_device(firmware)
     wire.play(device)
     host = wire.open()
     assert enable(wire, host, is_awaiting=True) == 0 and wire.tec == 0
-    assert 8 <= enable(wire, host, is_awaiting=False) <= 24 and wire.tec >= 128
+    least, most = at_once
+    assert least <= enable(wire, host, is_awaiting=False) <= most and (wire.tec >= 128) == (least == 8)
     assert device.powered
-
-
-def test_replies_of_two_motors_to_the_masters_id_collide_unless_each_is_awaited(wire):
-    late = replace(FIRMWARES["open_drive"], reply_delay=FIRMWARES["ak"].reply_delay)
-    wire.play(make_device(late))
-    host = wire.open()
-    assert enable(wire, host, is_awaiting=True) == 0
-    assert enable(wire, host, is_awaiting=False) > 0
-
-
-def test_replies_that_are_sent_at_once_to_the_masters_id_follow_each_other(wire):
-    wire.play(make_device(FIRMWARES["open_drive"]))
-    assert enable(wire, wire.open(), is_awaiting=False) == 0

@@ -1,74 +1,68 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The mechanics of the simulated arm, against the exact law and the energy balance."""
+"""The mechanics of the simulated arm: weight, friction, stops, a moving base, elastic joints."""
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
+import pinocchio
 import pytest
+from scipy.integrate import solve_ivp
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
+from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, SimulatedDevice
+from exo_gravity.sim.arm import JOINT_LOSS, _mjcf, felt_in_base, in_base
+from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.urdf import UrdfConfig
 
 from ..support.calibration_device import off_axis_of
+from ..support.chains import random_chain
+from ..support.simulated_device import make_device
+from ..support.trunk import orientation
 
-UPRIGHT = (0.0, 0.0, 1.0)
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
+
 FRICTIONLESS = {"coulomb_friction": (0.0,) * 4, "viscous_friction": (0.0,) * 4}
-
-
-def simulate(arm, torque, duration):
-    for _ in range(round(duration / STEP)):
-        arm.step(torque)
-
-
-def moved(arm, start):
-    """Return the largest angle in degrees by which a joint has left `start`."""
-    return np.degrees(np.abs(np.subtract(arm.positions, start)).max())
-
-
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt(side):
-    random = np.random.default_rng(1)
-    for _ in range(100):
-        length = random.uniform(0.02, 0.4, 4)
-        links = ArmModel(length, random.uniform(0, 1, 4) * length, random.uniform(0.1, 2, 4))
-        arm = SimulatedArm(ArmConfig(links))
-        direction = Tilt.of(side, *random.uniform(-np.pi, np.pi, 2)).direction
-        theta = random.uniform(-np.pi, np.pi, 4)
-        arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
-        arm.reset(theta)
-        np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(links, theta, direction), atol=1e-12)
-        arm.data.qvel[:] = 3.0  # a moving arm weighs no more
-        np.testing.assert_allclose(arm.weight, arm.data.qfrc_bias, atol=1e-12)
-
-
-def test_centres_of_gravity_off_the_links_axes_add_the_torques_of_their_moments():
-    rng = np.random.default_rng(2)
-    links = SimulatedArm().config.links
-    for _ in range(20):
-        cog_y, cog_z = rng.uniform(-0.015, 0.015, (2, 4))
-        arm = SimulatedArm(ArmConfig(links, cog_y=cog_y, cog_z=cog_z))
-        theta, direction = rng.uniform(-3.0, 3.0, 4), Tilt.of("right", *rng.uniform(-1.0, 1.0, 2)).direction
-        arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
-        arm.reset(theta)
-        expected = ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, cog_y, cog_z))
-        np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(expected, theta, direction), atol=1e-12)
 
 
 def test_stribeck_friction_holds_at_standstill_and_is_gone_in_motion():
     config = {"coulomb_friction": (0.1,) * 4, "viscous_friction": (0.0,) * 4, "stribeck_friction": (0.2,) * 4}
-    push = np.array((0.0, 0.0, 0.0, 0.2))
-    arms = SimulatedArm(ArmConfig(**config)), SimulatedArm(ArmConfig(**config))
-    for arm, speed in zip(arms, (0.0, 0.5), strict=True):
-        arm.reset(RAISED)
-        arm.move_base((0.0, 0.0, 0.0))
-        arm.data.qvel[3] = speed
-        simulate(arm, push, 0.2)
-    assert moved(arms[0], RAISED) < 0.01
-    assert arms[1].velocities[3] > 0.6
+    arm = SimulatedArm(ArmConfig(**config))
+    arm.reset(RAISED)
+    arm.move_base((0.0, 0.0, 0.0))
+    assert moved(arm, (0.0, 0.0, 0.0, 0.2), 0.2) < 0.01
+    arm.data.qvel[3] = 0.5
+    moved(arm, (0.0, 0.0, 0.0, 0.2), 0.2)
+    assert arm.velocities[3] > 0.6
+
+
+def moved(arm, torque, duration, start=RAISED):
+    """Return by how many degrees a joint has left `start` after so many s of `torque`."""
+    for _ in range(round(duration / STEP)):
+        arm.step(torque)
+    return np.degrees(np.abs(np.subtract(arm.positions, start)).max())
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_static_torque_agrees_with_the_exact_law_in_any_pose_and_tilt_of_links_with_any_centre_of_gravity(side):
+    random = np.random.default_rng(1)
+    for number in range(100):
+        length, mass = random.uniform(0.02, 0.4, 4), random.uniform(0.1, 2, 4)
+        cog_y, cog_z = random.uniform(-0.015, 0.015, (2, 4)) * (number % 2)
+        cog = random.uniform(0, 1, 4) * length
+        arm = SimulatedArm(ArmConfig(ArmModel(length, cog, mass), cog_y=cog_y, cog_z=cog_z))
+        direction = Tilt.of(side, *random.uniform(-np.pi, np.pi, 2)).direction
+        theta = random.uniform(-np.pi, np.pi, 4)
+        arm.move_base(np.multiply(STANDARD_GRAVITY, direction))
+        arm.reset(theta)
+        expected = ArmModel(length, cog, mass, off_axis=off_axis_of(mass, cog_y, cog_z))
+        np.testing.assert_allclose(arm.data.qfrc_bias, gravity_torque(expected, theta, direction), atol=1e-12)
+        arm.data.qvel[:] = 3.0  # a moving arm weighs no more
+        np.testing.assert_allclose(arm.weight, gravity_torque(expected, theta, direction), atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +78,8 @@ def test_stribeck_friction_holds_at_standstill_and_is_gone_in_motion():
 def test_the_exact_torque_holds_the_arm_and_an_imbalance_beyond_friction_moves_it(imbalance, friction, least, most):
     arm = SimulatedArm(ArmConfig(**friction))
     arm.reset(RAISED)
-    simulate(arm, gravity_torque(arm.config.links, RAISED) + imbalance, 1.0 if least else 10.0)
-    assert least <= moved(arm, RAISED) < most
+    torque = gravity_torque(arm.config.links, RAISED) + imbalance
+    assert least <= moved(arm, torque, 1.0 if least else 10.0) < most
 
 
 def test_a_frictionless_fall_conserves_energy():
@@ -93,7 +87,7 @@ def test_a_frictionless_fall_conserves_energy():
     arm.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
     arm.reset((0.0, 0.3, 0.8, 0.6))
     start = arm.data.energy.sum()
-    simulate(arm, (0.0,) * 4, 0.25)
+    moved(arm, (0.0,) * 4, 0.25)
     potential, kinetic = arm.data.energy
     assert kinetic > 0.5
     assert potential + kinetic == pytest.approx(start, abs=0.01 * kinetic)
@@ -120,17 +114,140 @@ def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
     arm.reset(theta)
     torque = np.zeros(4)
     torque[joint] = (9.0, 18.0, 9.0, 9.0)[joint] * (-1 if side == "position_min" else 1)
-    simulate(arm, torque, 1.0)
+    moved(arm, torque, 1.0)
     assert abs(np.degrees(arm.positions[joint] - stop)) < 1.0
+    arm.reset(RAISED)
+    assert (arm.positions, arm.velocities) == (list(RAISED), [0.0] * 4)  # at rest
 
 
-def test_reset_puts_the_arm_at_rest_in_a_pose():
-    arm = SimulatedArm()
+WORN = {"wearer_mass": (0.0, 0.0, 2.0, 1.7), "wearer_cog": (0.0, 0.0, 0.16, 0.2)}
+
+# The trunk slides along the world's axes, pitches about y and rolls about x; the left arm's base is fixed to it.
+TRUNK = """
+<worldbody><body>
+  <joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/><joint type="slide" axis="0 0 1"/>
+  <joint axis="0 1 0"/><joint axis="1 0 0"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+  <body xyaxes="0 1 0 1 0 0">"""
+
+
+@pytest.fixture(scope="module")
+def on_trunk():
+    """Inverse dynamics: the arm's torque (4,) on a trunk that moves like this."""
+    xml = _mjcf(ArmConfig(**FRICTIONLESS, **WORN))  # the trunk goes around the arm, and MuJoCo joins no two models
+    xml = xml.replace("<worldbody>", TRUNK).replace("</worldbody>", "</body></body></worldbody>")
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    model.opt.gravity[:] = 0, 0, -STANDARD_GRAVITY
+
+    def torque(state, theta, velocity, acceleration):
+        data.qpos[:] = 0, 0, 0, state.pitch, state.roll, *theta
+        data.qvel[:] = 0, 0, 0, state.pitch_rate, state.roll_rate, *velocity
+        moving = orientation(state) @ state.acceleration
+        data.qacc[:] = *moving, state.pitch_acceleration, state.roll_acceleration, *acceleration
+        mujoco.mj_inverse(model, data)
+        return data.qfrc_inverse[5:].copy()
+
+    return torque
+
+
+def accelerate(arm, state, theta, velocity, torque):
+    """Return the joint accelerations (4,) of the simulated left arm under `torque`."""
+    arm.reset(theta)
+    arm.data.qvel[:] = velocity
+    arm.move_base(*felt_in_base("left", state, STANDARD_GRAVITY))
+    arm.step(torque)
+    return arm.data.qacc.copy()
+
+
+def test_an_arm_on_a_moving_base_accelerates_as_one_on_a_trunk_with_joints(on_trunk):
+    rng, arm = np.random.default_rng(3), SimulatedArm(ArmConfig(**FRICTIONLESS, **WORN))
+    for _ in range(100):
+        state = TrunkState(*rng.uniform(-1.5, 1.5, 2), *rng.uniform(-4, 4, 4), tuple(rng.uniform(-10, 10, 3)))
+        torque = rng.uniform(-3, 3, 4)
+        theta, velocity = rng.uniform((-1.5, 0, -0.5, 0), (1.5, 3, 2, 3)), rng.uniform(-4, 4, 4)
+        acceleration = accelerate(arm, state, theta, velocity, torque)
+        np.testing.assert_allclose(on_trunk(state, theta, velocity, acceleration), torque, atol=1e-8)
+
+
+def test_a_base_that_stops_turning_leaves_no_forces_behind(on_trunk):
+    arm = SimulatedArm(ArmConfig(**FRICTIONLESS, **WORN))
+    moving = TrunkState(pitch_rate=2.0, roll_acceleration=5.0, acceleration=(1.0, 2.0, 3.0))
+    theta, still = (0.3, 0.8, 0.7, 0.6), (0.0,) * 4
+    accelerate(arm, moving, theta, still, still)
+    acceleration = accelerate(arm, TrunkState(), theta, still, still)
+    np.testing.assert_allclose(on_trunk(TrunkState(), theta, still, acceleration), still, atol=1e-8)
+
+
+def test_the_right_arm_feels_the_mirror_image():
+    x, y, z = 0.3, -0.5, 0.8
+    assert in_base("right", (x, y, z)) == in_base("left", (x, -y, z))
+    assert in_base("right", (x, y, z), turning=True) == in_base("left", (-x, y, -z))
+    for side in ("left", "right"):
+        pitch, roll = 0.4, -0.3
+        down = math.sin(pitch), -math.sin(roll) * math.cos(pitch), -math.cos(roll) * math.cos(pitch)
+        np.testing.assert_allclose(in_base(side, down), Tilt.of(side, pitch, roll).direction, atol=1e-12)
+
+
+STUCK = {"coulomb_friction": (10.0,) * 4, "viscous_friction": (0.0,) * 4}
+
+
+@pytest.mark.parametrize(("count", "stiffness"), [(1, 1000.0), (3, 150.0), (3, 1000.0)])
+def test_an_elastic_arm_moves_as_pinocchio_and_scipy_compute_it(count: int, stiffness: float) -> None:
+    text, names = random_chain(count, count)
+    rotor, play, k = np.full(count, 2e-3), np.full(count, 0.01), np.full(count, stiffness)
+    loss, torque = JOINT_LOSS * k, np.linspace(0.5, -0.3, count)
+    arm = SimulatedArm(
+        UrdfConfig(
+            text=text, joint_names=names, rotor_inertia=rotor.tolist(), joint_stiffness=k.tolist(),
+            backlash=play.tolist(), coulomb_friction=(0.0,) * count, viscous_friction=(0.0,) * count,
+        )
+    )  # fmt: skip
+    arm.move_base((0.0, 0.0, -9.81))
+    start = np.linspace(0.2, 0.6, count)
+    arm.reset(start)
+    model = pinocchio.buildModelFromXML(text)
+    model = pinocchio.buildReducedModel(
+        model, [n for n in range(1, model.njoints) if model.names[n] not in names], pinocchio.neutral(model)
+    )
+    data = model.createData()
+
+    def rates(_: float, state: np.ndarray) -> np.ndarray:
+        link, motor, link_speed, motor_speed = state.reshape(4, count)
+        twist = motor - link
+        shaft = k * (twist - np.clip(twist, -play / 2.0, play / 2.0)) + loss * (motor_speed - link_speed)
+        fall = pinocchio.aba(model, data, link, link_speed, shaft)
+        return np.concatenate((link_speed, motor_speed, fall, (torque - shaft) / rotor))
+
+    way = solve_ivp(rates, (0.0, 0.2), np.concatenate((start, start, np.zeros(2 * count))), rtol=1e-7, max_step=1e-3)
+    for _ in range(round(0.2 / STEP)):
+        arm.step(torque)
+    link, motor = way.y[: 2 * count, -1].reshape(2, count)
+    assert np.abs(link - start).max() > 0.05
+    np.testing.assert_allclose(arm.positions, link, atol=3e-3)
+    np.testing.assert_allclose(arm.motor_positions, motor, atol=3e-3)
+
+
+@pytest.mark.parametrize(("stiffness", "play"), [(150.0, 0.0), (1000.0, 0.02)])
+def test_behind_a_motor_that_stands_the_link_sags_by_its_torque_and_the_play(stiffness: float, play: float) -> None:
+    arm = SimulatedArm(ArmConfig(joint_stiffness=(stiffness,) * 4, backlash=(play,) * 4, **STUCK))
     arm.reset(RAISED)
-    simulate(arm, (0.0,) * 4, 0.3)
-    arm.reset(RAISED)
-    assert arm.positions == list(RAISED)
-    assert arm.velocities == [0.0] * 4
+    for _ in range(3000):
+        arm.step(np.multiply(arm.velocities, -0.5), of_motors=(0.0,) * 4)  # a hand stills the links
+    np.testing.assert_allclose(arm.motor_positions, RAISED, atol=1e-3)
+    torque = gravity_torque(arm.config.links, arm.positions)
+    sag = np.subtract(arm.motor_positions, arm.positions)
+    carrying = np.abs(torque) > 0.3
+    np.testing.assert_allclose(sag[carrying], (torque / stiffness + np.sign(torque) * play / 2.0)[carrying], atol=2e-4)
+
+
+def test_one_elastic_joint_leaves_the_others_rigid_and_a_motor_reports_its_own_angle() -> None:
+    config = ArmConfig(joint_stiffness=(0.0, 0.0, 150.0, 0.0), **STUCK)
+    device: SimulatedDevice = make_device(config=config)
+    device.arm.reset(RAISED)
+    device.advance(0.5)
+    sag = np.subtract(device.arm.motor_positions, device.arm.positions)
+    assert sag[2] > 0.005
+    assert not np.any(np.delete(sag, 2))
 
 
 @pytest.mark.parametrize(
@@ -146,6 +263,7 @@ def test_reset_puts_the_arm_at_rest_in_a_pose():
         ({"stribeck_friction": (0, 0, -0.1, 0)}, "stribeck_friction"),
         ({"links": ArmModel.from_moments((0.05, 0.13, 0.3, 0.3), (0.1,) * 4)}, "robot.first_moment"),
         ({"links": ArmModel((0.05, 0.13, 0.3, 0.3), (0,) * 4, (0.5, 0.5, 0.0, 0.2))}, "links.mass"),
+        ({"backlash": (0.0, 0.01, 0.0, 0.0)}, "backlash"),  # play needs a stiffness
     ],
 )
 def test_an_impossible_configuration_is_rejected_by_name(change, name):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import replace
 
 import pytest
 
@@ -51,6 +50,13 @@ class Bench:
         data = bytes((3, 0, operation, register)) + value
         return self.motor.receive(data, self.angle, 0.0, self.time, REGISTERS)
 
+    def ask_float(self, register: int) -> float:
+        return struct.unpack("<f", self.ask(register)[4:])[0]
+
+    def without_power_for_a_moment(self) -> None:
+        self.motor.unplugged = True
+        self.motor.unplugged = False
+
 
 @pytest.fixture
 def bench() -> Bench:
@@ -93,21 +99,14 @@ def test_an_error_switches_the_motor_off_and_comes_back_while_its_cause_stays(be
     assert bench.state(CLEAR_ERROR) == 0x9 and bench.state(ENTER) == 0x9
     bench.motor.error = 0
     assert bench.state(CLEAR_ERROR) == 0 and bench.state(ENTER) == ON
-
-
-def test_a_hot_coil_switches_the_motor_off(bench: Bench) -> None:
-    bench.state(ENTER)
     bench.motor.temperature = 101.0
     bench.wait(STEP)
-    assert bench.push(0.0) == 0xC
+    assert bench.push(0.0) == 0xC  # a hot coil
 
 
 def test_registers_are_told_and_what_is_written_counts_until_the_power_goes(bench: Bench) -> None:
-    told = {number: bench.ask(number) for number in (7, 9, 10, 20, 21, 22, 23)}
-    values = [struct.unpack("<I", told[number][4:])[0] for number in (7, 9, 10)]
-    assert values == [0x13, 4000, 1]
-    floats = [struct.unpack("<f", told[number][4:])[0] for number in (20, 21, 22, 23)]
-    assert floats == [10.0, 12.5, 30.0, 10.0]
+    assert [struct.unpack("<I", bench.ask(number)[4:])[0] for number in (7, 9, 10)] == [0x13, 4000, 1]
+    assert [bench.ask_float(number) for number in (20, 21, 22, 23)] == [10.0, 12.5, 30.0, 10.0]
     assert bench.ask(99) is None
     assert bench.motor.receive(bytes((4, 0, 0x33, 21, 0, 0, 0, 0)), 0.0, 0.0, 0.0, REGISTERS) is None  # another's
     bench.ask(TMAX, 0x55, struct.pack("<f", 20.0))
@@ -115,27 +114,21 @@ def test_registers_are_told_and_what_is_written_counts_until_the_power_goes(benc
     bench.state(ENTER)
     bench.push(2.0)
     assert bench.wait(1.0) == pytest.approx(4.0, abs=0.02)  # the same code, another torque; and no time-out
-    bench.motor.unplugged = True
-    bench.motor.unplugged = False
-    assert struct.unpack("<f", bench.ask(TMAX)[4:])[0] == 10.0
+    bench.without_power_for_a_moment()
+    assert bench.ask_float(TMAX) == 10.0
 
 
-def test_a_stored_register_survives_a_power_cycle_and_a_refresh_tells_the_state(bench: Bench) -> None:
+def test_a_stored_register_and_the_zero_survive_a_power_cycle_and_a_refresh_tells_the_state(bench: Bench) -> None:
     bench.ask(PMAX, 0x55, struct.pack("<f", 12.566))
     bench.ask(1, 0xAA)
-    bench.motor.unplugged = True
-    bench.motor.unplugged = False
-    assert struct.unpack("<f", bench.ask(PMAX)[4:])[0] == pytest.approx(12.566)
+    bench.without_power_for_a_moment()
+    assert bench.ask_float(PMAX) == pytest.approx(12.566)
     bench.state(ENTER)
     refreshed = bench.ask(0, 0xCC)
     assert refreshed[0] == 0x13
     assert refreshed == bench.send(bytes(8), 0x103)  # which commands nothing in MIT mode either
-
-
-def test_the_zero_is_set_at_once_and_kept(bench: Bench) -> None:
-    assert bench.state(SET_ZERO) == 0
-    bench.motor.unplugged = True
-    bench.motor.unplugged = False
+    assert bench.state(EXIT) == 0 and bench.state(SET_ZERO) == 0
+    bench.without_power_for_a_moment()
     reply = DAMIAO_MIT.unpack_reply(bench.motor.joint.spec, 3, bench.send(EXIT))
     assert reply.position == pytest.approx(0.0, abs=0.001)
 
@@ -145,6 +138,5 @@ def test_a_motor_is_simulated_by_the_class_of_its_family() -> None:
     assert type(simulated(joint)) is class_of(FAMILY)
     with pytest.raises(ParameterError, match="motor = 'unheard'"):
         class_of("unheard")
-    damiao = replace(Bench().motor.joint)
     with pytest.raises(ParameterError, match=r"firmware\.variant = 'vendor': must be one of usual"):
-        simulated(damiao, FIRMWARES["vendor"])
+        simulated(Bench().joint, FIRMWARES["vendor"])

@@ -1,21 +1,38 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The simulated device: arm, motors and wearer, joined by frames alone, without a bus."""
+"""The simulated device: arm, motors, trunk and wearer joined by frames, without a bus and on one."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import socket
+import threading
+import time
+from types import SimpleNamespace
 
+import can
 import numpy as np
 import pytest
 
-from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import unpack_reply
-from exo_gravity.core.motors.frames import ENTER, SET_ZERO
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, VirtualWearer
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.motors.ak import MIT, MIT_V3, unpack_reply
+from exo_gravity.core.motors.damiao import DAMIAO_MIT
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS, SET_ZERO
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.hardware.can.can_port import CanPort
+from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, VirtualWearer
+from exo_gravity.sim import device as device_module
+from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.script import TrialScript
 
-from ..support.simulated_device import RAISED, SPECS, command, make_device
+from ..support.ports import own_ports
+from ..support.simulated_device import OFF, RAISED, SPECS, command, frame, make_device
+
+PORTS = own_ports()
 
 
 @pytest.fixture
@@ -23,12 +40,17 @@ def device():
     return make_device()
 
 
-def test_a_reply_has_the_present_position_and_velocity(device):
+def perform(device, *steps):
+    device.start(VirtualWearer(TrialScript.parse({"name": "test", "steps": list(steps)})))
+
+
+def test_a_reply_has_the_present_position_and_velocity_and_the_error_of_the_encoder(device):
+    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
     device.arm.reset(RAISED)
     device.advance(0.2)
-    for joint in range(4):
+    for joint, error in enumerate(device.encoder_error):
         reply = unpack_reply(SPECS[joint], device.exchange(joint + 1, command(joint))[1])
-        assert reply.position == pytest.approx(device.arm.positions[joint], abs=2e-4)
+        assert reply.position == pytest.approx(device.arm.positions[joint] + error, abs=2e-4)
         assert reply.velocity == pytest.approx(device.arm.velocities[joint], abs=0.013)
 
 
@@ -39,27 +61,16 @@ def test_time_advances_in_whole_steps_and_the_remainder_is_kept(device):
     assert device.time == pytest.approx(0.011)
 
 
-def test_gravity_torque_through_frames_holds_the_arm(device):
+def test_gravity_torque_through_frames_holds_the_arm_until_the_trunk_tilts(device):
     device.arm.reset(RAISED)
-    for can_id in (1, 2, 3, 4):
-        device.exchange(can_id, ENTER)
     for joint, torque in enumerate(gravity_torque(device.arm.config.links, RAISED)):
+        device.exchange(joint + 1, ENTER)
         device.exchange(joint + 1, command(joint, torque))
     device.advance(10.0)
     np.testing.assert_allclose(np.degrees(device.arm.positions), np.degrees(RAISED), atol=0.05)
-
-
-def test_a_motors_damping_acts_at_every_step():
-    links = SimulatedArm().config.links
-    weightless = ArmModel(links.length, links.cog, links.mass, gravity=0.0)
-    device = make_device(config=ArmConfig(weightless, coulomb_friction=(0,) * 4, viscous_friction=(0,) * 4))
-    device.arm.data.qvel[:] = 2.0
-    for joint in range(4):
-        device.exchange(joint + 1, ENTER)
-        device.exchange(joint + 1, command(joint, kd=2.0))
-    device.advance(1.0)
-    # Not exactly at rest: no 12-bit code commands exactly 0 rad/s.
-    assert np.abs(device.arm.velocities).max() < 0.015
+    device.pitch = 0.6
+    device.advance(2.0)
+    assert np.abs(np.subtract(device.arm.positions, RAISED)).max() > 0.2
 
 
 def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it(device):
@@ -67,35 +78,13 @@ def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it(device)
     for joint in range(len(SPECS)):
         device.exchange(joint + 1, ENTER)
         device.exchange(joint + 1, command(joint, kd=5.0))
-    reach = [{"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], [0.0, 0.9, 0.3, 0.6])]
-    device.start(VirtualWearer(TrialScript.parse({"name": "reach", "steps": reach})))
+    perform(device, *({"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], [0.0, 0.9, 0.3, 0.6])))
     velocities = []
     for _ in range(1600):
         device.advance(0.001)
         velocities.append(device.arm.velocities)
     changes = np.diff(velocities, axis=0)
     assert np.abs(changes[1:] - changes[:-1]).max() < 0.5
-
-
-def test_tilting_the_trunk_moves_the_arm(device):
-    device.advance(0.5)
-    assert np.abs(device.arm.positions).max() < 1e-6
-    device.pitch = 0.6
-    device.advance(2.0)
-    assert np.abs(device.arm.positions).max() > 0.2
-
-
-def test_the_wearer_starts_after_the_delay(device):
-    device.advance(1.0)
-    wearer = VirtualWearer(
-        TrialScript.parse({"name": "test", "steps": [{"move": list(RAISED), "over": 2.0}, {"hold": 1.0}]})
-    )
-    device.start(wearer, delay=0.5)
-    device.advance(0.4)
-    assert wearer.step is None
-    device.advance(2.0)
-    assert wearer.step == 0
-    np.testing.assert_allclose(device.arm.positions, RAISED, atol=0.03)
 
 
 @pytest.mark.parametrize(("fault", "of_joint_1"), [("bus_silent", True), ("cut_off", (True, False, False, False))])
@@ -106,12 +95,6 @@ def test_a_motor_that_no_frame_reaches_keeps_its_last_command(device, fault, of_
     assert device.exchange(1, command(0, 0.0)) is None
     assert device.motors[0].torque(0.0, 0.0) == pytest.approx(2.0, abs=0.01)
     assert (device.exchange(3, ENTER) is None) is (fault == "bus_silent")
-
-
-def test_an_encoder_error_shifts_the_angle_that_a_motor_replies(device):
-    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
-    reply = unpack_reply(SPECS[1], device.exchange(2, command(1))[1])
-    assert reply.position == pytest.approx(0.698, abs=0.001)
 
 
 def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
@@ -129,10 +112,6 @@ def test_two_motors_with_the_same_id_are_rejected(ids):
         make_device(ids=ids)
 
 
-def perform(device, *steps):
-    device.start(VirtualWearer(TrialScript.parse({"name": "trunk", "steps": list(steps)})))
-
-
 def test_the_trunk_bows_and_stays_bowed(device):
     device.pitch, device.roll = 0.1, -0.06
     perform(device, {"hold": 0.5}, {"bow": 0.5, "over": 1.0}, {"hold": 0.5})
@@ -144,11 +123,10 @@ def test_the_trunk_bows_and_stays_bowed(device):
     assert device.trunk.pitch_rate == pytest.approx(0.4 * 1.875, rel=0.01)
     device.advance(1.0)
     assert (device.pitch, device.roll) == pytest.approx((0.5, -0.06), abs=1e-6)
-    assert not device.trunk_motion
-    assert device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
+    assert not device.trunk_motion and device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
 
 
-def test_a_walking_trunk_stays_where_it_was(device):
+def test_a_walking_trunk_stays_where_it_was_and_a_new_script_ends_the_motion_of_the_old_one(device):
     device.pitch = 0.1
     perform(device, {"walk": 4.0}, {"hold": 1.0})
     pitches = []
@@ -157,9 +135,6 @@ def test_a_walking_trunk_stays_where_it_was(device):
         pitches.append(device.pitch)
     assert np.ptp(pitches) == pytest.approx(math.radians(2.0), rel=0.02)
     assert pitches[-1] == pytest.approx(0.1, abs=1e-6)
-
-
-def test_a_new_script_ends_the_motion_of_the_old_one(device):
     perform(device, {"walk": 10.0})
     device.advance(2.3)
     assert any(device.trunk.acceleration)
@@ -172,3 +147,172 @@ def test_the_arm_feels_the_shock_of_sitting_down(device):
     perform(device, {"sit": 2.0})
     device.advance(0.551)  # at the peak of the shock, 1.28 g
     np.testing.assert_allclose(device.arm.model.opt.gravity, (0.0, 0.0, 2.28 * 9.80665), atol=0.1)
+
+
+# On a bus of python-can
+
+
+@pytest.fixture(params=["virtual", "udp_multicast"])
+def options(request):
+    """The options of a bus that no other test uses."""
+    port = next(PORTS)
+    if request.param == "virtual":
+        return {"interface": "virtual", "channel": f"device-{port}"}
+    return {"interface": "udp_multicast", "channel": "239.74.163.2", "port": port, "hop_limit": 0}
+
+
+@contextlib.contextmanager
+def running(device, options):
+    """Run `device` in a thread; yield the host's bus. What the device sends is echoed to it, marked or as it is."""
+    stop, echo = threading.Event(), {"receive_own_messages": True} if options["interface"] == "virtual" else {}
+    with can.Bus(**options) as host, can.Bus(**options, **echo) as bus:
+        thread = threading.Thread(target=device.run, args=(bus, stop.is_set))
+        thread.start()
+        try:
+            yield host
+        finally:
+            stop.set()
+            thread.join()
+
+
+def next_reply(host, timeout=5.0):
+    """Return the next frame from a motor, or None; the first byte of the host's own commands is 0x7f or more."""
+    deadline = time.monotonic() + timeout
+    while (remaining := deadline - time.monotonic()) > 0:
+        with contextlib.suppress(can.CanOperationError):  # noise that is no frame
+            message = host.recv(remaining)
+            if message is not None and message.data and message.data[0] < 0x7F and not message.is_extended_id:
+                return message
+    return None
+
+
+def test_every_command_gets_one_reply_and_an_echo_of_a_reply_or_another_frame_is_no_command(device, options):
+    with running(device, options) as host:
+        for message in (
+            *(frame(can_id, ENTER) for can_id in (0, 5)),
+            frame(0x7FF, b""),
+            frame(1, b""),
+            frame(1, ENTER[:7]),
+            frame(1, ENTER, is_extended_id=True),
+            frame(1, None, is_remote_frame=True, dlc=8),
+            frame(1, ENTER, is_error_frame=True),
+            frame(1, ENTER, is_fd=True),
+        ):
+            host.send(message)
+        if port := options.get("port"):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
+                noise.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+                for data in (b"", b"no frame", b"\xc1", b"\x80"):
+                    noise.sendto(data, (options["channel"], port))
+        host.send(frame(1, command(0, 2.0)))
+        assert next_reply(host).arbitration_id == 1
+        assert device.motors[0].torque(0.0, 0.0) == 0.0  # none of them switched it on
+        for joint in [0, 1, 2, 3] * 10:
+            sent = time.monotonic()
+            host.send(frame(joint + 1, command(joint)))
+            reply = next_reply(host)
+            assert (reply.arbitration_id, reply.data[0]) == (joint + 1, joint + 1)
+            assert time.monotonic() - sent >= 200e-6  # no real motor replies faster
+        host.send(frame(1, ENTER))
+        next_reply(host)
+        for _ in range(50):
+            host.send(frame(1, command(0, 1.0)))
+            assert unpack_reply(SPECS[0], next_reply(host).data).torque == pytest.approx(1.0, abs=0.01)
+        assert next_reply(host, timeout=0.05) is None
+    assert device.motors[0].torque(0.0, 0.0) == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_failing_bus_ends_the_run_with_a_bus_error(device):
+    bus = can.Bus(interface="virtual", channel=f"device-{next(PORTS)}")
+    bus.shutdown()
+    with pytest.raises(BusError, match="receiving"):
+        device.run(bus, lambda: False)
+
+
+class ScriptedBus:
+    """A bus on which each wait takes a time and ends with a frame, as `script` says: pairs of s and data, or None.
+
+    sent: the time in s, the ID and the first byte of each frame that the device has sent.
+    """
+
+    channel_info = "a test"
+
+    def __init__(self, script):
+        self.now, self.script, self.sent = 0.0, list(script), []
+
+    def recv(self, timeout):
+        wait, data = self.script.pop(0)
+        self.now += wait
+        return data if data is None or isinstance(data, can.Message) else frame(1, data, timestamp=self.now)
+
+    def send(self, message):
+        self.sent.append((self.now, message.arbitration_id, message.data[0]))
+
+    def run(self, device, monkeypatch, *aside):
+        clock = SimpleNamespace(monotonic=lambda: self.now, time=lambda: self.now)
+        monkeypatch.setattr(device_module, "time", clock)
+        device.run(self, lambda: not self.script, *aside)
+
+
+def test_other_work_waits_until_every_command_has_been_answered(device, monkeypatch):
+    at_once = [(0.0, frame(can_id, command(can_id - 1))) for can_id in (1, 2, 3, 4)]
+    bus, answered = ScriptedBus([*at_once, *[(0.002, None)] * 5]), []
+    bus.run(device, monkeypatch, lambda now: answered.append(len(bus.sent)))
+    assert answered and set(answered) == {4}
+
+
+@pytest.mark.parametrize(
+    ("waits", "simulated", "slip"),
+    [([0.002] * 50, 0.1, 0.0), ([0.002, 0.04, 0.002], 0.044, 0.0), ([0.002, 0.3, 0.002], 0.054, 0.25)],
+)
+def test_physics_catches_up_after_a_late_wake_up_and_more_than_50_ms_are_slip(
+    device, monkeypatch, waits, simulated, slip
+):
+    ScriptedBus((wait, None) for wait in waits).run(device, monkeypatch)
+    assert device.time == pytest.approx(simulated, abs=1e-9)
+    assert device.slip == pytest.approx(slip)
+
+
+REGULAR = [(0.002, command(0))] * 5
+
+
+@pytest.mark.parametrize(
+    ("script", "stall", "silence"),
+    [
+        ([(0.3, None), (0.6, ENTER), *REGULAR], 0.002, 0.002),
+        ([(0.0, ENTER), *REGULAR, (0.138, command(0)), *REGULAR], 0.138, 0.138),
+        ([(0.0, ENTER), *REGULAR, *[(0.002, None)] * 39, (0.002, EXIT), (0.5, None)], 0.002, 0.08),
+        ([(0.0, ENTER), *REGULAR, (0.3, EXIT), (0.4, ENTER), *REGULAR], 0.002, 0.002),
+    ],
+    ids=["regular", "stalled", "no commands", "switched on again"],
+)
+def test_stalls_and_silence_are_measured_while_the_motors_are_on(device, monkeypatch, script, stall, silence):
+    ScriptedBus(script).run(device, monkeypatch)
+    assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))
+
+
+def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up(monkeypatch):
+    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
+    bus = ScriptedBus([*[(0.001, None)] * 5000, (1.0, None), *[(0.001, None)] * 4000])
+    bus.run(device, monkeypatch)
+    times, ids, _ = zip(*bus.sent, strict=True)
+    assert set(ids) == {MIT_V3.reply_id(2) & ID_BITS}
+    assert len(times) == pytest.approx(900, abs=5)
+    assert np.diff(times).min() > 0.009 and np.diff(times).max() == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("is_fd", [False, True], ids=["classic", "fd"])
+def test_damiao_motors_tell_their_state_and_settings_on_the_buses_of_python_can(options, is_fd):
+    joints = [JointMotor(MOTORS["DM-J4310"], can_id, wire_format=DAMIAO_MIT, timeout=0.2) for can_id in (1, 2, 3, 4)]
+    device = SimulatedDevice(SimulatedArm(), [simulated(joint) for joint in joints])
+    device.is_fd = (is_fd,) * len(joints)
+    with running(device, options) as host:
+        bus = MotorBus([CanPort(host, COMPUTER_CLOCK, is_fd=is_fd)] * len(joints), joints)
+        bus.exchange(OFF, time.monotonic() + 0.01)
+        assert bus.boards.hindrance(time.monotonic(), 100.0) == "motor 1 to tell its CTRL_MODE"
+        end = time.monotonic() + 5.0
+        while bus.boards.hindrance(time.monotonic(), 100.0) and time.monotonic() < end:
+            bus.exchange(OFF, time.monotonic() + 0.01)
+        assert not bus.boards.hindrance(time.monotonic(), 100.0)
+    assert [sample.on for sample in bus.samples] == [False] * len(joints)
+    assert not device.powered and bus.foreign_commands == 0

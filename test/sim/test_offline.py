@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A trial without a bus and in simulated time: the arm is carried as on a real bus, and always let down at the end."""
+"""A trial without a bus, in simulated time: its script, its virtual wearer, and the arm, always let down at the end."""
 
 from __future__ import annotations
 
@@ -8,29 +8,39 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from exo_gravity.core import ArmModel
+from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedImu, SimulatedMotor
+from exo_gravity.sim import (
+    STEP,
+    ArmConfig,
+    SimulatedArm,
+    SimulatedDevice,
+    SimulatedMotor,
+    VirtualWearer,
+)
 from exo_gravity.sim.arm import DEFAULT_LINKS
-from exo_gravity.sim.imu import measured_tilt
-from exo_gravity.sim.script import TrialScript
+from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.sim.virtual_arm import resting
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
+
 POSE = [0.1, 0.6, 0.7, 0.5]
+
 SCRIPT = TrialScript.parse({"name": "one", "steps": [{"move": POSE, "over": 2.0}, {"hold": 3.0}]})
+
 MOTORS_AS_MOUNTED = (
     JointMotor(MOTORS["AK60-6"], 1),
     JointMotor(MOTORS["AK80-9"], 2, -1, 0.4),
     JointMotor(MOTORS["AK60-6"], 3, 1, -0.2),
     JointMotor(MOTORS["AK60-6"], 4, -1),
 )
+
 LIMITS = Limits(
     NAMES,
     (-1.65, -0.17, -0.78, -0.17),
@@ -39,8 +49,11 @@ LIMITS = Limits(
     (3.0, 9.0, 3.0, 3.0),
     sign_check_torque=0.0,
 )
+
 ONE_G = Settings("right", DEFAULT_LINKS)
+
 BENT = (0.1, -0.06)  # rad
+
 DELAY = 2.5  # s after the motors are switched on, in which they ramp in
 
 
@@ -146,7 +159,122 @@ def test_motors_that_never_reply_are_an_error():
         make(ids=(11, 12, 13, 14)).run()
 
 
-def test_the_tilt_of_the_trunk_follows_from_a_second_of_imu_samples():
-    mounted = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
-    tilt = measured_tilt(0.1, -0.06, SimulatedImu(ImuConfig(mounted)), mounted)
-    np.testing.assert_allclose(tilt, (0.1, -0.06), atol=0.01)
+def test_steps_of_the_trunk_have_an_angle_or_only_a_duration_and_one_of_the_hand_a_mass():
+    steps = [{"bow": 0.5, "over": 3}, {"lean": -0.3, "over": 2.0}, {"walk": 60.0}, {"sit": 2}, {"load": 2, "over": 1}]
+    assert list(TrialScript.parse({"name": "trunk", "steps": steps}).steps) == [
+        Step("bow", 3.0, (0.5,)),
+        Step("lean", 2.0, (-0.3,)),
+        Step("walk", 60.0),
+        Step("sit", 2.0),
+        Step("load", 1.0, (2.0,)),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("content", "name"),
+    [
+        (None, "script"),
+        ({"name": "x", "steps": [], "extra": 1}, "script"),
+        *(({"name": name, "steps": [{"hold": 1}]}, "name") for name in ("/tmp/x", "../x", "", None, "a\nb", "x" * 101)),
+        ({"name": "x", "steps": []}, "steps"),
+        ({"name": "x", "steps": [{"hold": 1, "over": 1}]}, "steps[0]"),
+        ({"name": "x", "steps": [{"hold": "long"}]}, "steps[0].hold"),
+        ({"name": "x", "steps": [{"move": [0, 0, 0, 0], "over": 1}, {"move": [0, 0, 0], "over": 1}]}, "steps[1].move"),
+        ({"name": "x", "steps": [{"move": [0, 0, 0, 90], "over": 1}]}, "steps[0].move"),
+        ({"name": "x", "steps": [{"push": [0, 0, 0, 1], "over": -1}]}, "steps[0].over"),
+        ({"name": "x", "steps": [{"bow": 45, "over": 3}]}, "steps[0].bow"),
+        ({"name": "x", "steps": [{"bow": 0.5}]}, "steps[0]"),
+        ({"name": "x", "steps": [{"walk": 0.5}]}, "steps[0].walk"),
+        ({"name": "x", "steps": [{"load": 200, "over": 1}]}, "steps[0].load"),
+    ],
+)
+def test_an_invalid_entry_is_named(content, name):
+    with pytest.raises(ParameterError) as caught:
+        TrialScript.parse(content)
+    assert caught.value.name == name
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (b"name: x\nsteps:\n  - {hold: 1.0}\nsteps:\n  - {hold: 2.0}\n", "steps is given twice"),
+        (b"name: x\nsteps: [{hold: 1.0, hold: 30.0}]\n", "hold is given twice"),
+        (b"\xff\xfe", "decode"),
+        (b"[" * 5000, "depth"),
+        (None, "No such file"),
+    ],
+)
+def test_a_file_that_says_something_twice_or_cannot_be_read_is_refused(text, why, tmp_path):
+    path = tmp_path / "trial.yaml"
+    if text is not None:
+        path.write_bytes(text)
+    with pytest.raises(ParameterError, match=why) as caught:
+        TrialScript.read(path)
+    assert caught.value.name == "trial" and str(path) in str(caught.value)
+
+
+THERE = (-0.6, 0.9, 0.8, 0.7)
+
+PUSH = (0.5, 2.0, 1.5, 1.0)
+
+NO_TORQUE = (0.0,) * 4
+
+PUSHED = TrialScript.parse(
+    {
+        "name": "test",
+        "steps": [{"move": THERE, "over": 2.0}, {"hold": 1.0}, {"push": PUSH, "over": 0.4}, {"hold": 1.0}],
+    }
+)
+
+
+def simulate(arm, wearer, begin, end, supported=0.0):
+    """Run the script from `begin` to `end` s and return the wearer's torques (n, 4).
+
+    supported: share of gravity that is compensated.
+    """
+    torques = []
+    for step in range(round(begin / STEP), round(end / STEP)):
+        theta = arm.positions
+        torque = wearer.torque(step * STEP, theta, arm.velocities)
+        arm.step(np.add(torque, supported * gravity_torque(arm.config.links, theta)))
+        torques.append(torque)
+    return np.array(torques)
+
+
+@pytest.mark.parametrize(("supported", "wearer_mass"), [(0.0, (0.0, 0.0, 1.5, 1.2)), (1.0, (0.0,) * 4)])
+def test_the_hand_moves_any_arm_to_the_pose_and_to_rest_and_releases_it_at_once(supported, wearer_mass):
+    arm, wearer = SimulatedArm(ArmConfig(wearer_mass=wearer_mass, wearer_cog=(0, 0, 0.16, 0.18))), VirtualWearer(PUSHED)
+    simulate(arm, wearer, 0.0, 2.0, supported)
+    assert np.degrees(np.abs(np.subtract(arm.positions, THERE)).max()) < 1.0
+    assert np.abs(arm.velocities).max() < 0.1
+    assert not simulate(arm, wearer, 2.0, 3.0, supported).any()  # released at once; a supported arm stays
+    assert not supported or np.degrees(np.abs(np.subtract(arm.positions, THERE)).max()) < 1.0
+
+
+def test_the_hand_moves_the_arm_along_a_minimum_jerk_path():
+    arm, wearer = SimulatedArm(), VirtualWearer(PUSHED)
+    simulate(arm, wearer, 0.0, 0.75, supported=1.0)
+    # Halfway through a motion of 1.5 s: half the distance, at 15/8 of the mean speed.
+    np.testing.assert_allclose(arm.positions, np.divide(THERE, 2), atol=np.radians(3))
+    np.testing.assert_allclose(arm.velocities, np.multiply(THERE, 15 / 8 / 1.5), rtol=0.2)
+
+
+def test_the_hand_is_limited_to_its_strength():
+    arm, wearer = SimulatedArm(), VirtualWearer(PUSHED, strength=1.0)
+    torques = simulate(arm, wearer, 0.0, 2.0)
+    assert np.abs(torques).max() == 1.0
+    assert np.degrees(np.abs(np.subtract(arm.positions, THERE)).max()) > 5
+
+
+def test_a_push_is_a_half_sine_with_the_torques_of_the_script():
+    wearer = VirtualWearer(PUSHED)
+    for share, elapsed in ((0.0, 3.0), (np.sqrt(0.5), 3.1), (1.0, 3.2), (np.sqrt(0.5), 3.3)):
+        np.testing.assert_allclose(wearer.torque(elapsed, THERE, NO_TORQUE), np.multiply(PUSH, share), atol=1e-9)
+
+
+def test_the_wearer_reports_the_active_step_starts_where_the_arm_is_and_gives_no_torque_before_and_after():
+    wearer, seen = VirtualWearer(PUSHED), []
+    for elapsed in (-1.0, 0.0, 2.0, 3.0, 3.5, PUSHED.duration + 0.1, 1e6):
+        assert wearer.torque(elapsed, (0.2, 0.3, 0.4, 0.5), NO_TORQUE) == NO_TORQUE
+        seen.append(wearer.step)
+    assert seen == [None, 0, 1, 2, 3, 4, 4]
