@@ -24,6 +24,7 @@ from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
 from ..support.simulated_device import SPECS
+from ..support.thorough import quick
 
 RATE = 125.0  # Hz
 WEIGHT = Weight(0.6, 0.2)  # on a forearm that the device carries from the beginning
@@ -110,6 +111,10 @@ def of_urdf(name: str, weight: Weight, scale: float = 1.0) -> list[BenchStep]:
     return played(device, arm.motors, arm.limits, model_of(arm), weight, Person(), arm.can_bridge["rate"])
 
 
+def with_timeout(timeout: float) -> tuple[JointMotor, ...]:
+    return (*MOTORS[:3], replace(MOTORS[3], timeout=timeout))
+
+
 def failed(results: list[BenchStep]) -> str:
     """The name of the only step that did not pass, which is the last one, '' for none."""
     assert [result.name for result in results] == NAMES[: len(results)]
@@ -141,30 +146,21 @@ def test_a_weight_that_the_last_joint_hardly_feels_is_refused():
     assert failed(results) == "torque" and "must be at least 0.3: take a heavier one" in results[-1].sentence
 
 
-def test_a_motor_without_the_offset_of_its_temperature_fails_when_cold():
-    assert failed(acceptance(temperature=-15.0)) == "cold"
+WRONG_RANGE = (*MOTORS[:3], replace(MOTORS[3], spec=replace(MOTORS[3].spec, torque_range=9.0)))
+SPOILT = {  # what is the case, the step that fails, and what is said
+    "a cold motor without the offset of its temperature": ({"temperature": -15.0}, "cold", ""),
+    "a supply that was not switched": ({"forgets_the_supply": True}, "zero", ""),
+    "another torque range": ({"true": WRONG_RANGE}, "torque", "ratio"),
+    "no time-out": ({"assumed": with_timeout(0.2)}, "time_out", "the motor held; it must let go"),
+    "a time-out": ({"assumed": with_timeout(0.0), "timeout": 0.2}, "time_out", "the motor let go; it must hold"),
+}
 
 
-def test_a_supply_that_was_not_switched_proves_no_zero():
-    assert failed(acceptance(forgets_the_supply=True)) == "zero"
-
-
-@pytest.mark.thorough
-def test_a_torque_range_that_is_not_the_firmwares_fails_at_the_known_weight():
-    wrong = (*MOTORS[:3], replace(MOTORS[3], spec=replace(MOTORS[3].spec, torque_range=9.0)))
-    results = acceptance(true=wrong)
-    assert failed(results) == "torque"
-    assert "ratio" in results[-1].sentence
-
-
-WRONG_TIMES = [(0.0, 0.2, "the motor held; it must let go"), (0.2, 0.0, "the motor let go; it must hold")]
-
-
-@pytest.mark.parametrize(("true", "assumed", "sentence"), WRONG_TIMES)
-@pytest.mark.thorough
-def test_a_time_out_that_is_not_that_of_the_file_fails(true, assumed, sentence):
-    results = acceptance(assumed=(*MOTORS[:3], replace(MOTORS[3], timeout=assumed)), timeout=true)
-    assert failed(results) == "time_out" and sentence in results[-1].sentence
+@pytest.mark.parametrize("case", quick(list(SPOILT)[:2], SPOILT))
+def test_what_is_not_as_the_file_says_fails_at_its_step(case):
+    spoil, step, said = SPOILT[case]
+    results = acceptance(**spoil)
+    assert failed(results) == step and said in results[-1].sentence
 
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():

@@ -67,14 +67,11 @@ def test_the_support_rises_while_the_arm_sinks_and_is_asked_for_in_steps_that_le
     assert arm.move(-0.05, 20.0) == 1.0
 
 
-def test_a_raised_support_is_forgotten_while_the_arm_is_held() -> None:
+def test_a_raised_support_is_forgotten_while_held_and_lifting_takes_it_back_half_as_fast_never_below_the_set() -> None:
     arm = raised()
     before = arm.move(0.0, 10.0)
     assert arm.move(0.0, MEMORY) - 0.4 == pytest.approx((before - 0.4) / math.e, abs=0.02)
     assert arm.adaptation.requested == pytest.approx(arm.adaptation.support, abs=0.02)
-
-
-def test_lifting_takes_back_half_as_fast_and_never_below_the_set_support() -> None:
     arm = raised()
     before = arm.adaptation.support
     assert arm.move(0.05, 5.0) == pytest.approx(before - 0.5 * 4.0 * RISE, abs=0.05)

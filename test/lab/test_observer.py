@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The wearer's torque: momentum and C^T v against Pinocchio, the estimate against MuJoCo and known torques."""
+"""The wearer's torque: the estimate against MuJoCo and known torques, its share of the weight, and contacts."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.arm_data import ModelError
-from exo_gravity.core.arm.kinematics import links_of, turning_in_base
+from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.numbers import COVER
-from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.lab.observer.contact import ContactWatch
 from exo_gravity.lab.observer.momentum import OBSERVER, MomentumObserver, WearerEstimate
 from exo_gravity.lab.observer.share import (
     PERIOD,
@@ -32,33 +32,29 @@ from exo_gravity.lab.observer.watch import WearerWatch
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, felt_in_base
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.sim.urdf import UrdfConfig
-
-from ..core.test_kinematics import NO_ROTORS
-from ..support.chains import random_chain
 
 LOAD = Wearer(75.0).on_links(DEFAULT_LINKS.length)
+
 STILL = (0.0,) * 4
+
 EXACT = ModelError(STILL, STILL, 0.0, 0.0)
+
 COULOMB, VISCOUS = (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 0.02)
+
 SETTINGS = Settings(
     "right", DEFAULT_LINKS, wearer_mass=tuple(LOAD.mass), wearer_cog=tuple(LOAD.cog), model_error=EXACT,
     terms=TermSettings(friction=Friction(0.0, COULOMB, VISCOUS)),
 )  # fmt: skip
+
 WHOLE = DEFAULT_LINKS.with_wearer(LOAD.mass, LOAD.cog)
+
 TILT = Tilt.of("right", 0.1, -0.05)
+
 POSE = (0.2, 0.8, 0.5, 0.7)
+
 SOFT = 100.0  # Nm/rad, of elastic joints
+
 CODE = 0.024  # rad/s of a motor's 12 bits
-
-
-def test_a_base_that_turns_adds_the_momentum_of_an_arm_that_turns_with_it():
-    # About joint 1's own axis the base's turning is that of joint 1, for momentum and kinetic energy alike.
-    links, rng = links_of(DEFAULT_LINKS)._replace(rotors=NO_ROTORS), np.random.default_rng(2)
-    for theta, velocity in rng.uniform(-2.0, 2.0, (20, 2, 4)):
-        turned = links.momentum(theta, velocity, (0.0, 0.0, 0.7))
-        same = links.momentum(theta, velocity + np.array((0.7, 0.0, 0.0, 0.0)))
-        assert turned == (pytest.approx(same[0]), pytest.approx(same[1]))
 
 
 def still(effort, tilt=TILT, settings=SETTINGS, pose=POSE):
@@ -228,17 +224,16 @@ def curve(share, count=500, deviation=0.1):
     return WearerCurve(time, np.reshape(share, (-1, 1)) * weight, band, weight, band)
 
 
-def test_the_share_is_that_of_the_weight_that_the_wearer_gives_and_a_sliding_one_forgets():
+def test_the_share_is_that_of_the_weight_that_the_wearer_gives_and_a_longer_time_does_not_narrow_its_band():
     assert share_of(curve(0.35)).value == pytest.approx(0.35)
-    sliding = share_of(curve(np.repeat((0.2, 0.8), 250)), 1.0).value
+    sliding = share_of(curve(np.repeat((0.2, 0.8), 250)), 1.0).value  # which forgets
     assert sliding[249] == pytest.approx(0.2) and 0.2 < sliding[300] < 0.8
     assert sliding[-1] == pytest.approx(0.8)
-
-
-def test_a_longer_time_does_not_narrow_the_band_of_the_share():
     short, long = (share_of(curve(0.5, count)).deviation for count in (100, 2000))
     assert long == pytest.approx(short, rel=0.3)
     assert share_of(curve(0.5, deviation=0.2)).deviation == pytest.approx(2.0 * share_of(curve(0.5)).deviation)
+    for hanging in (curve(0.5)._replace(weight=np.full((500, 4), 0.1)), while_between(curve(0.5), ())):
+        assert np.isnan(share_of(hanging).value)
 
 
 def test_the_whole_share_hides_a_joint_that_carries_little_and_its_own_share_shows_it():
@@ -277,11 +272,6 @@ def test_the_share_of_a_wearer_who_walks_is_not_biased_by_what_shakes_their_arm(
     walked = WearerCurve(PERIOD * np.arange(500.0), *columns)
     assert share_of(walked).value == pytest.approx(0.6, abs=0.01)
     assert walked.weight == pytest.approx(np.tile(own.torque(POSE, TILT), (500, 1)))
-
-
-def test_a_hanging_arm_has_no_share():
-    for hanging in (curve(0.5)._replace(weight=np.full((500, 4), 0.1)), while_between(curve(0.5), ())):
-        assert np.isnan(share_of(hanging).value)
 
 
 def test_a_recording_is_sampled_100_times_a_second_and_samples_without_effort_are_left_out():
@@ -329,37 +319,6 @@ def test_a_watch_follows_the_load_and_the_stiffness_of_elastic_joints_in_the_set
     assert estimate.torque == pytest.approx(behind - held, abs=1e-9)
 
 
-def test_the_wearers_torque_on_an_arm_of_three_joints_from_a_urdf():
-    count, rotor = 3, 0.01
-    text, names = random_chain(count, seed=5)
-    arm = UrdfArm(text, names, "hand", (rotor,) * count)
-    worn = {"wearer_mass": (0.0, 0.8, 0.6), "wearer_cog": (0.0, 0.5 * arm.length[1], 0.6 * arm.length[2])}
-    settings = Settings(
-        "left", arm, "urdf", mode="zero_g", support=1.0, max_effort=(100.0,) * count, use_imu=False, **worn
-    )
-    friction = dict.fromkeys(("coulomb_friction", "viscous_friction"), (0.0,) * count)
-    device = SimulatedArm(
-        UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(rotor,) * count, **worn, **friction)
-    )
-    start = np.array((0.3, -0.4, 0.5))
-    device.reset(start)
-    observer, tilt, given = MomentumObserver(settings), Tilt.of("left"), np.array((0.6, -0.4, 0.3))
-    errors, speeds = [], []
-    for n in range(3000):
-        now, theta = n * 0.001, device.positions
-        swing = 2.0 * np.cos(3.0 * now + np.arange(count)) - 5.0 * (theta - start)  # Nm, which moves the arm to and fro
-        motors = np.array(settings.torque(theta, tilt)[0]) + swing - 0.4 * np.array(device.velocities)
-        device.step(motors + given)
-        if n % 10 == 0:
-            estimate = observer.update(now, (theta, device.velocities, motors.tolist()), tilt)
-            errors.append(np.subtract(estimate.torque, given))
-            speeds.append(np.abs(device.velocities).max())
-            carried = np.subtract(settings.torque(theta, tilt)[0], arm.torque(theta, tilt))
-            assert estimate.weight == pytest.approx(carried, abs=1e-9)
-    assert max(speeds[100:]) > 1.0
-    assert np.abs(errors[100:]).max() < 0.05
-
-
 def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
     speed, load = (0.3, -0.3, 0.3, 0.3), (0.08,) * 4
     needed = gravity_torque(WHOLE, POSE, TILT.direction)
@@ -377,3 +336,37 @@ def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
         estimates.append(np.abs(estimate.torque).max())
     blind, aware = estimates
     assert blind > 0.5 and aware < 0.1
+
+
+REST, BLOW = [0.0] * 50, [4.0] * 10  # Nm, 100 times a second
+
+GROWING = [4.0 * math.sin(0.5 * math.pi * min(1.0, n / 150)) for n in range(300)]
+
+
+def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> ContactWatch:
+    """Return the watch after these torques of the elbow in Nm. gap: s before the last one."""
+    watch = ContactWatch()
+    for number, torque in enumerate(torques, 1):
+        now = PERIOD * number + gap * (number == len(torques))
+        band = (deviation,) * 4
+        watch.update(now, WearerEstimate((0.0, 0.0, 0.0, torque), band, (0.0,) * 4, band))
+    return watch
+
+
+def test_a_blow_is_a_contact_once_with_its_time_joint_and_sign() -> None:
+    watch = touched([*REST, *[-4.0] * 100])
+    assert watch.count == 1 and watch.last == (pytest.approx(0.5, abs=0.02), 3, pytest.approx(-3.6, abs=0.4))
+
+
+@pytest.mark.parametrize(
+    ("torques", "deviation", "gap", "count"),
+    [
+        ([*REST, *BLOW, *[0.0] * 250, *REST, *BLOW], 0.2, 0.0, 2),
+        (GROWING, 0.2, 0.0, 0),
+        ([*REST, *BLOW], 3.0, 0.0, 0),
+        ([*REST, 9.0], 0.1, 10.0, 0),
+    ],
+    ids=["two blows more than a second apart", "as a person's", "within the band", "after a gap"],
+)
+def test_only_a_blow_is_a_contact(torques: list[float], deviation: float, gap: float, count: int) -> None:
+    assert touched(torques, deviation, gap).count == count

@@ -69,10 +69,7 @@ def test_the_range_of_each_joint_is_an_arc_on_which_the_link_points_at_its_angle
         link = origins[n + 1] - origins[n]
         start, tip = needle.points
         assert (tip - start) / SIZES.range_radius == pytest.approx(link / np.linalg.norm(link), abs=1e-12)
-
-
-def test_a_joint_near_its_limit_is_red():
-    shapes = lines(arm_shapes(view((0.0, 3.10, 0.0, 0.0))), "limits")
+    shapes = lines(arm_shapes(view((0.0, 3.10, 0.0, 0.0))), "limits")  # joint 2 is near its limit
     assert [shape.colour for shape in shapes] == [GREY, GREY, RED, RED, GREY, GREY, GREY, GREY]
 
 

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Holds, drift, pushes, let-downs and the verdict, from synthetic recordings with known motion."""
+"""Holds, drift, pushes, let-downs, smoothness and the verdict, from synthetic recordings with known motion."""
 
 from __future__ import annotations
 
@@ -8,19 +8,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.report.smoothness import LEAST, spectral_arc_length
 from exo_gravity.lab.trial.analysis import HoldCriteria, analyse, failures
 from exo_gravity.lab.trial.recording import ARRAYS, ScriptedStep
 
 from ..support.synthetic_bags import POSITION_CODE, RATE, VELOCITY_CODE, measured, smooth, still
 
 DEG_PER_MIN = math.radians(1.0) / 60.0
+
 POSE_A, POSE_B = np.array([0.1, 0.4, 0.5, 0.6]), np.array([-0.3, 0.9, 1.2, 0.2])
+
 HANGING = np.array([0.0, 0.05, 0.0, 0.1])
+
 PEAK_SPEED = 1.875 * np.abs(POSE_A - HANGING) / 4.0  # of a minimum-jerk motion in 4 s
+
 SCRIPT = (ScriptedStep("move", 0.0, 2.0), ScriptedStep("hold", 2.0, 12.0))
+
 STOPPED_IN_A_HOLD = (ScriptedStep("move", 5.0, 7.0), ScriptedStep("hold", 7.0, 60.0))
+
 ARRIVAL = smooth(POSE_B, POSE_A, 2.0)
 
 
@@ -219,3 +227,21 @@ def test_joints_are_put_in_the_order_asked_for_and_others_are_refused_by_name():
         np.testing.assert_array_equal(getattr(turned, field), getattr(whole, field)[:, ::-1])
     with pytest.raises(DataError, match="must be a, b, c, d"):
         whole.in_order(("a", "b", "c", "d"))
+
+
+BELL = np.exp(-5.0 * np.arange(-1.0, 1.0, 1.0 / 100.0) ** 2)
+
+
+def test_the_smoothness_of_a_bell_is_the_arc_length_of_its_spectrum_and_what_the_authors_code_prints():
+    """The amplitude of exp(-5 t^2) is a Gaussian of the frequency: LEAST**(u^2), u = 1 where it has fallen to LEAST.
+
+    The authors' is github.com/siva82kb/SPARC, smoothness.py at 3650934, the example of `sparc`: a bell that is cut off.
+    """
+    slope = 2.0 * math.log(LEAST)
+    length, _ = quad(lambda u: math.hypot(1.0, slope * u * LEAST ** (u * u)), 0.0, 1.0)
+    whole = np.exp(-5.0 * np.arange(-20.0, 20.0, 1.0 / 100.0) ** 2)
+    assert spectral_arc_length(whole, 100.0) == pytest.approx(-length, abs=5e-4)
+    assert spectral_arc_length(BELL, 100.0) == pytest.approx(-1.41403, abs=1e-5)
+    assert spectral_arc_length(3.0 * BELL, 100.0) == pytest.approx(spectral_arc_length(BELL, 100.0))
+    assert spectral_arc_length(np.concatenate((BELL, BELL)), 100.0) < spectral_arc_length(BELL, 100.0) - 0.1
+    assert math.isnan(spectral_arc_length(np.zeros(100), 100.0))

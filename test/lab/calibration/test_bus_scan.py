@@ -13,7 +13,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.damiao import DAMIAO_MIT, LAST_ID, REFRESH, REGISTERS
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import DAMPED, ENTER, SET_ZERO, unpack_command
+from exo_gravity.core.motors.frames import DAMPED, ENTER, SET_ZERO, WireFormat, unpack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.hardware.ownership.bus_lock import BusLock
@@ -100,13 +100,20 @@ def test_the_motors_of_all_families_are_found_and_none_is_commanded(wire: Wire, 
     assert not device.powered
 
 
-def test_no_motor_is_switched_on_and_one_without_power_is_missing(wire: Wire) -> None:
-    device = make_device()
-    device.motors[2].unplugged = True
+@pytest.mark.parametrize(
+    ("wire_format", "heard"),
+    [(MIT, [1, 2, 4]), (MIT_V3, [1, 2, 3, 4])],
+    ids=["MIT", "V3, heard"],
+)
+def test_no_motor_is_switched_on_and_one_without_power_is_missing(
+    wire: Wire, wire_format: WireFormat, heard: list[int]
+) -> None:
+    device = make_device(Firmware(status_rate=100.0), formats=(wire_format,) * 4)
     wire.play(device)
     with scan_of(wire) as bus:
-        assert [answer.can_id for answer in bus.scan(range(1, 6))[0]] == [1, 2, 4]
-        assert set(bus.poll((1, 3))) == {1}
+        device.motors[2].unplugged = True
+        assert [answer.can_id for answer in bus.scan(range(1, 6))[0]] == heard
+        assert sorted(bus.poll((1, 2, 3, 4))) == [1, 2, 4]
     assert not device.powered
 
 
@@ -124,17 +131,40 @@ def test_two_motors_with_one_id_are_reported(wire: Wire) -> None:
 
 
 @pytest.mark.parametrize(
-    ("reply", "problem"),
+    ("reply", "period", "problem"),
     [
-        (frame(3, bytes((3, 1, 2, 3, 4))), "a frame with ID 3 [03 01 02 03 04]"),
-        (frame(3, bytes((9, 0x80, 0, 0x80, 8, 0))), "a frame with ID 3 [09 80 00 80 08 00]"),
-        (frame(77, bytes((3, 0x80, 0, 0x80, 8, 0))), "a frame with ID 77 [03 80 00 80 08 00]"),
+        *(
+            (
+                frame(can_id, bytes(data)),
+                0.0,
+                f"ID 3: a frame with ID {can_id} [{bytes(data).hex(' ')}] follows a command",
+            )
+            for can_id, data in (
+                (3, (3, 1, 2, 3, 4)),
+                (3, (9, 0x80, 0, 0x80, 8, 0)),
+                (77, (3, 0x80, 0, 0x80, 8, 0)),
+            )
+        ),
+        # As a V1 or V2 board is delivered.
+        (
+            frame(0x2903, bytes(8), is_extended_id=True),
+            0.02,
+            "ID 3: about 50 status frames a second: a V1 or V2 board in servo mode",
+        ),
+        (frame(0x29C8, bytes(8), is_extended_id=True), 0.01, "ID 200: a V3 board; its ID must be from 1 to 126"),
     ],
 )
-def test_a_reply_that_fits_no_motor_is_reported(wire: Wire, reply: can.Message, problem: str) -> None:
-    Responder(wire, lambda message: [reply] if message.arbitration_id == 3 else [])
+def test_a_reply_that_fits_no_motor_and_a_board_that_cannot_be_used_are_reported(
+    wire: Wire, reply: can.Message, period: float, problem: str
+) -> None:
+    if period:
+        wire.repeat(reply, period)
+    else:
+        Responder(wire, lambda message: [reply] if message.arbitration_id == 3 else [])
     with scan_of(wire) as bus:
-        assert bus.scan(range(1, 6)) == ((), (f"ID 3: {problem} follows a command, and is no motor's reply",))
+        answers, (said,) = bus.scan(range(1, 6))
+    assert (answers == () or period) and said.startswith(problem)
+    assert said.endswith((", and is no motor's reply", "or a V3 board, to be set to 500 a second", "from 1 to 126"))
 
 
 def test_a_late_reply_is_not_taken_for_a_second_motor(wire: Wire) -> None:
@@ -154,16 +184,13 @@ def test_a_late_reply_is_not_taken_for_a_second_motor(wire: Wire) -> None:
     assert problems == ()
 
 
-def test_a_bus_that_a_bridge_holds_is_refused_with_its_holder_and_free_after_the_scan(wire: Wire) -> None:
+def test_a_bus_that_a_bridge_holds_or_has_left_with_motors_on_is_refused_and_free_after_a_scan(wire: Wire) -> None:
     lock = BusLock(ADDRESS, "/right/can_bridge (PID 4711)")
     with pytest.raises(BusError, match=r"is held by /right/can_bridge \(PID 4711\)"):
         scan_of(wire)
     lock.release()
     for _ in range(2):
         scan_of(wire).close()
-
-
-def test_a_bus_whose_motors_a_dead_bridge_may_have_left_on_is_refused_and_released(wire: Wire) -> None:
     lock = BusLock(ADDRESS, "a bridge")
     lock.notes.note(lock.notes.drive._replace(powered=True))
     lock.release()
@@ -199,25 +226,3 @@ def test_motors_of_both_formats_are_found_on_one_bus_and_the_v3_boards_are_sent_
     sent = {message.arbitration_id for message in listener.received if bytes(message.data) == DAMPED}
     assert sent == {1, 3, 5, 6}
     assert not device.powered
-
-
-def test_a_v3_board_that_falls_silent_is_missing(wire: Wire) -> None:
-    device = make_device(Firmware(status_rate=100.0), formats=(MIT_V3,) * 4)
-    wire.play(device)
-    with scan_of(wire) as bus:
-        device.motors[2].unplugged = True
-        assert sorted(bus.poll((1, 2, 3, 4))) == [1, 2, 4]
-
-
-def test_a_board_in_servo_mode_is_not_taken_for_a_v3_board(wire: Wire) -> None:
-    wire.repeat(frame(0x2903, bytes(8), is_extended_id=True), 0.02)  # as a V1 or V2 board is delivered
-    with scan_of(wire) as bus:
-        (problem,) = bus.scan(range(1, 5))[1]
-    assert problem.startswith("ID 3: about 50 status frames a second: a V1 or V2 board in servo mode")
-    assert problem.endswith("or a V3 board, to be set to 500 a second")
-
-
-def test_a_v3_board_with_an_id_that_no_parameter_can_have_is_reported(wire: Wire) -> None:
-    wire.repeat(frame(0x29C8, bytes(8), is_extended_id=True), 0.01)
-    with scan_of(wire) as bus:
-        assert bus.scan(range(1, 4))[1] == ("ID 200: a V3 board; its ID must be from 1 to 126",)

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Identification from held poses: right on random devices, with stated errors, and with what it cannot show."""
+"""Identification from held poses: right on random devices, with stated errors, and what it refuses."""
 
 from __future__ import annotations
 
@@ -8,30 +8,33 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from exo_gravity.core import ArmModel, Tilt
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.core.compensation.tracking import Observation
+from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration import pose_fit
-from exo_gravity.lab.calibration.identification import identify
-from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments, along_axes
-from exo_gravity.lab.calibration.pose_fit import FIT, Places
+from exo_gravity.lab.calibration.identification import check_physical, identify
+from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, with_mounting
+from exo_gravity.lab.calibration.moment_model import PapersMoments, along_axes
+from exo_gravity.lab.calibration.pose_fit import FIT, Places, layout_of
+from exo_gravity.lab.calibration.poses import missing_pose
+from exo_gravity.lab.calibration.tours import moments_from
+from exo_gravity.lab.inputs.arms import configured_arm
+from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model
-from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
-from exo_gravity.sim.arm import DEFAULT_LINKS, ArmConfig, SimulatedArm
+from exo_gravity.lab.moments import MOMENTS, regressor
+from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ...support.calibration_device import (
     CANDIDATES,
     CODE,
     LEANING,
-    LENGTH,
     PAPERS,
     UPRIGHT,
     WEIGHT,
     Device,
     best,
-    off_axis_of,
 )
 
 
@@ -50,8 +53,12 @@ def share_covered(found_of_devices):
     return np.mean(np.abs(size) < 2.0)
 
 
-def test_moments_of_random_devices_are_right_to_2_percent_or_their_errors_which_cover_95_percent(devices):
+def test_moments_of_random_devices_and_torques_in_new_poses_are_right_to_2_percent_and_errors_cover_95_percent(devices):
+    theta = np.random.default_rng(7).uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
     for device, found in devices:
+        true = device.effort(theta, LEANING)
+        off = regressor(theta, LEANING) @ found.moments / found.scale + found.offset - true
+        assert np.all(np.sqrt(np.mean(off**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
         wrong = np.abs(found.moments - device.moments)
         assert np.all((wrong < 2.0 * found.error) | (wrong < 0.02 * device.moments.max()))
         np.testing.assert_allclose(found.friction, device.friction / device.scale, atol=0.015)
@@ -72,14 +79,6 @@ def test_two_standard_errors_cover_an_error_that_all_sweeps_of_a_joint_and_a_tou
         ]
         found.append((device, identify(observations, PAPERS)))
     assert 0.90 <= share_covered(found) <= 0.99
-
-
-def test_the_torque_in_other_poses_is_right_to_2_percent_of_the_peak(devices):
-    theta = np.random.default_rng(7).uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
-    for device, found in devices:
-        true = device.effort(theta, LEANING)
-        wrong = regressor(theta, LEANING) @ found.moments / found.scale + found.offset - true
-        assert np.all(np.sqrt(np.mean(wrong**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
 
 
 def test_the_prediction_of_a_pose_is_that_of_a_fit_without_it_and_nearly_as_good_as_its_measurement(devices):
@@ -189,26 +188,48 @@ def off_device(seed, model, leans, askew, zero):
 TWO_LEANS = LEANING, Tilt.of("right", -0.1, 0.25).direction
 
 
-def test_zeros_and_axes_that_are_off_leave_little_of_the_torque():
-    for seed in (0, 1):
-        wrong, found, peak = off_device(seed, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), TWO_LEANS, 1.5, 1.5)
-        assert wrong.max() < 0.02 * peak  # 0.8 and 1.5 %; with zeros and axes held 1.1 and 2.9 %
-        assert np.max(found.torque_error) < 0.03 * peak / COVER
+@pytest.mark.parametrize(
+    ("seeds", "with_imu", "zero", "covered", "error"),
+    [
+        (2, True, 1.5, 0.0, 0.03),
+        pytest.param(6, True, 0.0, 0.9, 0.0, marks=pytest.mark.thorough),
+        pytest.param(6, False, 0.0, 0.9, 0.0, marks=pytest.mark.thorough),
+    ],
+)
+def test_the_band_contains_what_zeros_and_axes_leave_that_are_off_which_is_little(
+    seeds, with_imu, zero, covered, error
+):
+    model, leans = PapersMoments(DEFAULT_LINKS, keeps_tilt=with_imu), TWO_LEANS if with_imu else (UPRIGHT,)
+    inside = []
+    for seed in range(seeds):
+        wrong, found, peak = off_device(seed, model, leans, 1.5, zero)
+        inside.append(wrong < COVER * found.torque_error)
+        if error:
+            assert wrong.max() < 0.02 * peak  # 0.8 and 1.5 %; with zeros and axes held 1.1 and 2.9 %
+        assert np.max(found.torque_error) < (error * peak / COVER if error else 0.1)
+    assert np.mean(inside, axis=(0, 1)).min() >= covered
+
+
+def test_the_papers_derivatives_by_turns_are_pinocchios():
+    pin, model = pinocchio_model(DEFAULT_LINKS)
+    data, theta, step = model.createData(), np.array((0.4, 0.9, -0.3, 0.8)), 1e-5
+    down = np.array((0.2, -0.3, 0.93))
+    model.gravity.linear[:] = 9.80665 * down
+    moments = PapersMoments(DEFAULT_LINKS, keeps_tilt=True)
+    shown = np.einsum("nkat,a,k->tn", moments.turned(theta[None])[0], down, moments.moments)
+    for number, derivative in enumerate(shown):
+        joint, way = 1 + number // 3, np.eye(3)[(2, 0, 1)[number % 3]]
+        place, ends = model.jointPlacements[joint].copy(), []
+        for sign in (1.0, -1.0):
+            model.jointPlacements[joint] = place * pin.SE3(pin.exp3(sign * step * way), np.zeros(3))
+            ends.append(pin.computeGeneralizedGravity(model, data, theta).copy())
+        model.jointPlacements[joint] = place
+        np.testing.assert_allclose(derivative, (ends[0] - ends[1]) / (2.0 * step), atol=1e-6)
 
 
 def test_zeros_of_a_jig_are_kept():
     found = identify(Device(5).tour(), PAPERS, Places(zero=0.0))
     assert np.abs(found.turn[:, 0]).max() < 1e-4 < np.abs(identify(Device(5).tour(), PAPERS).turn[1, 0])
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(("with_imu", "askew"), [(True, 1.5), (False, 1.5)])  # degrees
-def test_the_band_contains_what_axes_leave_that_are_askew(with_imu, askew):
-    model = PapersMoments(DEFAULT_LINKS, keeps_tilt=with_imu)
-    devices = [off_device(seed, model, TWO_LEANS if with_imu else (UPRIGHT,), askew, 0.0) for seed in range(6)]
-    covered = np.mean([wrong < COVER * found.torque_error for wrong, found, _ in devices], axis=(0, 1))
-    assert covered.min() > 0.9  # of six devices
-    assert np.max([found.torque_error for _, found, _ in devices]) < 0.1  # Nm
 
 
 def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
@@ -223,42 +244,187 @@ def test_the_next_pose_shows_more_than_a_repeated_or_a_random_one():
     assert chosen < min(drawn)
 
 
-def held(arm, theta, moments, weight=(0.0, 0.0)):
-    """Move the simulated arm slowly through the pose in both directions; return what holds it, as commanded."""
-    passes = []
-    arm.move_base(np.multiply(STANDARD_GRAVITY, LEANING))
-    for way in (1.0, -1.0):
-        arm.reset(theta - way * 0.1)
-        guess, summed, efforts = regressor([theta], LEANING)[0] @ moments, np.zeros(4), []
-        for step in range(1300):
-            target = theta + way * (0.1e-3 * step - 0.1)  # rad; 0.1 rad/s
-            error = target - arm.positions
-            summed += 1e-3 * error
-            effort = guess + 80.0 * error + 400.0 * summed + 2.0 * (way * 0.1 - np.array(arm.velocities))
-            effort = np.round(np.clip(effort, -9.0, 9.0) / CODE) * CODE
-            arm.step(effort)
-            if np.all(np.abs(arm.positions - theta) < 0.02):
-                efforts.append(effort)
-        passes.append((np.mean(efforts, axis=0), np.std(efforts, axis=0) / np.sqrt(len(efforts) / 20.0)))
-    (up, up_spread), (down, down_spread) = passes
-    return Observation(theta, LEANING, (up + down) / 2, (up - down) / 2, np.hypot(up_spread, down_spread) / 2, *weight)
+SLIPS = {
+    "one pose": {2: (0, 0, 0.3, 0)},
+    "two poses": {2: (0, 0, 0.3, 0), 5: (0, -0.5, 0, 0)},
+    "weighed": {9: (0, 0, 0, 0.2)},
+}
 
 
-def test_an_arm_simulated_by_mujoco_is_found_from_slow_passes_in_both_directions():
-    links, beside = DEFAULT_LINKS, np.array(((0.0, 0.01, -0.012, 0.008), (0.012, -0.01, 0.005, 0.01)))
-    friction = {"coulomb_friction": (0.2, 0.3, 0.15, 0.1), "stribeck_friction": (0.05,) * 4}
-    weight = {"wearer_mass": (0.0, 0.0, 0.0, WEIGHT[0]), "wearer_cog": (0.0, 0.0, 0.0, WEIGHT[1])}
-    bare, weighed = (
-        SimulatedArm(ArmConfig(links, cog_y=beside[0], cog_z=beside[1], **friction, **load)) for load in ({}, weight)
-    )
-    guess = np.array(TYPICAL_MOMENTS)
-    observations = [held(bare, np.array(theta), guess) for theta in best(LEANING, 8)]
-    guess = guess + load_moments(LENGTH, *WEIGHT)
-    observations += [held(weighed, np.array(theta), guess, WEIGHT) for theta in best(LEANING, 4, WEIGHT)]
+@pytest.mark.parametrize("slips", SLIPS.values(), ids=SLIPS)
+def test_a_pose_with_a_slip_or_a_hand_is_left_out_and_named(slips):
+    device = Device(6)
+    observations = device.tour(bare=10)
+    for index, error in slips.items():
+        observations[index] = observations[index]._replace(effort=np.add(observations[index].effort, error))
     found = identify(observations, PAPERS)
-    true = moments_of(ArmModel(links.length, links.cog, links.mass, off_axis=off_axis_of(links.mass, *beside)))
-    wrong = np.abs(found.moments - true)
-    assert np.all((wrong < 0.02 * true.max()) | (wrong < 2.0 * found.error))
-    np.testing.assert_allclose(found.scale, 1.0, atol=0.02)
-    np.testing.assert_allclose(found.friction, friction["coulomb_friction"], atol=0.08)
-    assert found.rejected == ()
+    assert {index for index, _ in found.rejected} == set(slips)
+    for index, reason in found.rejected:
+        assert f"joint {int(np.argmax(np.abs(slips[index]))) + 1}" in reason
+    assert np.all(np.abs(found.moments - device.moments) < 4.0 * found.error)
+
+
+@pytest.mark.parametrize(
+    ("bare", "spoilt", "words"), [(30, 12, r"pose 17: effort of joint 1 is"), (8, 6, "off in half of the poses")]
+)
+def test_poses_that_do_not_fit_one_arm_are_refused_together(bare, spoilt, words):
+    observations = Device(7).tour(bare=bare)
+    for k in range(spoilt):
+        error = np.eye(4)[k % 4] * (-1) ** k  # Nm
+        observations[2 * k] = observations[2 * k]._replace(effort=observations[2 * k].effort + error)
+    with pytest.raises(DataError, match=rf"the poses do not fit one arm: .*{words}.*touched"):
+        identify(observations, PAPERS)
+
+
+def test_too_few_poses_are_refused_with_the_pose_that_is_missing_and_accepted_with_it():
+    device = Device(8)
+    observations = [device.observe(theta) for theta in best(LEANING, 2)]
+    with pytest.raises(DataError, match="2 poses do not show"):
+        identify(observations, PAPERS)
+    for _ in range(4):
+        try:
+            found = identify(observations, PAPERS)
+            break
+        except DataError as error:
+            assert "poses do not show" in str(error) or "is not known better than" in str(error)
+            degrees = str(error).split("add the pose [")[1].split("]")[0].split(",")
+            observations.append(device.observe(np.radians([float(angle) for angle in degrees])))
+    assert np.all(np.abs(found.moments[1:4]) > found.error[1:4])
+
+
+@pytest.mark.parametrize(("moment", "joint"), [(1, 1), (2, 2), (3, 3)])
+def test_the_missing_pose_shows_the_moment_that_is_missing(moment, joint):
+    hidden = np.arange(layout_of(PAPERS).count) == moment
+    pose = missing_pose(hidden, LEANING, PAPERS)
+    theta = np.radians([float(angle) for angle in pose.split("[")[1].split("]")[0].split(",")])
+    assert np.abs(regressor(theta, LEANING, 9.8)[0, joint, moment]) > 0.8 * 9.8
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({2: (0.2, 0.3)}, r"M3 = 0.200 kg m is not known better than 0.300: add the pose \["),
+        ({3: (-0.03, 0.001)}, "M4 = -0.030 kg m: must be positive: check direction and zero of joint 4"),
+        ({7: (0.06, 0.001)}, "Y4 = 0.060 kg m exceeds M4: the zero of joint 4 seems 63 degrees off"),
+        ({6: (-0.3, 0.001)}, "Y3 = -0.300 kg m exceeds M3: the zero of joint 3 seems -56 degrees off"),
+    ],
+)
+def test_moments_that_no_arm_has_are_refused_with_what_to_check(changes, words):
+    moments, error = np.array((0.1, 0.2, 0.2, 0.03, 0.0, 0.0, 0.0, 0.0)), np.full(8, 0.001)
+    check_physical(moments, error, np.ones(4), np.array(LEANING), PAPERS)
+    for index, (value, uncertain) in changes.items():
+        moments[index], error[index] = value, uncertain
+    with pytest.raises(DataError, match=words):
+        check_physical(moments, error, np.ones(4), np.array(LEANING), PAPERS)
+
+
+ARM = configured_arm(packaged_config("sim.yaml"))
+
+DOWN = np.array(Tilt.of("right", 0.05, 0.21).direction)  # a stand that leans to the arm's side
+
+
+def in_trunk(side, direction):
+    """Return a direction in an arm's base frame in the trunk's axes; the right arm's base is a mirror image."""
+    return turn_in_trunk(side, direction) * (1.0 if side == "left" else -1.0)
+
+
+def leant(axis, angle):
+    """Return DOWN turned by `angle` rad about the part of `axis` across it."""
+    across = axis - (axis @ DOWN) * DOWN
+    turn = np.cross(across / np.linalg.norm(across), DOWN) * angle + DOWN
+    return turn / np.linalg.norm(turn)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_imu_that_is_two_degrees_off_does_no_harm_and_is_found(seed):
+    device = Device(seed)
+    measured = leant(np.random.default_rng(seed).normal(size=3), np.radians(2.0))
+    observations = [one._replace(direction=measured) for one in device.tour(tuple(DOWN), 8, 8)]
+    found = identify(observations, PAPERS)
+    error = np.abs(found.moments - device.moments)
+    assert np.all(error < np.maximum(3.5 * found.error, 0.01 * device.moments.max()))
+    direction = measured + np.cross(found.tilt, measured)
+    assert np.linalg.norm(direction / np.linalg.norm(direction) - DOWN) < np.radians(0.3)
+
+
+def test_the_corrected_mounting_is_the_old_one_after_the_turn():
+    rng = np.random.default_rng(1)
+    rotation = rng.normal(size=4)
+    rotation /= np.linalg.norm(rotation)
+    turn, vector = np.array((0.0, 0.0, 0.05)), rng.normal(size=3)
+    x, y, z = rotation_matrix(rotation.tolist()) @ vector
+    expected = x * np.cos(0.05) - y * np.sin(0.05), y * np.cos(0.05) + x * np.sin(0.05), z
+    np.testing.assert_allclose(rotation_matrix(turned(rotation.tolist(), turn)) @ vector, expected, atol=1e-12)
+    assert turned(rotation.tolist(), np.zeros(3)) == pytest.approx(tuple(rotation))
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_turn_in_the_arms_base_moves_gravity_as_in_the_trunk(side):
+    turn, direction = np.array((0.01, -0.02, 0.03)), np.array(Tilt.of(side, 0.2, 0.1).direction)
+    np.testing.assert_allclose(in_trunk(side, direction), gravity_in_trunk(0.2, 0.1), atol=1e-12)
+    moved = np.cross(turn_in_trunk(side, turn), gravity_in_trunk(0.2, 0.1))
+    np.testing.assert_allclose(moved, in_trunk(side, np.cross(turn, direction)), atol=1e-12)
+
+
+HEADING = np.radians(4.0)
+
+FILE = """
+/imu: {ros__parameters: {rotation_trunk_from_imu: [0.0, 0.0, 0.0, 1.0]}}
+"""
+
+
+def tours(device, pitches):
+    """Observations without and with the weight, at a pitch each, of an IMU whose heading is `HEADING` off."""
+    observations = []
+    for pitch, (bare, weighed) in zip(pitches, ((8, 0), (0, 8)), strict=True):
+        down = Tilt.of("right", pitch, 0.2).direction
+        x, y, z = down
+        measured = np.array((x + HEADING * y, y - HEADING * x, z))  # turned by -HEADING about z
+        measured /= np.linalg.norm(measured)
+        observations += [one._replace(direction=measured) for one in device.tour(down, bare, weighed)]
+    return observations
+
+
+def test_the_heading_is_corrected_only_if_it_shows(tmp_path):
+    params, arm = tmp_path / "exo.yaml", ARM
+    params.write_text(FILE, encoding="utf-8")
+    for pitches, is_shown in (((0.07, 0.07), False), ((0.07, -0.09), True)):
+        observations = tours(Device(2), pitches)
+        outcome = with_mounting(moments_from(arm, observations), params)
+        (mounting,) = [change.value for change in outcome.changes if change.name == "rotation_trunk_from_imu"]
+        for observation in observations[0], observations[-1]:
+            pitch = pitches[bool(observation.load_mass)]
+            moved = rotation_matrix(mounting) @ in_trunk("right", observation.direction)
+            wrong = np.linalg.norm(moved - gravity_in_trunk(pitch, 0.2))
+            assert wrong < np.radians(0.3)
+        heading = np.arctan2(rotation_matrix(mounting)[1, 0], rotation_matrix(mounting)[0, 0])
+        assert (abs(heading) > HEADING / 2.0) == is_shown
+        assert (NO_HEADING in outcome.lines) != is_shown
+
+
+def scaled(*factors):
+    """Return observations of joints with these factors in their efforts: reversed, silent, or of another firmware."""
+    return [one._replace(effort=np.multiply(one.effort, factors)) for one in Device(10).tour()]
+
+
+@pytest.mark.parametrize(
+    ("observations", "words"),
+    [
+        *(
+            (lambda factor=factor: scaled(1, 1, factor, 1), "scale 3|do not fit|not known better|must be positive")
+            for factor in (-1.0, 0.0, 0.2, 5.0)
+        ),
+        (
+            lambda: [
+                *Device(11).tour(weighed=0),
+                *(Device(11).observe(theta, weight=(0.002, 0.1)) for theta in best(LEANING, 4)),
+            ],
+            "a heavier one",
+        ),
+        (lambda: [*Device(12).tour()[:1], *scaled(1, np.nan, 1, 1)], "pose 2: effort"),
+        (list, "no pose"),
+    ],
+)
+def test_impossible_observations_are_refused_with_what_to_check(observations, words):
+    with pytest.raises(DataError, match=words):
+        identify(observations(), PAPERS)

@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The calibration of arms from URDFs whose masses are wrong: what MuJoCo needs of the true arm is the judge."""
+"""The calibration of arms from URDFs, bare and worn: what MuJoCo needs of the true arm is the judge."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -20,16 +21,16 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.live import tour_parameters
-from exo_gravity.lab.calibration.moment_model import PapersMoments, UrdfMoments, along_axes
+from exo_gravity.lab.calibration.moment_model import UrdfMoments, along_axes
 from exo_gravity.lab.calibration.poses import candidates, next_pose
-from exo_gravity.lab.calibration.result import page_of, write_changes
+from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
 from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
+from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
+from exo_gravity.lab.calibration.worn_arm import worn_arm
 from exo_gravity.lab.inputs.arms import AnyArm, any_arm, carried_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.lab.inputs.references import pinocchio_model
 from exo_gravity.lab.inputs.ros_yaml import text_of
-from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ...support.calibration_device import player_of
 from ...support.chains import random_chain
@@ -37,14 +38,23 @@ from ...support.thorough import quick
 from ...support.urdf_oracle import MujocoArm, WornMujocoArm
 
 SHIPPED = quick(["three_joints"], ["elbow", "three_joints", "seven_joints"])
+
 DOWN = gravity_in_trunk(0.0, 0.0)
+
 MEDIAN, WORST = 0.01, 0.03  # of the peak torque
+
 POSES = 12
+
 NOISE = 0.004  # Nm, standard deviation of a pose's effort: half a code of an AK60-6
+
 ZERO = 1.5  # deg, the largest error of an encoder's zero
+
 ASKEW = 1.5  # deg, by which each axis lies otherwise than in the file's URDF
+
 OFF = 0.2  # share by which each mass of the file's URDF is wrong
+
 NO_WEIGHT = (0.0, 0.0)  # kg and m
+
 BEST: dict[tuple[str, tuple[float, float]], list[np.ndarray]] = {}  # poses of a tour, by the file's name and the weight
 
 
@@ -64,12 +74,6 @@ def turned(text: str, joint: str, turn: np.ndarray) -> str:
     matrix = pin.rpy.rpyToMatrix(rpy) @ pin.exp3(turn)
     origin.set("rpy", " ".join(map(repr, pin.rpy.matrixToRpy(matrix).tolist())))
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def true_arm(text: str, names: Sequence[str], weight: tuple[float, float] = NO_WEIGHT) -> WornMujocoArm:
-    """The arm of a URDF with a weight of some kg at some m from its last joint."""
-    none = (0.0,) * (len(names) - 1)
-    return WornMujocoArm(text, names, (*none, weight[0]), (*none, weight[1]))
 
 
 @dataclass
@@ -93,6 +97,11 @@ class Bench:
         arm = any_arm(params, "right")
         return cls(name, params, arm, text, np.zeros(len(arm.joint_names)))
 
+    def true_arm(self, weight: tuple[float, float] = NO_WEIGHT) -> WornMujocoArm:
+        """The true arm with a weight of some kg at some m from its last joint."""
+        none = (0.0,) * (len(self.arm.joint_names) - 1)
+        return WornMujocoArm(self.text, self.arm.joint_names, (*none, weight[0]), (*none, weight[1]))
+
     def poses(self, weight: tuple[float, float] = NO_WEIGHT) -> Sequence[np.ndarray]:
         """The best poses, which follow from the file alone."""
         if (self.name, weight) not in BEST:
@@ -105,7 +114,7 @@ class Bench:
 
     def observed(self, scales: np.ndarray, weight: tuple[float, float] = NO_WEIGHT) -> list[Observation]:
         """What a tour through the best poses would show of motors with these true torque scales (n,)."""
-        truth, random = true_arm(self.text, self.arm.joint_names, weight), np.random.default_rng(4)
+        truth, random = self.true_arm(weight), np.random.default_rng(4)
         seen = []
         for theta in self.poses(weight):
             effort = truth.torque(theta + self.off) / scales + random.normal(0.0, NOISE, len(theta))
@@ -117,7 +126,7 @@ class Bench:
         """The median and the largest error of the true torque in 300 poses by the file `params`, of the peak."""
         new, random = carried_arm(load(params), "/right"), np.random.default_rng(9)
         poses = random.uniform(self.arm.low, self.arm.high, (300, len(scales)))
-        truth = true_arm(self.text, self.arm.joint_names)
+        truth = self.true_arm()
         true = np.array([truth.torque(pose) for pose in poses])
         moved = np.multiply(
             self.arm.can_bridge["direction"], np.subtract(self.arm.can_bridge["zero"], new.can_bridge["zero"])
@@ -136,23 +145,19 @@ class Bench:
         return output
 
 
+@pytest.mark.parametrize("is_weighed", [False, True])
 @pytest.mark.parametrize("name", SHIPPED)
-def test_masses_that_are_a_fifth_off_are_found_to_one_percent_of_the_torque(name: str, tmp_path: Path) -> None:
-    bench = Bench.of(name, tmp_path)
-    right = np.ones(len(bench.arm.joint_names))
-    before, _ = bench.errors(bench.params, right)
-    after, worst = bench.errors(bench.calibrated(bench.observed(right)), right)
-    assert before > 5.0 * MEDIAN
-    assert after < MEDIAN and worst < WORST
-
-
-@pytest.mark.parametrize("name", SHIPPED)
-def test_a_known_weight_shows_wrong_torque_scales(name: str, tmp_path: Path) -> None:
+def test_masses_a_fifth_off_are_found_and_with_a_known_weight_torque_scales_too(
+    name: str, is_weighed: bool, tmp_path: Path
+) -> None:
     bench, lever = Bench.of(name, tmp_path), {"seven_joints": 0.08}.get(name, 0.2)
-    scales = np.resize((0.85, 1.1, 0.95), len(bench.arm.joint_names))
-    seen = [*bench.observed(scales), *bench.observed(scales, (1.0, lever))]
-    after, worst = bench.errors(bench.calibrated(seen), scales)
-    assert after < MEDIAN and worst < WORST
+    scales = np.ones(len(bench.arm.joint_names))
+    assert bench.errors(bench.params, scales)[0] > 5.0 * MEDIAN
+    if is_weighed:
+        scales = np.resize((0.85, 1.1, 0.95), len(scales))
+    seen = [*bench.observed(scales), *(bench.observed(scales, (1.0, lever)) if is_weighed else ())]
+    median, worst = bench.errors(bench.calibrated(seen), scales)
+    assert median < MEDIAN and worst < WORST
 
 
 @pytest.mark.parametrize("name", SHIPPED[1:])  # those of a single joint look like a moment across its link
@@ -167,21 +172,6 @@ def test_zeros_and_axes_that_are_askew_are_found_where_the_poses_show_them(name:
     bench.off = np.radians(np.resize((ZERO, -ZERO, ZERO), len(right)))
     median, worst = bench.errors(bench.calibrated(bench.observed(right)), right)
     assert median < 0.5 * MEDIAN and worst < 0.25 * WORST
-
-
-def test_a_weight_that_hangs_a_little_beside_its_link_is_no_error_of_a_zero(tmp_path: Path) -> None:
-    bench, lever = Bench.of("three_joints", tmp_path), 0.2
-    hung = np.radians((0.0, 0.0, 3.0))  # the weight is farther round the elbow than said
-    bare, right = bench.observed(np.ones(3)), np.ones(3)
-    truth, none = true_arm(bench.text, bench.arm.joint_names, (1.0, lever)), true_arm(bench.text, bench.arm.joint_names)
-    weighed = []
-    for one in bench.observed(right, (1.0, lever)):
-        theta = np.asarray(one.theta)
-        beside = none.torque(theta) + truth.torque(theta + hung) - none.torque(theta + hung)
-        weighed.append(one._replace(effort=beside))
-    found = identify([*bare, *weighed], model_of(bench.arm))
-    assert np.degrees(np.abs(found.turn[:, 0])).max() < 1.0
-    assert np.abs(found.scale - 1.0).max() < 0.01
 
 
 @pytest.mark.parametrize("count", [1, 3, 6])
@@ -201,28 +191,19 @@ def test_the_derivatives_by_turns_of_the_joints_are_mujocos(count: int) -> None:
         assert np.abs(wrong).max() < 1e-5
 
 
-def test_the_papers_derivatives_by_turns_are_pinocchios() -> None:
-    pin, model = pinocchio_model(DEFAULT_LINKS)
-    data, theta, step = model.createData(), np.array((0.4, 0.9, -0.3, 0.8)), 1e-5
-    down = np.array((0.2, -0.3, 0.93))
-    model.gravity.linear[:] = 9.80665 * down
-    moments = PapersMoments(DEFAULT_LINKS, keeps_tilt=True)
-    shown = np.einsum("nkat,a,k->tn", moments.turned(theta[None])[0], down, moments.moments)
-    for number, derivative in enumerate(shown):
-        joint, way = 1 + number // 3, np.eye(3)[(2, 0, 1)[number % 3]]
-        place, ends = model.jointPlacements[joint].copy(), []
-        for sign in (1.0, -1.0):
-            model.jointPlacements[joint] = place * pin.SE3(pin.exp3(sign * step * way), np.zeros(3))
-            ends.append(pin.computeGeneralizedGravity(model, data, theta).copy())
-        model.jointPlacements[joint] = place
-        np.testing.assert_allclose(derivative, (ends[0] - ends[1]) / (2.0 * step), atol=1e-6)
-
-
-def test_a_zero_that_no_jig_could_have_missed_by_so_much_is_refused(tmp_path: Path) -> None:
-    bench = Bench.of("three_joints", tmp_path)
-    bench.off[0] = np.radians(12.0)
-    with pytest.raises(DataError, match=r"joint 1: its zero is \+\d+\.\d degrees off: must be within 6"):
-        moments_from(bench.arm, bench.observed(np.ones(3)))
+def test_a_weight_that_hangs_a_little_beside_its_link_is_no_error_of_a_zero(tmp_path: Path) -> None:
+    bench, lever = Bench.of("three_joints", tmp_path), 0.2
+    hung = np.radians((0.0, 0.0, 3.0))  # the weight is farther round the elbow than said
+    bare, right = bench.observed(np.ones(3)), np.ones(3)
+    truth, none = bench.true_arm((1.0, lever)), bench.true_arm()
+    weighed = []
+    for one in bench.observed(right, (1.0, lever)):
+        theta = np.asarray(one.theta)
+        beside = none.torque(theta) + truth.torque(theta + hung) - none.torque(theta + hung)
+        weighed.append(one._replace(effort=beside))
+    found = identify([*bare, *weighed], model_of(bench.arm))
+    assert np.degrees(np.abs(found.turn[:, 0])).max() < 1.0
+    assert np.abs(found.scale - 1.0).max() < 0.01
 
 
 def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> None:
@@ -243,18 +224,25 @@ def test_two_leans_of_the_base_show_how_the_imu_is_mounted(tmp_path: Path) -> No
     assert model_of(bench.arm).shows_tilt is False  # nothing is measured there
 
 
-def test_a_joint_that_turns_the_wrong_way_is_refused(tmp_path: Path) -> None:
-    bench = Bench.of("elbow", tmp_path)
-    wrong = [one._replace(effort=-np.asarray(one.effort)) for one in bench.observed(np.ones(1))]
-    with pytest.raises(DataError, match=r"joint 1 needs -.* times the torque of the URDF: must be from 0\.3 to 3"):
-        moments_from(bench.arm, wrong)
-
-
-def test_poses_that_do_not_show_a_moment_are_refused_and_the_missing_one_is_named(tmp_path: Path) -> None:
-    bench = Bench.of("three_joints", tmp_path)
-    same = bench.observed(np.ones(3))[:1] * 4
-    with pytest.raises(DataError, match=r"4 poses do not show abduction 2.*: add the pose \["):
-        moments_from(bench.arm, same)
+@pytest.mark.parametrize(
+    ("name", "zero", "change", "said"),
+    [
+        ("three_joints", 12.0, lambda seen: seen, r"joint 1: its zero is \+\d+\.\d degrees off: must be within 6"),
+        (
+            "elbow",
+            0.0,
+            lambda seen: [one._replace(effort=-np.asarray(one.effort)) for one in seen],
+            r"joint 1 needs -.* times the torque of the URDF: must be from 0\.3 to 3",
+        ),
+        ("three_joints", 0.0, lambda seen: seen[:1] * 4, r"4 poses do not show abduction 2.*: add the pose \["),
+    ],
+    ids=["a zero that no jig could have missed by so much", "the wrong way", "a moment that is not shown"],
+)
+def test_impossible_poses_are_refused_with_what_to_check(name, zero, change, said, tmp_path: Path) -> None:
+    bench = Bench.of(name, tmp_path)
+    bench.off[0] = np.radians(zero)
+    with pytest.raises(DataError, match=said):
+        moments_from(bench.arm, change(bench.observed(np.ones(len(bench.off)))))
 
 
 def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refused(tmp_path: Path) -> None:
@@ -265,22 +253,6 @@ def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refuse
         urdf_moments({**values, "urdf.file": ""})
     with pytest.raises(ParameterError, match=r"joint_names = .*: must be all joints that move the arm's links"):
         urdf_moments({**values, **none, "joint_names": ["abduction", "elbow"]})
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 5, 6, 7, 9])
-def test_the_moments_of_any_chain_give_mujocos_torque(count: int) -> None:
-    text, names = random_chain(count, seed=count)
-    arm, truth, random = UrdfArm(text, names, "hand"), MujocoArm(text, names), np.random.default_rng(count)
-    changed = with_wrong_masses(text, count)
-    other = arm.with_more_moments(UrdfArm(changed, names, "hand").moments - arm.moments)
-    rows, moments, base = arm.regressor, arm.moments, MujocoArm(changed, names)
-    for _ in range(20):
-        theta, tilt = random.uniform(-3.0, 3.0, count), Tilt.of("left", *random.uniform(-1.0, 1.0, 2))
-        down = np.array(tilt.gravity_in_trunk)
-        np.testing.assert_allclose(
-            rows(theta[None], down)[0] @ moments, truth.torque(theta, 9.80665 * down), atol=1e-10
-        )
-        np.testing.assert_allclose(other.torque(theta, tilt), base.torque(theta, 9.80665 * down), atol=1e-9)
 
 
 def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
@@ -315,3 +287,117 @@ def test_a_tour_of_the_elbow_finds_its_moments_and_its_friction(tmp_path: Path) 
         else:
             (curve,) = friction_from(bench.arm, player.tour.measured).curves
             assert abs(curve.fitted[-1] - 0.4 - 0.05 * curve.speed[-1]) < 0.03
+
+
+BODY_MASS = 75.0  # kg, by the table; the true arm differs
+
+OFF_MASS, OFF_PLACE = 0.25, 0.02  # share, and m, by which each segment differs from the table
+
+STIFFNESS = 1.0  # Nm/rad of some joints
+BREATHING = 0.05  # Nm, standard deviation of a pose by the wearer
+BREATHING, NOISE = 0.05, 0.004  # Nm, standard deviations of a pose: of the wearer, and of the motors
+
+SEEDS = range(6)
+
+NEW_POSES = 100
+
+
+@cache
+def relaxed_poses(name: str) -> list[np.ndarray]:
+    """The poses of the tour for an arm of config, without the visits again."""
+    arm = any_arm(packaged_config(f"{name}.yaml"), "right")
+    arm = replace(arm, compensator={**arm.compensator, "wearer.body_mass": BODY_MASS})
+    model, (low, high) = model_of(arm), worn_arm(arm).comfortable.tolist()
+    limits = replace(arm.limits, position_min=low, position_max=high)
+    poses, taken = candidates(limits, model), [np.array(limits.home)]
+    while len(taken) < WEARER.poses:
+        best = next_pose(taken, poses, DOWN, model.moments, model)
+        taken.append(poses[best])
+        poses = np.delete(poses, best, axis=0)
+    return taken
+
+
+@dataclass
+class Person:
+    """A relaxed wearer of an arm of config, drawn at random."""
+
+    name: str
+    params: Path
+    arm: AnyArm
+    truth: WornMujocoArm
+    bare: WornMujocoArm
+    seed: int
+
+    @classmethod
+    def of(cls, name: str, seed: int, folder: Path, springs: bool = True) -> Person:
+        params, text = folder / f"{seed}.yaml", packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")
+        nodes, random = load(packaged_config(f"{name}.yaml")), np.random.default_rng(seed)
+        nodes["/right/compensator"] |= {"wearer.body_mass": BODY_MASS, "mode": "zero_g", "support": 1.0}
+        params.write_text(text_of(nodes))
+        arm = any_arm(params, "right")
+        settings, count = carried_arm(load(params), "/right").settings, len(arm.joint_names)
+        mass = np.array(settings.wearer_mass) * random.uniform(1.0 - OFF_MASS, 1.0 + OFF_MASS, count)
+        place = np.array(settings.wearer_cog) + random.uniform(-OFF_PLACE, OFF_PLACE, count)
+        place = np.clip(place, 0.0, arm.robot.length) * (mass > 0.0)
+        stiffness = STIFFNESS * springs * random.integers(0, 2, count)
+        rest = random.uniform(0.0, 0.8, count)
+        worn = WornMujocoArm(text, arm.joint_names, mass, place, stiffness=stiffness, rest=rest)
+        return cls(name, params, arm, worn, WornMujocoArm(text, arm.joint_names, 0.0 * mass, 0.0 * mass), seed)
+
+    def observed(self, varying: float = 0.0) -> list[Observation]:
+        """What the tour shows. varying: share of the weight that they carry until the poses are visited again."""
+        random, taken = np.random.default_rng(10 + self.seed), relaxed_poses(self.name)
+        seen, count = [], len(self.arm.joint_names)
+        for number, theta in enumerate([*taken, *taken[: WEARER.again]]):
+            bare = self.bare.torque(theta)
+            effort = self.truth.torque(theta) + random.normal(0.0, np.hypot(BREATHING, NOISE), count)
+            effort = effort - varying * (number < len(taken)) * (self.truth.torque(theta) - bare)
+            seen.append(Observation(theta, DOWN, effort, np.full(count, 0.2), np.full(count, NOISE)))
+        return seen
+
+    def left(self, result: CalibrationResult) -> tuple[float, np.ndarray]:
+        """What the new file leaves to the wearer in new poses: the median of their arm's weight, and by joint in Nm.
+
+        By joint it is the root mean square, which `model_error.wearer_torque` states.
+        """
+        output = self.params.with_suffix(".new.yaml")
+        write_changes(self.params, output, result.changes, "calibrate wearer")
+        settings = carried_arm(load(output), "/right").settings
+        poses = np.random.default_rng(99).uniform(*worn_arm(self.arm).comfortable, (NEW_POSES, len(self.arm.low)))
+        true = np.array([self.truth.torque(pose) for pose in poses])
+        given = np.array([settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
+        weight = np.abs(true - [self.bare.torque(pose) for pose in poses]).max()
+        off = given - true
+        return float(np.median(np.abs(off).max(axis=1)) / weight), np.sqrt(np.mean(off**2, axis=0))
+
+
+def value_of(result: CalibrationResult, name: str) -> Sequence[float]:
+    (found,) = [change.value for change in result.changes if change.name == name]
+    return found
+
+
+@pytest.mark.parametrize("name", quick(["three_joints"], ["elbow", "three_joints", "seven_joints"]))
+def test_a_relaxed_arm_keeps_little_of_its_weight_and_the_band_says_how_much(name: str, tmp_path: Path) -> None:
+    left, covered = [], []
+    for seed in SEEDS:
+        person = Person.of(name, seed, tmp_path)
+        result = wearer_from(person.arm, person.observed(), 0.0)
+        assert result.refusals == ()
+        share, off = person.left(result)
+        left.append(share)
+        band = 2.0 * np.array(value_of(result, "model_error.wearer_torque"))
+        covered += (off <= band).tolist()
+    assert np.median(left) < 0.02 and max(left) < 0.04
+    assert np.mean(covered) > 0.9
+
+
+def test_a_wearer_who_does_not_relax_and_one_who_is_not_there_are_refused(tmp_path: Path) -> None:
+    person = Person.of("three_joints", 0, tmp_path)
+    with pytest.raises(DataError, match=r"flexion: .* Nm between two visits of a pose: .* did the wearer relax"):
+        wearer_from(person.arm, person.observed(varying=0.4))
+    person.truth = person.bare
+    with pytest.raises(DataError, match="is the arm relaxed, the robot calibrated"):
+        wearer_from(person.arm, person.observed())
+    light = replace(person.arm, compensator={**person.arm.compensator, "wearer.body_mass": 0.0})
+    with pytest.raises(ParameterError, match=r"compensator wearer\.body_mass = 0.*: must be the wearer's, in kg"):
+        worn_arm(light)

@@ -1,0 +1,182 @@
+# Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
+"""Files of arms that ship and that once did, each carried without ROS; sessions, sources, and work in processes."""
+
+from __future__ import annotations
+
+import os
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from exo_gravity.core.compensation.settings import compensator_table
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import OPTIONS
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import CAN_BRIDGE, CONFIRM
+from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.vocabulary import Source
+from exo_gravity.lab.inputs.arms import carried_arm, configured_arms, read_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.lab.parallel import ENDED, Outcome, in_processes
+from exo_gravity.lab.source import of_all, source_of
+from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.lab.trial.scripted import read_script
+from exo_gravity.lab.trial.session import Session
+from exo_gravity.sim.params import SIMULATOR
+from exo_gravity.sim.script import TrialScript
+
+from ..support import DATA
+from ..support.thorough import quick
+from ..support.urdf_oracle import MujocoArm
+
+POSES = {
+    "elbow": [1.2],
+    "three_joints": [0.6, 0.5, 0.8],
+    "seven_joints": [0.5, 0.5, 0.3, 0.8, 0.2, 0.3, -0.2],
+}
+
+HELD = 0.05  # rad that a joint may turn while nobody touches the arm
+
+FRICTION = 0.1  # Nm: the torque command has codes, and the trial's efforts those of the motors' replies
+
+
+def script_to(pose: list[float]) -> TrialScript:
+    return TrialScript.parse({"name": "raise", "steps": [{"move": pose, "over": 3.0}, {"hold": 3.0}]})
+
+
+@pytest.mark.parametrize("name", quick(["three_joints"], POSES))
+def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
+    params, script = packaged_config(f"{name}.yaml"), script_to(POSES[name])
+    (trial,) = simulated_trials(params, script)
+    held: list[list[float]] = []
+
+    def look(now: float) -> bool:
+        if trial.safety.state is State.ACTIVE:
+            held.append(trial.arm.device.arm.positions)
+        return False
+
+    recording = trial.run(look)
+    assert not trial.trouble and not trial.events
+    released = next(step.start for step in recording.steps if step.action == "hold")
+    during = (recording.time > released + 0.5) & (recording.time < released + 2.9)
+    positions, commands = recording.position[during], recording.command[during]
+    assert np.ptp(positions, axis=0).max() < HELD
+    assert np.abs(positions[0] - POSES[name]).max() < 0.2
+    arm = carried_arm(load(params), "/right")
+    text = Path(packaged_config(f"arms/{name}.urdf")).read_text(encoding="utf-8")
+    oracle = MujocoArm(text, arm.limits.joint_names)
+    needed = oracle.torque(positions[-1], (0.0, 0.0, -9.80665))
+    assert np.abs(commands[-1] - needed).max() < 1e-9
+    assert np.abs(recording.effort[during][-1] - needed).max() < FRICTION
+    assert not trial.arm.device.powered
+
+
+THEN = DATA / "a47959f4"
+
+TABLES = {"can_bridge": CAN_BRIDGE, "imu": IMU, "simulator": SIMULATOR}
+
+SHORT = TrialScript.parse({"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 2.0}]})
+
+
+def test_a_script_bends_the_elbow_and_one_for_another_number_of_joints_or_a_tool_for_another_arm_is_refused() -> None:
+    (trial,) = simulated_trials(packaged_config("elbow.yaml"), read_script("elbow")[1])
+    assert trial.run().position.max() > 1.1 and not trial.trouble
+    with pytest.raises(ParameterError, match=r"steps\[0\]\.move = .*: must be 3 numbers, one per joint"):
+        simulated_trials(packaged_config("three_joints.yaml"), script_to([0.1, 0.2]))
+    with pytest.raises(ParameterError, match="law = 'urdf': must be exact: this is for the paper's arm"):
+        read_arm(load(packaged_config("elbow.yaml")), "/right")
+
+
+# What docs/topics.md promises: the files of a47959f4 work unchanged, except that a person confirms the pose
+
+
+@pytest.mark.parametrize(("file", "arms"), [("exo", 2), ("sim", 1), ("sim_both", 2)])
+def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str, arms: int) -> None:
+    nodes = load(THEN / f"{file}.yaml")
+    for name, given in nodes.items():
+        executable = name.rpartition("/")[2]
+        table = compensator_table(given) if executable == "compensator" else TABLES[executable]
+        values = values_of(table, given, OPTIONS)
+        assert {key: values[key] for key in given if key in values} == {
+            key: value for key, value in given.items() if not key.startswith(f"{OPTIONS}.")
+        }
+    found = configured_arms(THEN / f"{file}.yaml")
+    assert len(found) == arms
+    for arm in found:
+        assert arm.settings().side == arm.side
+        assert arm.can_bridge["start_pose"] == CONFIRM  # the one thing that is new to them
+
+
+@pytest.mark.parametrize("file", quick(["sim"], ["sim", "sim_both"]))
+def test_every_simulated_arm_is_carried_through_a_trial(file: str) -> None:
+    for trial in simulated_trials(THEN / f"{file}.yaml", SHORT):
+        recording = trial.run()
+        assert trial.trouble == "" and recording.carried
+    assert TrialScript.parse(yaml.safe_load((THEN / "home.yaml").read_text(encoding="utf-8"))).steps
+
+
+SIMULATED, REAL, UNKNOWN = Source.SIMULATED, Source.REAL, Source.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("interface", "channel", "has_simulator", "source"),
+    [
+        ("udp_multicast", "239.74.163.2", False, SIMULATED),
+        ("socketcan", "can0", False, REAL),
+        ("socketcan", "can0,can0,can1,can1", False, REAL),
+        ("socketcan", "vcan0", False, UNKNOWN),
+        ("socketcan", "vcan0", True, SIMULATED),
+        ("socketcan", "", False, UNKNOWN),
+        ("", "", False, UNKNOWN),
+        (None, None, False, UNKNOWN),
+    ],
+)
+def test_an_arm_is_real_only_if_its_file_names_a_bus_that_leads_to_motors(interface, channel, has_simulator, source):
+    bridge = {} if interface is None else {"can.interface": interface, "can.channel": channel}
+    assert source_of(bridge, has_simulator) is source
+
+
+def test_several_arms_are_real_only_together():
+    assert of_all([REAL, REAL]) is REAL
+    assert of_all([REAL, SIMULATED]) is of_all([SIMULATED, UNKNOWN]) is SIMULATED
+    assert of_all([REAL, UNKNOWN]) is of_all([]) is UNKNOWN
+
+
+@pytest.mark.parametrize("code", ["", "P01", "0042", "pilot-3_b", "A" * 32])
+def test_a_code_names_the_folder_of_the_subject_and_the_day_and_without_one_there_is_none(code):
+    assert Session(code).folder(date(2026, 3, 14)) == (f"{code}/2026-03-14" if code else "")
+
+
+@pytest.mark.parametrize("code", ["Anna Meier", "../P01", "a/b", ".", "-P01", "Jörg", "P01\n", "A" * 33, "P.1", "CON:"])
+def test_characters_that_do_not_belong_in_the_name_of_a_folder_are_refused(code):
+    with pytest.raises(ParameterError, match=r"subject = .*: must be a code"):
+        Session(code)
+
+
+HALF = ({"note": "calm \ud83d"}, {"protocol": "a\0"})  # an emoji cut by a field's maxlength; a C string ends there
+
+
+@pytest.mark.parametrize("wrong", [{"note": "x" * 1001}, {"protocol": 1}, {"subject": None}, *HALF])
+def test_a_text_that_is_too_long_or_no_whole_text_is_refused(wrong):
+    with pytest.raises(ParameterError, match=next(iter(wrong))):
+        Session(**wrong)
+
+
+def square(item: int) -> int:
+    """Return the square of most numbers."""
+    if item == 3:
+        os._exit(1)
+    if item == 4:
+        raise RuntimeError("not this one")
+    return item * item
+
+
+def test_every_item_has_one_outcome_also_when_a_process_dies():
+    outcomes = sorted(in_processes(square, range(8), workers=2), key=lambda outcome: outcome.item)
+    failed = {3: ENDED, 4: "RuntimeError: not this one"}
+    squares = [Outcome(item, item * item) for item in range(8)]
+    assert outcomes == [Outcome(one.item, None, failed[one.item]) if one.item in failed else one for one in squares]
