@@ -21,6 +21,7 @@ sys.path[:0] = [str(ROOT)]
 
 from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
 from test.faults.cases import CASES  # noqa: E402
+from test.faults.virtual_cases import ROWS  # noqa: E402
 from test.support.document_commands import DOCUMENTS  # noqa: E402
 
 FOLDERS = "bench|config|docs|examples|exo_gravity|launch|test|core|hardware|sim|lab|panel|nodes|tools|.ci|.github"
@@ -74,7 +75,7 @@ def safety_case() -> Iterator[str]:
     found = re.findall(r"\| cause.*?\| rows \|\n\|[-|]+\n((?:\|.*\n)+)", text_of("docs/safety_case.md"))
     cells = (line.split(" | ")[-1] for table in found for line in table.splitlines())
     names = [name for cell in cells for name in re.findall(r"`([^`]+)`", cell)]
-    rows = [case.name for case in CASES]
+    rows = [case.name for case in (*CASES, *ROWS)]
     for row in rows:
         if (times := sum(fnmatchcase(row, name) for name in names)) != 1:
             yield f"docs/safety_case.md must name the row {row} once, not {times} times"

@@ -65,11 +65,8 @@ def mode(rig: Rig) -> None:
     rig.change(mode="one_g" if rig.settings.mode == "zero_g" else "zero_g")
 
 
-def supply_cut(rig: Rig, motors: Sequence[int], duration: float = math.inf, keeps_turns: bool = False) -> None:
-    """Cut the supply. After it the encoders, on the rotors, know the angle only within a turn of the rotor.
-
-    keeps_turns: the encoders still know the turn.
-    """
+def supply_cut(rig: Rig, motors: Sequence[int], duration: float = math.inf) -> None:
+    """Cut the supply. After it the encoders, on the rotors, know the angle only within a turn of the rotor."""
 
     def power(is_on: bool) -> None:
         rig.catch_up()
@@ -79,8 +76,7 @@ def supply_cut(rig: Rig, motors: Sequence[int], duration: float = math.inf, keep
             motor.unplugged = not is_on
             turn = 2.0 * math.pi / motor.joint.spec.gear_ratio
             errors[joint] = -turn * round(rig.device.arm.positions[joint] / turn)
-        if not keeps_turns:
-            rig.device.encoder_error = errors
+        rig.device.encoder_error = errors
 
     during(rig, duration, partial(power, False), partial(power, True))
 
@@ -137,16 +133,6 @@ def motor_warms(rig: Rig, joint: int, most: float) -> None:
     """Warm a motor from 60 to `most` degC."""
     motor = rig.motors[joint]
     gradually(rig, WARMING, lambda share: setattr(motor, "temperature", 60.0 + share * (most - 60.0)))
-
-
-def foreign_frames(name: str) -> Act:
-    """Return the act that sends a motor its frames of this name: 'enter', 'exit' or 'set_zero'."""
-
-    def inject(rig: Rig, joint: int) -> None:
-        for frame in getattr(rig.motors[joint].joint, name):
-            rig.send(frame)
-
-    return inject
 
 
 def foreign_torque(rig: Rig, joint: int, torque: float, rate: float = 500.0, duration: float = 2.0) -> None:
@@ -282,8 +268,6 @@ ACTS: Mapping[str, Act] = {
     "motor_error": lambda rig, joint, code: of_motor("error", 0)(rig, joint, code),
     "motor_hot": of_motor("temperature", 30.0),
     "motor_warms": motor_warms,
-    "foreign_exit": foreign_frames("exit"),
-    "foreign_set_zero": foreign_frames("set_zero"),
     "foreign_torque": foreign_torque,
     # Computers.
     "stall": stall,

@@ -52,7 +52,8 @@ class Rig(VirtualArm):
 
     compensator, controller: what carries it. truth: its motion (sim/truth.py) since it was last forgotten.
     imu_error: rad of pitch and roll that the IMU adds, as one that comes loose: its gyroscope agrees. imu_frozen: the
-    reading that it repeats. imu_silent: whether it sends nothing. changes: of the state so far.
+    reading that it repeats. imu_silent: whether it sends nothing. gyro_bias: rad/s of pitch that it adds: a
+    gyroscope that reads exactly 0 counts as none. changes: of the state so far.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class Rig(VirtualArm):
         self.changes: list[Change] = []
         self.imu_error, self._last_error = [0.0, 0.0], [0.0, 0.0]
         self.imu_frozen: TrunkReading | None = None
-        self.imu_silent = False
+        self.imu_silent, self.gyro_bias = False, 0.0
         self.newest_reading: TrunkReading | None = None
         self.add_imu(self._sense, self.compensator, IMU_PERIOD)
 
@@ -161,7 +162,7 @@ class Rig(VirtualArm):
         seen = trunk._replace(
             pitch=trunk.pitch + self.imu_error[0],
             roll=trunk.roll + self.imu_error[1],
-            pitch_rate=trunk.pitch_rate + pitch_rate,
+            pitch_rate=trunk.pitch_rate + pitch_rate + self.gyro_bias,
             roll_rate=trunk.roll_rate + roll_rate,
         )
         gravity = gravity_in_trunk(seen.pitch, seen.roll).tolist()

@@ -174,8 +174,10 @@ class Played:
         """Let the device receive a frame, and send its reply."""
         if message.is_error_frame or (message.is_fd and not any(self._device.is_fd)):
             return
-        self.catch_up()
         frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        if list(message.data[:1]) == [frame_id]:
+            return  # another device's reply: as in `SimulatedDevice.run`, no command
+        self.catch_up()
         for joint, reply in self._device.replies(frame_id, bytes(message.data)):
             delay = self._random.uniform(*self._device.motors[joint].firmware.reply_delay)
             self._wire.clock.later(delay, partial(self._send, joint, reply))

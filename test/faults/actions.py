@@ -138,16 +138,6 @@ def change_message(change: Callable[[JointState], object]) -> Action:
     return lambda rig: setattr(rig, "change_message", change)
 
 
-def reported(node: str, key: str, text: str) -> Action:
-    """Check that the node reports what begins with `text`."""
-
-    def check(rig: Rig) -> None:
-        found = rig.probe.diagnostic(node, key) or "nothing"
-        assert found.startswith(text), f"{key}: {found}"
-
-    return check
-
-
 def enable(on: bool) -> Action:
     return lambda rig: rig.probe.enable(on)
 
@@ -203,24 +193,6 @@ def raw_imu(rig: Rig) -> Imu:
 def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
     """Return what makes a message of /imu/data with the orientation (x, 0, 0, w)."""
     return lambda rig: stamped(rig, Imu(orientation=Quaternion(x=x, w=w)))
-
-
-def enabled_in_vain(rig: Rig, wait: Action) -> None:
-    """Clear the fault and enable the arm, whose cause is still there: its motors must stay off while `wait(rig)`."""
-    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    start = time.time()
-    assert rig.probe.trigger("clear_fault").success
-    rig.probe.wait_until(lambda: rig.probe.state == "disabled", 10.0)
-    rig.probe.enable(True)
-    wait(rig)
-    assert not rig.truth.since(start)["on"].any(), "a motor was switched on"
-
-
-def refused_on_the_wrong_angle(rig: Rig) -> None:
-    """Check that clear and enable do not switch on the motors of an arm whose encoder is still wrong."""
-    enabled_in_vain(rig, lambda rig: rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0))
-    assert rig.probe.fault == "implausible_zero", rig.probe.fault
-    NO_JUMP(rig)
 
 
 def overload_processors(rig: Rig) -> None:
@@ -348,33 +320,12 @@ def foreign_frames(frame: bytes | Callable[[Rig], Frame], rate: float = 1.0, sec
     return inject
 
 
-def commanding(torque: float) -> Callable[[Rig], Frame]:
-    """Return what makes a command of `torque` (Nm) for the joint that is struck."""
-
-    def make(rig: Rig) -> Frame:
-        motor = rig.motors[rig.struck]
-        return motor.command_id, motor.command(torque, 0.0)
-
-    return make
-
-
 def motor_error(rig: Rig) -> int:
     """Return the code of an error of the struck motor."""
     return AK_ERROR if rig.motors[rig.struck].spec.family == FAMILY else DAMIAO_ERROR
 
 
-def motor_turn(rig: Rig) -> float:
-    """Return by how many rad the struck joint turns with its motor's rotor."""
-    return rig.motors[rig.struck].spec.rotor_turn
-
-
 # Faults of the simulated device, and what ends them.
-CUT_OFF, CONNECT = simulator(fault__cut_off=at_struck(True)), simulator(fault__cut_off=everywhere(False))
-# The device counts the time from the moment at which the motor loses its power.
-RESTART = simulator(fault__unplugged_time=0.03, fault__unplugged=at_struck(True))
-SHORT_RESTART = simulator(fault__unplugged_time=0.015, fault__unplugged=at_struck(True))
-RESTARTED = simulator(fault__unplugged_time=0.0, fault__unplugged=everywhere(False))
 CUT, RELEASE = simulator(fault__unplugged=everywhere(True)), simulator(fault__unplugged=everywhere(False))
 SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
 ERROR, NO_ERROR = simulator(fault__error=at_struck(motor_error)), simulator(fault__error=everywhere(0))
-JUMP, NO_JUMP = simulator(fault__encoder_error=at_struck(motor_turn)), simulator(fault__encoder_error=everywhere(0.0))

@@ -15,8 +15,6 @@ import signal
 import subprocess
 import time
 
-import numpy as np
-
 from exo_gravity.core.motors.ak import MIT_V3
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
@@ -25,21 +23,15 @@ from exo_gravity.core.safety.descent import DESCENT
 from ..support.launched_nodes import SECOND_GROUP
 from ..support.ros_probe import Timeout
 from .actions import (
-    CONNECT,
     CUT,
-    CUT_OFF,
     END_SILENCE,
-    ERROR,
     FOREIGN,
-    NO_ERROR,
     RELEASE,
     SILENCE,
-    enable,
     foreign_frames,
     has_refused,
     in_turn,
     pause,
-    reported,
     run_bridge,
     second_bridge,
     send_signal,
@@ -48,7 +40,8 @@ from .actions import (
 )
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, Action, FaultCase
 from .rig import Rig
-from .rigs import HandedOverRig, LauncherRig, ShortEnableRig, TwoBusRig, TwoBusV3Rig, V3Rig
+from .rigs import HandedOverRig, LauncherRig, TwoBusRig, TwoBusV3Rig, V3Rig
+from .virtual_cases import stays_off
 
 # s after which a watchdog has faded the torque of motors that do not reply, and hands the bus over
 GIVEN_UP = DESCENT.blind_hold + DESCENT.blind_fade_time + 1.0
@@ -86,19 +79,6 @@ def start_with_silent_motors(rig: HandedOverRig) -> None:
 def next_bridge_let_it_down(rig: HandedOverRig) -> None:
     log = rig.log_of_next.read_text()
     assert "the arm is down, its motors are off" in log, f"the next bridge did not let the arm down: {log[-300:]}"
-
-
-def clear(rig: Rig) -> None:
-    """Clear the fault while the supply is off: the motors may still be letting down, as far as the bridge knows."""
-    rig.probe.wait_until(lambda: rig.probe.state == "fault", 10.0)
-    assert rig.probe.trigger("clear_fault").success
-
-
-def stays_off(records: np.ndarray) -> str:
-    """Return what is wrong if a motor is on later than the cut."""
-    since = records["time"] - records["time"][0]
-    on = records["on"][since > 0.1].any(axis=0)
-    return f"motor {int(np.argmax(on)) + 1} was on after the cut" if on.any() else ""
 
 
 def carries_again(rig: Rig) -> None:
@@ -143,32 +123,10 @@ OWNERSHIP = (
         PROCESS_REACTION),
 )
 V3_BOARDS = (
-    FaultCase("V3 boards: arm disabled", enable(False), V3Rig, outcomes=("disabled",)),
-    FaultCase("V3 boards: motor 2 cut off from the bus", CUT_OFF, V3Rig, clear=CONNECT, unreached=(1,),
-        outcomes=("motor_silent",)),
-    FaultCase("V3 boards: bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), V3Rig,
-        unreached=ALL_JOINTS),
-    FaultCase("V3 boards: motor 2 reports an error", ERROR, V3Rig, clear=NO_ERROR, outcomes=("motor_error",)),
-    FaultCase("V3 boards: foreign exit of motor 2, once", foreign_frames(lambda rig: V3_MOTOR_2.exit[-1]), V3Rig,
-        steps_from=0.05, outcomes=("foreign_command", "torque_not_delivered")),
     FaultCase("V3 boards: foreign 6 Nm to motor 2, 500 a second for 2 s",
         foreign_frames(lambda rig: (V3_MOTOR_2.command_id, V3_MOTOR_2.command(FOREIGN, 0.0)), 500.0, 2.0), V3Rig,
-        steps_from=2.1,
-        outcomes=("foreign_command",), energy_limit=2.0),
-    FaultCase("V3 boards: compensator killed", send_signal("compensator", KILL), V3Rig, PROCESS_REACTION),
+        steps_from=2.1, outcomes=("foreign_command",), energy_limit=2.0),
     FaultCase("V3 boards: can_bridge killed", send_signal("can_bridge", KILL), V3Rig, PROCESS_REACTION),
-)
-SUPPLY = (
-    FaultCase("enabled, and the supply cut for 4 s while checking", in_turn(CUT, pause(4.0), RELEASE, pause(OBSERVED)),
-        ShortEnableRig, stage="checking", clear=RELEASE, outcomes=("disabled",),
-        afterwards=reported("can_bridge", "refusal text", "not enabled within 2 s")),
-    supply_case("supply cut for 2 s", in_turn(CUT, pause(2.0)), Rig),
-    supply_case("supply cut for 30 s, cleared meanwhile", in_turn(CUT, pause(15.0), clear, pause(15.0)), Rig),
-    supply_case("V3 boards: supply cut for 2 s", in_turn(CUT, pause(2.0)), V3Rig),
-    supply_case("V3 boards: supply cut for 30 s, cleared meanwhile", in_turn(CUT, pause(15.0), clear, pause(15.0)),
-        V3Rig),
-    supply_case("V3 boards: supply cut for 3 s, motor 2 back 6 s before the others",
-        in_turn(CUT, pause(3.0), simulator(fault__unplugged=[True, False, True, True]), pause(6.0)), V3Rig),
 )
 TWO_BUSES = (
     FaultCase("two buses: the second dead until the arm is given up", DEAD, TwoBusRig, clear=ALIVE, unreached=FAR,

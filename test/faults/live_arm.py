@@ -21,7 +21,7 @@ from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
 from .rigs import COMPENSATOR, BothArmsRig, WearerRig
 from .stall_clock import StallClock
-from .wearer_cases import HOLD, MOVED, PUSH_DOWN, RATED, SHAKE, THROW
+from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, SHAKE, THROW
 
 MINUTE = 60.0  # s
 STALL = READING.reply_timeout  # s
@@ -79,7 +79,7 @@ BACK: Steps = [{"move": list(SoakRig.pose), "over": over} for over in (1.5, 60.0
 ACTS: dict[str, Steps] = {
     "lifts": [{"move": [0.0, 1.0, 0.3, 1.0], "over": 1.6}],
     "pushes down": PUSH_DOWN,
-    "holds": HOLD,
+    "holds": KEEP,
     "shakes": SHAKE,
     "throws": [*THROW, {"hold": 0.5}],
     "reaches": [{"move": pose, "over": 1.0} for pose in ([0.3, 0.9, 0.6, 1.0], list(SoakRig.pose)) * 3],

@@ -11,42 +11,28 @@ import itertools
 import math
 import os
 import signal
-import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
-import yaml
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from ..support.launched_nodes import Parameters, executable
-from .actions import CUT, ERROR, NO_ERROR, RELEASE, enabled_in_vain, in_turn, pause, publish, simulator, stamped, wearer
-from .bus_cases import stays_off
-from .command_cases import stopped_for
+from ..support.launched_nodes import Parameters
+from .actions import CUT, RELEASE, in_turn, publish, simulator, stamped, wearer
 from .fault_case import ALL_JOINTS, FaultCase
 from .rig import Rig
-from .rigs import WORN_COG, WORN_MASS, SignCheckRig, WearerRig, variant
+from .rigs import WORN_COG, WORN_MASS, WearerRig
+from .virtual_cases import stays_off
 
 GAP = 4.0  # s for which the bridge stands still
 BLIND = 30.0  # s, longer than a let-down waits for motors that do not reply
 LAP = [0.1, 0.5, 0.5, 1.3]  # rad
 ELBOW_TURN = 2.0 * math.pi / 6.0  # rad, of the output for one turn of the rotor
 OBSERVED = 4.0  # s
-TIMEOUT = 0.025  # s, of the open drive
-# rad/s that a joint gains while its motor's own time-out has taken the torque away: 1.31 in 63 ms, and a loop that is
-# stopped for 75 ms may miss one cycle more than that
-FIRMWARE_FALL = 1.5
-CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the joints are
 SUPPORT = itertools.cycle((1.0, 0.0, math.nan, 50.0, -1.0))
-
-TimeoutRig = variant(Rig, simulator={"firmware": {"timeout": TIMEOUT}})
-ExchangedRig = variant(
-    SignCheckRig, bridge={**SignCheckRig.bridge, "can_id": [1, 2, 4, 3], "position_min": [-1.65, -0.5, -0.78, -0.5]}
-)
 
 
 class AskingRig(WearerRig):
@@ -136,53 +122,10 @@ def stop_in_the_lap(rig: AskingRig) -> float:
     return start
 
 
-def refused_again(rig: Rig) -> None:
-    """Check that clear and enable do not switch on a motor that still reports its error."""
-    enabled_in_vain(rig, pause(OBSERVED))
-    NO_ERROR(rig)
-
-
-def await_refusal(rig: Rig) -> float:
-    """Wait until the start has failed; return when all motors were on: before, each is switched on and off once."""
-    rig.probe.wait_until(lambda: (newest := rig.truth.newest()) is not None and newest["on"].all(), 30.0)
-    start = time.time()
-    rig.probe.wait_until(lambda: rig.probe.state in ("fault", "disabled"), 30.0)
-    return start
-
-
-def connect_a_second_arm(rig: Rig) -> float:
-    """Connect another arm to the bus, whose motors have the same IDs; return when."""
-    start = time.time()
-    device = second_device(rig)
-    try:
-        rig.probe.wait_until(lambda: rig.probe.state == "fault", 30.0)
-    finally:
-        device.terminate()
-        device.wait(10.0)
-    return start
-
-
-def second_device(rig: Rig) -> subprocess.Popen[str]:
-    """Start another simulated arm, which hangs, on the bus of the first one."""
-    parameters = yaml.safe_load(rig.nodes[-1].path.read_text())["/right/simulator"]
-    for name in ("imu", "truth"):
-        parameters["ros__parameters"].pop(name, None)
-    path: Path = rig.folder / f"second_device_{time.monotonic_ns()}.yaml"
-    path.write_text(yaml.safe_dump({"/other/simulator": parameters}))
-    command = [executable("simulator"), "--ros-args", "-r", "__ns:=/other", "--params-file", str(path)]
-    return subprocess.Popen(command, text=True, start_new_session=True)
-
-
 def hostile_support(rig: Rig) -> JointState:
     """Return a request for support that contradicts the one before it."""
     message: JointState = stamped(rig, JointState(name=["support"], position=[next(SUPPORT)]))
     return message
-
-
-def muted(*joints: int) -> Callable[[Rig], object]:
-    """Lose the replies of these motors for GAP s; the motors obey."""
-    mute = [joint in joints for joint in ALL_JOINTS]
-    return in_turn(simulator(fault__mute=mute), pause(GAP), simulator(fault__mute=[False] * len(mute)))
 
 
 # fmt: off
@@ -195,24 +138,5 @@ REQUESTS = (
         unpowered=ALL_JOINTS, steps_from=0.1, check=stays_off, ends_rig=True),
     FaultCase("hostile requests for support, Zero-G, 75 kg", in_turn(*[publish(JointState, "/right/support_request",
         hostile_support)] * 4), AdaptiveRig, limit=None, outcomes=("active",), speed_limit=0.6),
-)
-CONNECTIONS = (
-    FaultCase("CAN IDs of motors 3 and 4 exchanged", await_refusal, ExchangedRig, None, "started",
-        outcomes=("joints_exchanged",), ends_rig=True),
-    # Two motors answer each command, and what either reports is taken for what the other applies.
-    FaultCase("a second arm with the same IDs on the bus", connect_a_second_arm, limit=None, ends_rig=True,
-        steps_from=math.inf, outcomes=("position_jump", "over_speed", "readings_contradict", "torque_not_delivered",
-        "outside_limits", "motor_silent")),
-)
-FIRMWARE = (
-    # The steps are the firmware's own, also where the machine stands still; test_motors.py judges the return.
-    *(FaultCase(f"can_bridge stopped for {milliseconds} ms, motors with a time-out of 25 ms",
-        stopped_for(milliseconds / 1000.0, "can_bridge"), TimeoutRig, None, speed_limit=FIRMWARE_FALL,
-        steps_from=math.inf) for milliseconds in (40, 60, 75)),
-    FaultCase("all motors mute for 4 s", muted(*ALL_JOINTS), speed_limit=CARELESS, driven_limit=CARELESS,
-        outcomes=("motor_silent",)),
-    FaultCase("motor 2 mute for 4 s", muted(1), outcomes=("motor_silent",), driven_limit=0.6),
-    FaultCase("motor 2 reports an encoder error, then clear and enable", ERROR, clear=lambda rig: None,
-        afterwards=refused_again, outcomes=("motor_error",)),
 )
 # fmt: on

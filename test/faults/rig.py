@@ -30,11 +30,11 @@ from ..support import CONFIG
 from ..support.launched_nodes import REAL, SIMULATED, LaunchedNodes, Parameters, children, full_name
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
+from .fault_case import CARRYING
 
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 NEAR = 0.15  # rad from the pose, in which the arm need not be moved again
 CARRY_LIMIT = 60.0  # s for the nodes to start and bring the arm to a stage
-CARRYING = ("active", "ramping in", "proving signs")
 
 
 class Rig:

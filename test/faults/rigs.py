@@ -4,16 +4,12 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -23,19 +19,16 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY
 
-from ..support import CONFIG, ROOT
+from ..support import CONFIG
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .injected import injected
-from .players import BE_SOUND, EFFORTS, OPERATOR
 from .rig import CARRY_LIMIT, NEAR, Rig
 
 UPRIGHT: Parameters = {"trunk": {"pitch": 0.0, "roll": 0.0}}
 COMPENSATOR = load(CONFIG / "sim.yaml")["/right/compensator"]
 ROBOT = ArmModel(*(COMPENSATOR[name] for name in ("link_length", "robot.cog", "robot.mass")))
-STATED: Parameters = {"largest_moment": list(ROBOT.first_moment), "largest_addition": [0.0] * 4}
-PEAK = [9.0, 18.0, 9.0, 9.0]  # Nm
 
 ChangeMessage = Callable[[JointState], object]
 
@@ -43,11 +36,6 @@ ChangeMessage = Callable[[JointState], object]
 def variant(base: type[Rig], /, **attributes: Any) -> type[Rig]:
     """Return a rig with other parameters."""
     return type(f"{base.__name__} with {', '.join(attributes)}", (base,), attributes)
-
-
-def with_friction(coulomb: float, **other: Any) -> type[Rig]:
-    """Return a rig with this friction in Nm in every joint."""
-    return variant(Rig, simulator={"friction": {"coulomb": [coulomb] * 4, **other}})
 
 
 class TwoLaunchersRig(Rig):
@@ -183,89 +171,6 @@ class BothArmsRig(Rig):
         self.left.close()
 
 
-class PlayedRig(Rig):
-    """Other processes act on the arm: the players of players.py."""
-
-    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
-        super().__init__(folder, shipped_timeouts)
-        self._players: dict[str, subprocess.Popen[bytes]] = {}
-
-    def is_played(self, player: str) -> bool:
-        """Return whether a player runs."""
-        return player in self._players and self._players[player].poll() is None
-
-    def play(self, player: str) -> None:
-        """Start a player unless it runs."""
-        if not self.is_played(player):
-            self._players[player] = subprocess.Popen([sys.executable, "-m", "test.faults.players", player], cwd=ROOT)
-
-    def pid(self, node: str) -> int:
-        return self._players[node].pid if node in self._players else super().pid(node)
-
-    def end(self, player: str) -> None:
-        """End a player that runs."""
-        if process := self._players.pop(player, None):
-            process.kill()
-            process.wait()
-
-    def close(self) -> None:
-        for player in tuple(self._players):
-            self.end(player)
-        super().close()
-
-
-class HeldRig(PlayedRig):
-    """A separate process holds control of the arm."""
-
-    def bring_to(self, stage: str) -> None:
-        self.play("holder")
-        super().bring_to(stage)
-        self.probe.wait_until(lambda: self.probe.diagnostic("can_bridge", "control held by") == OPERATOR)
-
-
-class AssistedRig(PlayedRig):
-    """A separate process assists the arm by `EFFORTS`."""
-
-    without = ("imu", "simulator")
-    compensator: ClassVar[Parameters] = {**NO_IMU, "assist": {"max_effort": [1.0] * 4}}
-    simulator: ClassVar[Parameters] = UPRIGHT
-
-    def bring_to(self, stage: str) -> None:
-        """Bring the arm to `stage`, with the outer loop's efforts in full."""
-        for number in (signal.SIGCONT, BE_SOUND):
-            if self.is_played("outer_loop"):
-                os.kill(self.pid("outer_loop"), number)
-        self.play("outer_loop")
-        super().bring_to(stage)
-        self.probe.wait_until(self._is_assisted)
-
-    def _is_assisted(self) -> bool:
-        gravity = gravity_torque(ROBOT, self.probe.joint_states[-1].position)
-        effort = self.probe.effort_commands[-1].effort
-        return len(effort) == 4 and bool(np.allclose(effort, gravity + EFFORTS, atol=0.02))
-
-
-class SuccessorRig(AssistedRig):
-    """A second outer loop, which asks for nothing, waits while the first one assists the arm."""
-
-    def replace_outer_loop(self) -> float:
-        """Kill the outer loop; once its torque has gone, let the other one begin. Return when it died (wall clock)."""
-        died = time.time()
-        os.kill(self.pid("outer_loop"), signal.SIGKILL)
-        self._wait_for("waiting")
-        os.kill(self.pid("successor"), BE_SOUND)
-        self._wait_for("assisting")
-        return died
-
-    def _wait_for(self, state: str) -> None:
-        self.probe.wait_until(lambda: self.probe.diagnostic("compensator", "assist") == state)
-
-    def bring_to(self, stage: str) -> None:
-        self.end("successor")
-        self.play("successor")
-        super().bring_to(stage)
-
-
 WORN_MASS, WORN_COG = Wearer(75.0).on_links((0.05, 0.13, 0.3, 0.3))
 
 
@@ -285,23 +190,6 @@ V3Rig = variant(Rig, bridge=V3, simulator=V3)
 TwoBusRig = variant(Rig, two_buses=True)  # motors 3 and 4 are on a second bus
 TwoBusV3Rig = variant(V3Rig, two_buses=True)
 SignCheckRig = variant(Rig, bridge={"sign_check_torque": 1.5})
-ShortEnableRig = variant(SignCheckRig, bridge={"sign_check_torque": 1.5, "enable_timeout": 2.0})
-LeastFrictionRig, LowFrictionRig, HighFrictionRig = (
-    with_friction(0.01, viscous=[0.0] * 4),
-    with_friction(0.05, viscous=[0.0] * 4),
-    with_friction(0.5),
-)
+LeastFrictionRig = variant(Rig, simulator={"friction": {"coulomb": [0.01] * 4, "viscous": [0.0] * 4}})
 # In this pose the motors can hold the arm on a trunk that is bowed to any angle up to 110 degrees.
 BowRig = variant(Rig, pose=(0.0, 0.4, 1.0, 1.8))
-# The elbow's upper limit is within reach of a push, and far from the mechanical stop.
-WallRig = variant(Rig, pose=(0.0, 0.3, 0.3, 1.0), bridge={"position_max": [1.65, 3.14, 2.53, 1.2]})
-V3WearerRig = variant(WearerRig, bridge=V3, simulator={**WearerRig.simulator, **V3})
-# The same wearer with a load in the hand, for which the motors use their peak torque.
-LoadedRig = variant(
-    WearerRig, bridge={"max_effort": PEAK}, compensator={**WearerRig.compensator, "max_effort": PEAK}
-)  # fmt: skip
-# The bridge knows what the robot needs at most; this process is in the compensator's place.
-MonitoredCommandsRig = variant(CommandedRig, bridge=STATED)
-# An arm half raised, which the wearer can move in both directions; and one with a long way to be pressed down.
-WornRig = variant(TwoLaunchersRig, pose=(0.0, 0.9, 0.3, 0.6))
-RaisedRig = variant(TwoLaunchersRig, pose=(0.0, 1.5, 0.3, 0.6))

@@ -12,9 +12,11 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.power import Power
@@ -71,6 +73,15 @@ class Defect:
         for target, make in self.patches.items():
             owner, name, original = find(target)
             yield owner, name, make(original)
+
+    @contextmanager
+    def here(self) -> Iterator[None]:
+        """Have the defect in this process for a while. Raises AttributeError."""
+        with ExitStack() as stack:
+            for owner, name, replacement in tuple(self.replacements()):
+                is_new = name not in vars(owner)
+                stack.enter_context(patch.object(owner, name, replacement, create=is_new))
+            yield
 
     def inject(self) -> None:
         """Inject the defect into this process, if it is one that is to have it. Raises AttributeError."""
@@ -253,12 +264,12 @@ DEFECTS = (
     ),
     Defect(
         "the last effort of an outer loop that ended stays",
-        ("outer loop killed",),
+        ("outer loop stops",),
         {ASSIST_VALID: always(math.inf)},
     ),
     Defect(
         "the torque of an outer loop that has ended is remembered",
-        ("outer loop killed, the next one asks for 0 Nm",),
+        ("outer loop stops, the next one asks for 0 Nm",),
         {ASSIST: remembered},
     ),
     Defect(
@@ -271,7 +282,7 @@ DEFECTS = (
         ("max_effort 9 to 0.5 Nm, Zero-G, 75 kg",),
         {COMPENSATOR: after(clamped)},
     ),
-    Defect("control that is not renewed is not lost", ("who holds control killed",), {LEASE: returns("")}),
+    Defect("control that is not renewed is not lost", ("who holds control dies",), {LEASE: returns("")}),
     Defect(
         "the watchdog of silent motors never hands the bus over",
         ("motors silent for long, then the next can_bridge",),
