@@ -1,5 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""CONTRIBUTING's "Add a motor family": another distribution's entry points, and an arm with its motors is carried."""
+"""An arm carried with a motor that another distribution provides, test/support/our_lab.
+
+    PYTHONPATH=test/support/our_lab python -m test.core.test_added_motor
+
+It is a process of its own, because entry points are looked up once. Prints what came of it as JSON.
+"""
 
 from __future__ import annotations
 
@@ -11,33 +16,82 @@ from typing import Any
 
 import pytest
 
+from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.motors.families import others
+from exo_gravity.core.motors.joint_motor import motors_of
+from exo_gravity.core.params import values_of
+from exo_gravity.core.safety.drive import Efforts, State
+from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
+from exo_gravity.sim.params import SIMULATOR, device_of
+from exo_gravity.sim.virtual_arm import VirtualArm
+
 from ..support import ROOT
 
-OUR_LAB = ROOT / "test" / "support" / "our_lab"
+
+class Holding:
+    """A controller that asks for what holds a simulated device where it is."""
+
+    def __init__(self, device: Any) -> None:
+        self.arm, self.answered = device.arm, 0.0
+
+    def efforts(self, latest: float) -> Efforts:
+        held = gravity_torque(self.arm.config.links, self.arm.positions)
+        return Efforts(tuple(held), self.answered, damped=False, held=False)
+
+    def take(self, now: float, samples: Any) -> None:
+        self.answered = now
 
 
-@pytest.fixture(scope="module")
-def carried() -> dict[str, Any]:
-    """What `test/support/added_motor.py` finds with the distribution `our_lab` installed."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(OUR_LAB), os.environ.get("PYTHONPATH", "")))}
-    command = [sys.executable, "-m", "test.support.added_motor"]
+def carry(**given: Any) -> dict[str, Any]:
+    """Carry the simulated arm that these parameters describe for a second, in virtual time, and let it down."""
+    given |= {"can.interface": "virtual", "can.channel": "wire"}
+    bridge = {"rate": 100.0, "sign_check_torque": 0.0, "max_effort": [3.0, 9.0, 3.0, 3.0]}
+    values = values_of(CAN_BRIDGE, given | bridge)
+    motors, limits = motors_of(values), limits_of(values)
+    check_bridge(values["rate"], motors, limits)
+    device = device_of(values_of(SIMULATOR, given))
+    arm = VirtualArm(device, Holding(device), motors, limits, values["rate"])
+    arm.enable()
+    is_carried = arm.run_until(lambda: arm.safety.state is State.ACTIVE, 5.0)
+    is_on = [motor.entered for motor in device.motors]
+    arm.safety.disable(arm.now)
+    arm.run_until(lambda: arm.loop.is_off, 20.0)
+    arm.bus.stop()
+    return {
+        "is_carried": is_carried and not arm.safety.fault,
+        "on": is_on,
+        "off": arm.loop.is_off and not device.powered,
+        "ignored": dict(arm.bus.ignored),
+        "home_tolerance": limits.home_tolerance,
+        "peak": [motor.peak_effort for motor in motors],
+        "rotors": list(device.arm.config.rotor_inertia),
+        "most": list(limits.max_command),
+        "simulated": [type(motor).__name__ for motor in device.motors],
+    }
+
+
+def test_a_laboratory_s_own_motor_needs_no_fork_and_all_its_bounds_follow_from_its_record() -> None:
+    path = os.pathsep.join((str(ROOT / "test" / "support" / "our_lab"), os.environ.get("PYTHONPATH", "")))
+    command, environment = [sys.executable, "-m", __name__], {**os.environ, "PYTHONPATH": path}
     output = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
-    return json.loads(output)
+    assert json.loads(output) == {
+        "is_carried": True,
+        "on": [True] * 4,
+        "off": True,
+        "ignored": {},
+        # less than half a turn of the rotor at the output: 9 degrees
+        "home_tolerance": pytest.approx([0.15, 0.34, 0.15, 0.50]),
+        "peak": [50.0, 18.0, 50.0, 9.0],
+        "rotors": [4.0e-3, 4.9e-3, 4.0e-3, 8.8e-4],
+        "most": [100.0, 40.0, 100.0, 40.0],
+        "simulated": ["OurSimulatedMotor", "SimulatedMotor", "OurSimulatedMotor", "SimulatedMotor"],
+        "is_lazy": True,  # a start with our motors alone looks up no entry point
+    }
 
 
-def test_a_laboratory_s_own_motor_needs_no_fork(carried: dict[str, Any]) -> None:
-    assert (carried["state"], carried["fault"], carried["on"], carried["off"]) == ("active", None, [True] * 4, True)
-    assert not carried["ignored"]
-    assert carried["simulated"] == ["OurSimulatedMotor", "SimulatedMotor", "OurSimulatedMotor", "SimulatedMotor"]
-
-
-def test_all_bounds_follow_from_the_record_of_a_motor(carried: dict[str, Any]) -> None:
-    # Less than half a turn of the rotor at the output: 9 degrees.
-    assert carried["home_tolerance"] == pytest.approx([0.15, 0.34, 0.15, 0.50])
-    assert carried["peak"] == [50.0, 18.0, 50.0, 9.0]
-    assert carried["most"] == [100.0, 40.0, 100.0, 40.0]
-    assert carried["rotors"] == [4.0e-3, 4.9e-3, 4.0e-3, 8.8e-4]
-
-
-def test_a_start_with_our_motors_alone_looks_up_no_entry_point(carried: dict[str, Any]) -> None:
-    assert carried["is_lazy"]
+if __name__ == "__main__":
+    before = others.cache_info().misses
+    carry(motor=["AK60-6"] * 4)
+    is_lazy = others.cache_info().misses == before
+    ours = carry(motor=["OUR-1", "AK80-9", "OUR-1", "AK60-6"], wire_format=["ours", "mit", "ours", "mit_v3"])
+    print(json.dumps({**ours, "is_lazy": is_lazy}))

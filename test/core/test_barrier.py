@@ -1,19 +1,28 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The last hand on every drive: what it limits, and that no arm is thrown, by the truth of the simulated device."""
+"""The bounds of every drive: the last hand on it, the monitor of unexplained torque, and a joint that is let down."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier, Shaped
-from exo_gravity.core.safety.descent import DESCENT
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
+from exo_gravity.core.safety.descent import DESCENT, JointDescent
+from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits
+from exo_gravity.core.safety.motion_monitor import MOTION, MotionMonitor
 
+from ..support.compensator_run import ROBOT
 from ..support.safety_run import LIMITS, PERIOD, SafetyRun, reading
 
 NOTHING = (0.0,) * 4
@@ -113,15 +122,6 @@ def test_the_brake_grows_without_a_step_and_falls_slowly():
     assert brakes[len(rising) + 155] > 0.01  # 1.44 rad/s on the way down, below `driven_speed`
 
 
-def test_an_arm_that_speeds_up_fast_is_braked_before_it_is_fast():
-    slowly, suddenly = barrier(), barrier()
-    effort = (3.0,) * 4
-    for speed in (0.0, 0.4, 0.8, 1.2):
-        slow = slowly.damping(0.1, joints(velocity=speed), HEARD, effort, NOTHING, is_late=False)
-        sudden = suddenly.damping(0.002, joints(velocity=speed), HEARD, effort, NOTHING, is_late=False)
-    assert slow == NOTHING and min(sudden) > 0.3
-
-
 @pytest.mark.parametrize("rate", [50.0, 100.0, 250.0, 500.0])
 def test_the_brake_leads_a_joint_that_speeds_up_by_as_much_at_any_rate(rate):
     arm, acceleration, dt = barrier(), 10.0, 1.0 / rate  # rad/s^2, s
@@ -163,25 +163,6 @@ def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
     assert min(hot.damping) == pytest.approx(DAMPING)
 
 
-def test_torque_exceeds_neither_its_limit_nor_its_rate():
-    arm = SafetyRun().until_active()
-    arm.steps.clear()
-    arm.effort = (39.0, -39.0, 39.0, -39.0)
-    arm.cycle(1.0)
-    assert arm.drive.effort == (3.0, -9.0, 3.0, -3.0)
-    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
-    assert "max_effort (b)" in arm.machine.acted
-
-
-def test_a_hot_motor_gets_less_torque():
-    arm = SafetyRun().until_active()
-    arm.effort = (3.0, 9.0, 3.0, 3.0)
-    arm.changes[1].update(temperature=75)
-    arm.cycle(1.0)
-    assert arm.drive.effort[1] == pytest.approx(6.75)
-    assert "derating (b)" in arm.machine.acted
-
-
 @pytest.mark.parametrize("rate", [20.0, 100.0, 500.0])
 @pytest.mark.parametrize("inertia", [0.005, 0.03, 0.3])
 @pytest.mark.parametrize("speed", [0.5, 5.0])
@@ -218,3 +199,180 @@ def test_a_wall_pushes_back_before_a_joint_limit():
 def test_an_impossible_effort_is_refused_by_name():
     with pytest.raises(ParameterError, match="effort of b"):
         shaped((0.0, math.nan, 0.0, 0.0))
+
+
+def descend(joint: JointDescent, velocity: float, duration: float) -> list[float]:
+    """Let `joint` move at `velocity` rad/s; return the torques meanwhile, and before."""
+    efforts = [joint.effort]
+    for _ in range(round(duration / PERIOD)):
+        joint.step(PERIOD, velocity)
+        efforts.append(joint.effort)
+    return efforts
+
+
+DESCENTS: dict[str, tuple[tuple[float, float], list[Any]]] = {
+    # Nm carried and at most; then rad/s and s of each motion, and what its torques in Nm and damping must be
+    **{
+        f"a joint under {carried} Nm that the wearer lifts is damped and not braked": (
+            (carried, 3.0),
+            [(carried / 2.0, 3.0, lambda efforts, damping, carried=carried: (
+                efforts[-1] == 0.0 and damping == DAMPING and all(0.0 <= tau / carried <= 1.0 for tau in efforts)
+            ))],
+        )
+        for carried in (2.0, -2.0)
+    },
+    "the brake returns at once to what the joint carried, and then grows slowly to `max_effort`": (
+        (2.0, 9.0),
+        [
+            (1.0, 1.0, lambda efforts, damping: efforts[-1] == 0.0),
+            (-1.0, 0.1, lambda efforts, damping: efforts[-1] == pytest.approx(2.0, abs=0.3)),
+            (-1.0, 1.0, lambda efforts, damping: 4.0 < efforts[-1] < 5.5),
+            (-1.0, 10.0, lambda efforts, damping: max(efforts) == 9.0),
+        ],
+    ),
+    "the brake stays within `max_effort`": ((2.0, 3.0), [(-2.0, 10.0, lambda efforts, damping: max(efforts) == 3.0)]),
+    "or what the joint carried": ((5.0, 3.0), [(-2.0, 10.0, lambda efforts, damping: max(efforts) == 5.0)]),
+    "downwards, too": ((-5.0, 0.5), [(2.0, 10.0, lambda efforts, damping: min(efforts) == -5.0)]),
+    "a torque that drives its joint goes to zero without a step": (
+        (2.0, 9.0),
+        [
+            (-1.0, 3.0, lambda efforts, damping: True),
+            (0.5, 0.5, lambda efforts, damping: (
+                efforts[-1] == 0.0 and np.diff(efforts).min() >= -MAX_EFFORT_RATE * PERIOD * 1.0001
+            )),
+        ],
+    ),
+    "a joint that nothing moves loses its torque within two seconds, and then its damping": (
+        (4.0, 9.0),
+        [
+            (0.0, 2.05, lambda efforts, damping: efforts[241] == pytest.approx(2.0, abs=0.1)),
+            (0.0, 0.0, lambda efforts, damping: efforts[-1] == 0.0 < damping),
+            (0.0, 4.0, lambda efforts, damping: damping == 0.0),
+        ],
+    ),
+    "damping returns when a joint without torque moves too fast": (
+        (0.0, 3.0),
+        [
+            (0.0, 6.0, lambda efforts, damping: damping == 0.0),
+            (3.0 * DESCENT.speed, 0.25, lambda efforts, damping: damping == DAMPING and not any(efforts)),
+        ],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "motions"), DESCENTS.values(), ids=DESCENTS)
+def test_a_joint_that_is_let_down_is_braked_as_its_row_says(given, motions):
+    carried, most = given
+    joint = JointDescent(carried, 0.0, most)
+    for velocity, seconds, holds in motions:
+        efforts = descend(joint, velocity, seconds)
+        assert holds(efforts, joint.damping), (efforts[-1], joint.damping)
+    assert joint.is_down is (joint.damping == 0.0)
+
+
+@pytest.mark.parametrize("speed", [-2.2, 2.2])
+def test_what_a_motor_that_replies_again_brakes_with_drives_nothing_and_what_it_holds_at_rest_is_its_torque(speed):
+    joint = JointDescent(-0.13, 0.0, 3.0)
+    braking = -3.0 * speed  # Nm, of damping on its way to DAMPING
+    joint.resume(braking, speed)
+    assert joint.effort == pytest.approx(-0.13)
+    assert joint.effort - joint.damping * speed == pytest.approx(braking)
+    joint.resume(3.7, 0.02)
+    assert (joint.effort, joint.damping) == (3.7, 0.0)
+
+
+WATCHED = Limits(("a", "b", "c", "d"), largest_moment=ROBOT.first_moment)
+HANGING, RAISED = (0.0, 0.05, 0.05, 0.05), (0.0, 1.3, 0.2, 0.3)  # rad
+
+
+def samples(theta: Sequence[float], velocity: float = 0.0) -> tuple[JointSample, ...]:
+    return tuple(JointSample(angle, velocity, 0.0, None, None, 0.0) for angle in theta)
+
+
+def torque_of(theta: Sequence[float], load: float = 1.0) -> tuple[float, ...]:
+    return tuple(load * gravity_torque(ROBOT, theta))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt(side: str) -> None:
+    random = np.random.default_rng(0)
+    monitor = MotionMonitor(WATCHED)
+    for _ in range(100):
+        theta, tilt = random.uniform(-1.6, 2.5, 4), Tilt.of(side, *random.uniform(-1.5, 1.5, 2))
+        lighter = ArmModel.from_moments(ROBOT.length, random.uniform(0.0, 1.0, 4) * ROBOT.first_moment)
+        monitor.follow(tilt, None)
+        low, high = monitor.explained(theta)
+        torque = gravity_torque(lighter, theta, tilt.direction)
+        assert np.all(np.array(low) - 1e-3 <= torque) and np.all(torque <= np.array(high) + 1e-3)
+
+
+GRAVITY = torque_of(RAISED)
+JUDGED = {  # torque, pose, what may be added, and s until the fault at most
+    "the heaviest load": (GRAVITY, RAISED, NO_TORQUE, math.inf),
+    "no load": (NO_TORQUE, RAISED, NO_TORQUE, math.inf),
+    "three times the heaviest": (torque_of(RAISED, 3.0), RAISED, NO_TORQUE, 0.1),
+    "the wrong sign": (torque_of(RAISED, -1.0), RAISED, NO_TORQUE, 0.1),
+    "another pose": (GRAVITY, HANGING, NO_TORQUE, 0.1),
+    **{
+        f"{push} Nm more, {name}": ((GRAVITY[0], GRAVITY[1] + push, *GRAVITY[2:]), RAISED, addition, latest)
+        for push in (3.0, -6.0)
+        for name, addition, latest in (
+            ("unannounced", NO_TORQUE, 0.2),
+            ("permitted", (0.0, 3.0, 0.0, 0.0), math.inf),
+            ("permitted at other joints", (3.0, 0.0, 3.0, 3.0), 0.2),
+        )
+    },
+}
+
+
+@pytest.mark.parametrize(("torque", "theta", "addition", "latest"), JUDGED.values(), ids=JUDGED)
+def test_only_what_gravity_and_permitted_additions_explain_is_no_fault(torque, theta, addition, latest):
+    """The time until the monitor finds a fault in a constant torque."""
+    monitor = MotionMonitor(replace(WATCHED, largest_addition=addition))
+    faults = [monitor.step(PERIOD, samples(theta), torque)[1] is not None for _ in range(500)]
+    found = faults.index(True) * PERIOD if any(faults) else math.inf
+    assert found < latest or found == latest == math.inf
+
+
+def test_a_torque_may_be_as_old_as_its_ride_while_the_wearer_moves() -> None:
+    moved = samples(HANGING, 2.0)  # on from a pose of 0.18 s ago
+    old = torque_of((HANGING[0], HANGING[1] + 0.36, *HANGING[2:]))
+    for age, is_fault in ((0.0, True), (0.18, False)):
+        monitor = MotionMonitor(WATCHED)
+        faults = [monitor.step(PERIOD, moved, old, age)[1] for _ in range(200)]
+        assert any(faults) is is_fault
+
+
+def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some_seconds() -> None:
+    before, lying = Tilt.of("left"), Tilt.of("left", math.radians(80.0), math.radians(-60.0))
+    torque = gravity_torque(ROBOT, RAISED, before.direction)
+    for overtaken, fault_after in ((None, 0.0), (before, MOTION.guided)):
+        monitor, now = MotionMonitor(WATCHED), 0.0
+        monitor.follow(lying, overtaken)
+        while not monitor.step(PERIOD, samples(RAISED), torque)[1]:
+            now += PERIOD
+        assert fault_after <= now + PERIOD < fault_after + 0.2
+
+
+def test_an_impossible_torque_is_passed_on_to_the_check_that_names_it() -> None:
+    for torque in (math.nan, math.inf, 41.0):
+        assert MotionMonitor(WATCHED).step(PERIOD, samples(RAISED), (0.0, torque, 0.0, 0.0))[1] is None
+
+
+def test_unexplained_torque_is_not_passed_on() -> None:
+    passed, _ = MotionMonitor(WATCHED).step(PERIOD, samples(RAISED), torque_of(RAISED, 2.5))
+    needed = torque_of(RAISED)
+    assert needed[1] < passed[1] < 1.5 * needed[1]
+
+
+def test_an_oscillation_between_two_explained_torques_is_a_fault() -> None:
+    monitor, gravity, fault = MotionMonitor(WATCHED), torque_of(RAISED), None
+    for cycle in range(100):
+        swing = 0.5 + 0.5 * math.sin(16.0 * math.pi * cycle * PERIOD)
+        fault = fault or monitor.step(PERIOD, samples(RAISED), [swing * torque for torque in gravity])[1]
+    assert fault and fault.code is FaultCode.UNEXPLAINED_TORQUE and "hardly moved" in fault.reason
+
+
+def test_without_moments_every_torque_passes() -> None:
+    monitor = MotionMonitor(replace(WATCHED, largest_moment=(0.0,) * 4))
+    assert monitor.step(PERIOD, samples(HANGING), (3.0, 9.0, 3.0, 3.0)) == ((3.0, 9.0, 3.0, 3.0), None)

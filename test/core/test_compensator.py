@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The compensator gives no torque without fresh and finite input, and no change of settings steps the torque."""
+"""The compensator through time: tilts that are late, changes of load, the trunk's motion, a command that fades."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from exo_gravity.core import ArmModel, gravity_torque
+from exo_gravity.core import gravity_torque
+from exo_gravity.core.arm.kinematics import turning_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.guidance import GuidedChange
+from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
@@ -26,22 +27,14 @@ def test_every_answer_is_the_torque_of_the_law_from_the_first_one_on():
     np.testing.assert_allclose(run.efforts, [gravity_torque(ROBOT, THETA)] * len(run.efforts), rtol=1e-12)
 
 
-def test_without_a_fresh_tilt_there_is_a_reason_instead_of_a_torque():
+def test_without_a_fresh_tilt_by_its_stamp_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
-    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
-    assert run.cycle().effort is not None
-    assert "older than 80 ms" in run.cycle(0.1).reason
-
-
-def test_a_tilt_is_as_old_as_its_stamp():
-    run = CompensatorRun(use_imu=True)
-    for _ in range(100):
-        run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age=0.07)
-        assert run.cycle().effort is not None
-    for _ in range(20):
-        run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age=0.09)
-        answer = run.cycle()
+    for age, count in ((0.07, 100), (0.09, 20)):
+        for _ in range(count):
+            run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age)
+            answer = run.cycle()
+            assert age > 0.08 or answer.effort is not None
     assert answer.reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
 
 
@@ -75,16 +68,8 @@ def test_a_late_tilt_is_extrapolated_within_the_bound_that_it_states_and_then_wi
     assert after.held == "" and np.abs(np.subtract(after.effort, before)).max() < 50.0 * 2 * PERIOD + 1e-9
 
 
-def test_a_tilt_whose_successor_was_refused_is_not_held_on():
-    run = CompensatorRun(use_imu=True)
-    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
-    with pytest.raises(ParameterError):
-        run.compensator.tilt.set_tilt(run.now + 0.01, math.nan, 0.0)
-    assert run.cycle(0.082).effort is None
-
-
 @pytest.mark.parametrize("age", [-3600.0, -0.06, 1.01, 3600.0, math.nan, math.inf])
-def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
+def test_a_stamp_of_another_clock_is_refused_with_the_reason_and_the_tilt_before_it_is_not_held_on(age):
     run = CompensatorRun(use_imu=True)
     with pytest.raises(ParameterError, match="synchronise the clocks"):
         run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age)
@@ -92,6 +77,9 @@ def test_a_stamp_of_another_clock_is_refused_and_the_reason_names_it(age):
     assert "no trunk tilt yet (the newest was refused: age of the trunk tilt by its stamp must be from" in reason
     run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
     assert run.cycle().effort is not None
+    with pytest.raises(ParameterError):
+        run.compensator.tilt.set_tilt(run.now + 0.01, math.nan, 0.0)
+    assert run.cycle(0.082).effort is None
 
 
 @pytest.mark.parametrize(
@@ -114,13 +102,6 @@ def test_after_a_break_nothing_is_left_of_a_change():
     run.now += 0.2
     answer = run.cycle()
     assert answer.effort == pytest.approx(gravity_torque(ROBOT, THETA)) and answer.remainder == ()
-
-
-def test_zero_g_carries_the_wearers_arm_in_proportion_to_the_support():
-    run = CompensatorRun(mode="zero_g", support=0.5)
-    run.cycle(1.2)
-    arm = ROBOT.with_wearer((0.0, 0.0, 2.0, 1.6), (0.0, 0.0, 0.16, 0.17), 0.5)
-    np.testing.assert_allclose(run.efforts[-1], gravity_torque(arm, THETA), rtol=1e-12)
 
 
 def test_a_change_of_mode_reaches_the_arm_without_a_step():
@@ -186,19 +167,14 @@ def test_a_change_during_another_begins_for_each_joint_where_that_joint_is():
         assert torque == pytest.approx((pose * 1.0, pose * 3.0))
 
 
-def test_where_the_velocity_is_not_known_a_change_takes_longer():
+def test_where_the_velocity_is_not_known_a_change_takes_longer_and_settings_that_change_no_torque_begin_none():
     run = CompensatorRun(mode="zero_g")
     run.cycle(1.5)
+    run.compensator.apply(settings_with(mode="zero_g", tilt_timeout=0.1))
+    assert run.cycle().remainder == ()
     run.compensator.apply(settings_with())
     assert run.cycle(GUIDANCE.longest - 0.1, velocity=None).remainder
     assert not run.cycle(GUIDANCE.watch + 0.2, velocity=None).remainder
-
-
-def test_settings_that_change_no_torque_begin_no_change():
-    run = CompensatorRun()
-    run.cycle(1.5)
-    run.compensator.apply(settings_with(tilt_timeout=0.1, support=0.3))
-    assert run.cycle().remainder == ()
 
 
 def test_too_large_a_torque_is_clamped_and_the_joint_named():
@@ -208,40 +184,131 @@ def test_too_large_a_torque_is_clamped_and_the_joint_named():
     assert answer.clamped == (1,)
 
 
+def test_only_the_supported_share_of_the_wearer_is_carried_and_counts_as_mass():
+    run = CompensatorRun(mode="zero_g", support=0.5)
+    arm = ROBOT.with_wearer((0.0, 0.0, 2.0, 1.6), (0.0, 0.0, 0.16, 0.17), 0.5)
+    np.testing.assert_allclose(run.cycle(1.2).effort, gravity_torque(arm, THETA), rtol=1e-12)
+    heavy = settings_with(mode="zero_g", support=0.5, wearer_mass=(0.0, 0.0, 5.0, 4.0))
+    assert heavy.arm.total_mass == pytest.approx(6.354)
+
+
+FORCE = (1.0, -2.0, 11.0)  # m/s^2 upward; an upright trunk that accelerates forward, to the right and upward
+DOWN = np.array((2.0, -1.0, 11.0))  # the same as gravity in the left arm's base frame: x0 left, y0 forward, z0 down
+STILL = (0.0, 0.0, 0.0)
+
+
+def run_with(force, spin_up=STILL, seconds=1.3, **changes):
+    """Run a compensator on an upright trunk that feels `force` and turns faster by `spin_up`; samples at 100 Hz."""
+    run = CompensatorRun(**{"use_imu": True, **changes})
+    for cycle in range(round(seconds / PERIOD)):
+        if cycle % 5 == 0:
+            turning = [run.now * component for component in spin_up]
+            run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
+            if force is not None:
+                run.compensator.motion.add(run.now, force, turning)
+        run.cycle()
+    return run
+
+
+def test_the_specific_force_replaces_gravity():
+    size = np.linalg.norm(DOWN)
+    expected = gravity_torque(ROBOT, THETA, DOWN / size) * size / 9.80665
+    np.testing.assert_allclose(run_with(FORCE, inertial=True).efforts[-1], expected, rtol=1e-6)
+
+
+def test_the_arm_turns_with_a_trunk_that_turns_faster_and_faster():
+    spin_up = (1.0, 2.0, -0.5)
+    expected = gravity_torque(ROBOT, THETA) + turning_torque(ROBOT, "left", THETA, spin_up)
+    run = run_with((0.0, 0.0, 9.80665), spin_up, inertial=True)
+    np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("side", "both"),
-        ("law", "newton"),
-        ("mode", "half_g"),
-        ("support", 1.1),
-        ("wearer_mass", (0.0, 0.0, 900.0, 0.0)),
-        ("wearer_cog", (0.0, 0.0, 0.31, 0.0)),
-        ("max_effort", (1.0, 2.0, 3.0)),
-        ("max_effort_rate", math.nan),
-    ],
+    ("force", "changes"),
+    [(FORCE, {}), (FORCE, {"inertial": True, "use_imu": False}), (None, {"inertial": True})],
+    ids=["not inertial", "without an IMU", "no motion measured"],
 )
-def test_impossible_settings_are_rejected_by_name(field, value):
-    with pytest.raises(ParameterError) as caught:
-        settings_with(**{field: value})
-    assert caught.value.name.replace(".", "_") == field
+def test_without_inertial_an_imu_or_measured_motion_only_the_tilt_counts(force, changes):
+    run = run_with(force, (1.0, 2.0, 3.0), **changes)
+    np.testing.assert_allclose(run.efforts[-1], gravity_torque(ROBOT, THETA), rtol=1e-9)
 
 
-def test_too_large_a_total_mass_is_rejected_in_every_mode_and_only_the_supported_share_counts():
-    heavy = (0.0, 0.0, 5.0, 4.0)  # kg, with 1.854 kg of robot
-    for mode in ("one_g", "zero_g"):
-        with pytest.raises(ParameterError, match=r"total mass in kg = 10.85: must be at most 10 \(robot 1.85, "):
-            settings_with(mode=mode, wearer_mass=heavy)
-    assert settings_with(mode="zero_g", support=0.5, wearer_mass=heavy).arm.total_mass == pytest.approx(6.354)
+def test_switching_it_on_does_not_step_the_torque():
+    run = run_with(FORCE, inertial=False)
+    settings = settings_with(use_imu=True, inertial=True)
+    run.compensator.apply(settings)
+    before = len(run.efforts)
+    for _ in range(1200):
+        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
+        run.compensator.motion.add(run.now, FORCE, STILL)
+        run.cycle()
+    assert np.abs(np.diff(run.efforts[before - 1 :], axis=0)).max() < 0.01
+    assert np.abs(np.subtract(run.efforts[-1], run.efforts[before - 1])).max() > 0.1
 
 
-@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 25.0), (2.0, 10.01), (0.9, 25.0), (1.3, 16.0)])
-def test_gain_and_gravity_together_may_not_double_the_earths(gain, gravity):
-    with pytest.raises(ParameterError, match=r"gain times gravity = .*: must be at most 20 m/s\^2"):
-        settings_with(robot=ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, (1.0, gain, 1.0, 1.0), gravity))
+def test_with_a_tilt_that_is_too_old_there_is_no_torque_whatever_the_motion():
+    run = run_with(FORCE, inertial=True)
+    run.compensator.motion.add(run.now, FORCE, STILL)
+    run.cycle(0.1)
+    run.compensator.motion.add(run.now, FORCE, STILL)
+    assert "older than 80 ms" in run.cycle().reason
 
 
-@pytest.mark.parametrize(("gain", "gravity"), [(2.0, 9.83), (1.3, 9.81), (0.8, 25.0), (1.0, 1.62), (0.0, 25.0)])
-def test_calibrated_gains_and_other_planets_are_accepted(gain, gravity):
-    scaled = ArmModel(ROBOT.length, ROBOT.cog, ROBOT.mass, [gain] * 4, gravity)
-    assert settings_with(robot=scaled).arm.scale == pytest.approx([gain * gravity] * 4)
+EFFORT = (2.0, -4.0)
+NOTHING = (0.0, 0.0)
+
+
+def active(now: float = 10.0) -> CommandFade:
+    fade = CommandFade(0.05)
+    fade.withdraw(now, "no trunk tilt yet")
+    assert fade.tick(now) is None and fade.state == "waiting" and not fade.problem
+    assert fade.take(now, EFFORT, EFFORT, NOTHING) == EFFORT
+    assert fade.tick(now + 0.04) is None  # while efforts arrive
+    return fade
+
+
+def test_late_input_fades_the_last_effort_to_zeros_that_go_on_until_an_operator_cleared_the_fault():
+    fade = active()
+    assert fade.tick(10.06) == EFFORT
+    assert not fade.take(10.1, EFFORT, NOTHING, NOTHING) and not fade.clear()
+    assert fade.tick(11.06) == pytest.approx((1.0, -2.0))
+    assert fade.tick(12.07) == fade.tick(100.0) == NOTHING
+    assert fade.problem == "no joint_states younger than 50 ms: zero, call clear_fault"
+    assert not fade.take(100.0, EFFORT, NOTHING, NOTHING) and fade.state == "zero"
+    assert fade.clear() and fade.take(100.1, EFFORT, NOTHING, NOTHING)
+
+
+def test_withdrawn_efforts_fade_at_once_and_the_first_reason_stays():
+    fade = active()
+    fade.withdraw(10.01, "trunk tilt older than 80 ms")
+    fade.withdraw(10.5, "another")
+    assert fade.tick(11.01) == pytest.approx((1.0, -2.0))
+    assert fade.reason == "trunk tilt older than 80 ms"
+
+
+@pytest.mark.parametrize("period", [0.01, 0.3])
+def test_no_message_of_a_fade_steps_by_more_than_the_fade_itself(period):
+    fade, now = active(), 10.06
+    last = fade.tick(now)
+    while fade.state != "zero":
+        now += period
+        effort = fade.tick(now)
+        columns = zip(effort, last, EFFORT, strict=True)
+        assert all(abs(a - b) <= abs(full) * period / 2.0 + 1e-12 for a, b, full in columns)
+        last = effort
+
+
+def test_the_first_efforts_begin_from_what_a_controller_holds_since_its_last_sender_died():
+    fade, held, last = CommandFade(0.05), (3.59, -1.0), (3.59, -1.0)
+    for cycle in range(151):  # 1.5 s at 100 Hz
+        effort = fade.take(10.0 + 0.01 * cycle, EFFORT, held, NOTHING)
+        assert max(abs(a - b) for a, b in zip(effort, last, strict=True)) <= 0.01 * GUIDANCE.rate + 1e-9
+        last = effort
+    assert last == EFFORT
+
+
+def test_a_fade_in_the_first_second_begins_from_what_was_sent():
+    fade = CommandFade(0.05)
+    assert fade.take(10.0, NOTHING, (3.59, 0.0), NOTHING) == (3.59, 0.0)
+    fade.withdraw(10.01, "no trunk tilt")
+    assert fade.tick(10.01) == (3.59, 0.0) and fade.tick(12.1) == NOTHING

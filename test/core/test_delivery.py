@@ -1,5 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The torque in the replies: a motor that does not deliver is noticed, a noisy sensor is not, and a load adds up."""
+"""Does a motor deliver the torque that it gets, how loaded is it, and is it on."""
+
+from __future__ import annotations
 
 import math
 
@@ -8,7 +10,9 @@ import pytest
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, MotorLoad
+from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.gate import SwitchOnCheck
+from exo_gravity.core.safety.power import MotorPower, Power, PowerChange
 
 from ..support.safety_run import LIMITS, PERIOD
 
@@ -16,63 +20,27 @@ PEAK = (9.0, 18.0, 9.0, 9.0)
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
 
 
-class Replies:
-    """Replies of four motors to `EFFORT`, in Nm. now: s."""
-
-    def __init__(self):
-        self.monitor = DeliveryMonitor(LIMITS, PEAK)
-        self.now = 10.0
-
-    def take(self, torques):
-        """One cycle with these replied torques; return the fault."""
-        self.now += PERIOD
-        joints = [JointSample(0.5, 0.0, torque, 30, 0, self.now) for torque in torques]
-        return self.monitor.step(PERIOD, joints, EFFORT, (0.0,) * 4)
-
-    def cycles_until_fault(self, torques):
-        """Count the cycles with these torques until a fault."""
-        return next(count for count in range(1, 100) if self.take(torques))
-
-
-class OrdinaryMotors:
-    """Four motors that reply one command old, behind a current loop, with noise; frames are lost both ways.
-
-    The commands wander between -1 and 1 Nm as fast as the bridge lets them, and rest in between, mostly at zero torque:
-    there the tolerance is least. Seeds make runs repeat.
-    """
-
-    def __init__(self, rate, lag=0.008, noise=0.15, loss=0.03):
-        self.monitor = DeliveryMonitor(LIMITS, PEAK)
-        self._period, self._loss, self._noise = 1.0 / rate, loss, noise
-        self._share = 1.0 - math.exp(-self._period / lag)
-        self._random = np.random.default_rng(4)
-        self._aim, self._sent = np.zeros(4), np.zeros(4)
-        self._received, self._applied = np.zeros(4), np.zeros(4)
-        self._joints = [JointSample(0.5, 0.0, 0.0, 30, 0, 0.0)] * 4
-        self._time = 0.0
-
-    def faults(self, seconds):
-        """Count the cycles in `seconds` s in which the monitor found a fault."""
-        return sum(self._cycle() is not None for _ in range(round(seconds / self._period)))
-
-    def _cycle(self):
-        random, period = self._random, self._period
-        self._time += period
-        if random.random() < 2.0 * period:  # twice a second
-            self._aim = random.uniform(-1.0, 1.0, 4) * (random.random() < 0.3)
-        self._sent = self._sent + np.clip(self._aim - self._sent, -50.0 * period, 50.0 * period)
-        replied = self._applied + random.normal(0.0, self._noise, 4)
-        arrive, return_ = random.random((2, 4)) >= self._loss
-        for i in np.flatnonzero(arrive & return_):
-            self._joints[i] = JointSample(0.5, 0.0, float(replied[i]), 30, 0, self._time)
-        self._received = np.where(arrive, self._sent, self._received)
-        self._applied = self._applied + self._share * (self._received - self._applied)
-        return self.monitor.step(period, self._joints, self._sent.tolist(), (0.0,) * 4)
-
-
 @pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
 def test_ordinary_motors_raise_no_false_alarm(rate):
-    assert OrdinaryMotors(rate).faults(8.0) == 0
+    """Four motors reply one command old, behind a current loop, with noise; frames are lost both ways.
+
+    The commands wander between -1 and 1 Nm as fast as the bridge lets them, and rest in between, mostly at zero torque:
+    there the tolerance is least.
+    """
+    monitor, period, random = DeliveryMonitor(LIMITS, PEAK), 1.0 / rate, np.random.default_rng(4)
+    aim, sent, received, applied = np.zeros((4, 4))
+    joints = [JointSample(0.5, 0.0, 0.0, 30, 0, 0.0)] * 4
+    for cycle in range(round(8.0 * rate)):
+        if random.random() < 2.0 * period:  # twice a second
+            aim = random.uniform(-1.0, 1.0, 4) * (random.random() < 0.3)
+        sent = sent + np.clip(aim - sent, -50.0 * period, 50.0 * period)
+        replied = applied + random.normal(0.0, 0.15, 4)
+        arrive, return_ = random.random((2, 4)) >= 0.03
+        for i in np.flatnonzero(arrive & return_):
+            joints[i] = JointSample(0.5, 0.0, float(replied[i]), 30, 0, (cycle + 1) * period)
+        received = np.where(arrive, sent, received)
+        applied = applied + (1.0 - math.exp(-period / 0.008)) * (received - applied)
+        assert monitor.step(period, joints, sent.tolist(), (0.0,) * 4) is None
 
 
 @pytest.mark.parametrize("rate", [100.0, 500.0])
@@ -87,29 +55,28 @@ def test_torque_that_is_missing_is_noticed_within_30_ms_at_any_rate(rate, torque
     assert next(step for step, fault in enumerate(taken[4:], 1) if fault) * period <= 0.23
 
 
+def replied(monitor, now, torques):
+    """Return the fault that the monitor finds in replies to EFFORT."""
+    joints = [JointSample(0.5, 0.0, torque, 30, 0, now) for torque in torques]
+    return monitor.step(PERIOD, joints, EFFORT, (0.0,) * 4)
+
+
 @pytest.mark.parametrize("silence", [0.0, 0.02, 0.04])
-def test_a_motor_that_applies_nothing_is_noticed_within_60_ms_and_after_a_restart_by_its_second_reply(silence):
-    for joint in (1, 2, 3):
-        replies = Replies()
-        assert not any(replies.take(EFFORT) for _ in range(100))
-        replies.now += silence
-        count = replies.cycles_until_fault([0.0 if i == joint else asked for i, asked in enumerate(EFFORT)])
-        assert count * PERIOD <= 0.06
-        assert replies.monitor.missing == tuple(i == joint for i in range(4))
-        assert not silence or joint != 1 or count <= 2
+@pytest.mark.parametrize("joint", [1, 2, 3])
+def test_a_motor_that_applies_nothing_is_noticed_within_60_ms_and_after_a_restart_by_its_second_reply(silence, joint):
+    monitor, faults = DeliveryMonitor(LIMITS, PEAK), []
+    assert not any(replied(monitor, 10.0 + PERIOD * n, EFFORT) for n in range(100))
+    while not any(faults):
+        now = 10.0 + PERIOD * (100 + len(faults)) + silence
+        faults.append(replied(monitor, now, [0.0 if i == joint else asked for i, asked in enumerate(EFFORT)]))
+    assert len(faults) * PERIOD <= 0.06
+    assert monitor.missing == tuple(i == joint for i in range(4))
+    assert not silence or joint != 1 or len(faults) <= 2
 
 
 def test_a_motor_that_comes_back_with_its_torque_is_no_fault():
-    replies = Replies()
-    for _ in range(50):
-        assert not replies.take(EFFORT)
-        replies.now += 0.03
-
-
-def test_a_current_sensor_with_5_percent_noise_raises_no_false_alarm():
-    replies, random = Replies(), np.random.default_rng(1)
-    noise = 0.05 * np.maximum(2.0, np.abs(EFFORT))
-    assert not any(replies.take(EFFORT + noise * random.standard_normal(4)) for _ in range(10_000))
+    monitor = DeliveryMonitor(LIMITS, PEAK)
+    assert not any(replied(monitor, 10.0 + (0.03 + PERIOD) * n, EFFORT) for n in range(50))
 
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
@@ -143,14 +110,13 @@ def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
         velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2
 
 
-def sample(effort: float, velocity: float = 0.0) -> JointSample:
-    return JointSample(0.0, velocity, effort, 30, 0, 0.0)
-
-
 def load_after(seconds: float, step: float, torque: float) -> list[tuple[float, float, float]]:
     """Return power, RMS torque and share of two motors; the second never replies."""
     load = MotorLoad((3.0, 9.0))
-    return [load.update(number * step, (sample(torque), UNKNOWN)) for number in range(round(seconds / step) + 1)][-1]
+    return [
+        load.update(number * step, (JointSample(0.0, 0.0, torque, 30, 0, 0.0), UNKNOWN))
+        for number in range(round(seconds / step) + 1)
+    ][-1]
 
 
 @pytest.mark.parametrize("step", [0.1, 0.5])
@@ -167,5 +133,65 @@ def test_a_torque_above_rated_is_overload_only_when_it_lasts():
 
 
 def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
-    loads = MotorLoad((3.0, 9.0, 3.0)).update(1.0, (sample(2.0, 3.0), sample(-2.0, 3.0), UNKNOWN))
+    loads = MotorLoad((3.0, 9.0, 3.0)).update(
+        1.0, [JointSample(0.0, 3.0, effort, 30, 0, 0.0) for effort in (2.0, -2.0)] + [UNKNOWN]
+    )
     assert [power for power, *_ in loads] == [6.0, -6.0, 0.0]
+
+
+IS_ON = (PowerChange.SWITCH_ON, PowerChange.SHOWN_ON)
+TOLD = {  # changes; then whether each reply says that the motor is on, None for silence, and what must hold then
+    **{
+        f"left on, {change}": ([change], [(True, lambda power: power.state is Power.ON)])
+        for change in (PowerChange.PROBED, PowerChange.TAKEN_OVER)
+    },
+    **{
+        f"left off, {change}": (
+            [change],
+            [
+                (False, lambda power: not power.is_quiet),
+                (False, lambda power: power.is_quiet and power.state is not Power.ON),
+            ],
+        )
+        for change in (PowerChange.PROBED, PowerChange.TAKEN_OVER)
+    },
+    "one wrong reply does not make a motor count as off": (
+        IS_ON,
+        [
+            *((on, lambda power: not power.is_told_off) for on in (True, False, True, False, True, False)),
+            (False, lambda power: power.is_told_off),
+        ],
+    ),
+    "silence takes back what was told": (
+        IS_ON, [(on, lambda power: not power.is_told_off) for on in (False, None, False)],
+    ),
+}  # fmt: skip
+
+
+def tell(power: MotorPower, time: float, on: bool | None) -> None:
+    sample = JointSample(0.0, 0.0, 0.0 if on else 0.5, 30, 0, time, bool(on))  # what a motor that is off may report
+    power.step(PERIOD, sample, on is None)
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_replies_that_say_whether_a_motor_is_on_are_believed_as_the_row_says(name):
+    power = MotorPower(replies=True)
+    changes, replies = TOLD[name]
+    for change in changes:
+        power.change(change)
+    for n, (on, holds) in enumerate(replies, 1):
+        tell(power, n * PERIOD, on)
+        assert holds(power), (n, power.state)
+
+
+def test_a_motor_has_left_once_it_says_so_and_not_before() -> None:
+    power = MotorPower(replies=True)
+    for change in (*IS_ON, PowerChange.SWITCH_OFF):
+        power.change(change)
+    for n in range(20):  # it did not hear EXIT
+        assert power.send(n * PERIOD) is Send.EXIT
+        tell(power, (n + 1) * PERIOD, True)
+    assert power.state is Power.LEAVING
+    power.send(20 * PERIOD)
+    tell(power, 21 * PERIOD, False)
+    assert power.state is Power.OFF

@@ -1,8 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Who holds control of an arm: one holder at a time, with a name, for as long as they renew it."""
+"""Who holds control, and for how long; and rates of counters."""
 
 import pytest
 
+from exo_gravity.core.numbers import Rate
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 
 
@@ -21,11 +22,7 @@ def test_a_lease_lasts_as_long_as_it_is_renewed_and_is_lost_once():
     assert lease.lost(now + 1.01 * LEASE_TIME) == "anna held control and has not renewed it for 1 s"
     assert lease.holder == "" and lease.lost(now + 60.0) == ""
     assert lease.request(now + 60.0, "ben", "hold") == "ben holds control"
-
-
-def test_a_control_that_was_released_is_free():
-    lease = held()
-    assert lease.request(100.1, "anna", "release") == "anna has released control"
+    assert lease.request(now + 60.1, "ben", "release") == "ben has released control"
     assert Lease().lost(1e6) == lease.lost(1e6) == ""
 
 
@@ -53,3 +50,15 @@ def test_a_request_without_a_name_or_of_another_kind_does_nothing(name, kind):
     lease = held()
     assert lease.request(100.1, name, kind) == "control: needs a name of 1 to 64 letters and hold, take or release"
     assert lease.request(100.2, name, kind) == "" and lease.holder == "anna"
+
+
+def test_a_rate_is_averaged_over_a_second_or_more_and_restarts_with_its_counter():
+    rate = Rate()
+    assert [rate.update(now, count) for now, count in ((10.0, 0), (10.5, 250), (11.0, 500), (11.1, 540))] == [
+        0.0,
+        0.0,
+        500.0,
+        500.0,
+    ]
+    assert rate.update(12.0, 3) == 0.0
+    assert rate.update(14.0, 203) == 100.0

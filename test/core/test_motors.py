@@ -1,28 +1,36 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The frames of AK motors in every wire format, and a motor on a joint.
+"""Frames of the motors: every code survives, the scaling is the manual's, no frame has two meanings.
 
-Every code survives a round trip, the scaling is the manual's, no frame has two meanings, and any bytes or numbers give
-a value within the wire range or a clear error.
+Any bytes or numbers give a value within the wire range or a clear error. Bytes are worked out by hand from the
+documents that core/motors names, or come from public drivers.
 """
 
 from __future__ import annotations
 
+import json
 import math
 import pickle
+import re
+import struct
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.errors import FrameError, ParameterError
-from exo_gravity.core.motors.ak import MIT, MIT_V3, MOTORS, error_text, pack_reply, unpack_reply
-from exo_gravity.core.motors.families import FORMATS
+from exo_gravity.core.motors.ak import MIT, MIT_V3, error_text, pack_reply, unpack_reply
+from exo_gravity.core.motors.ak import MOTORS as AK
+from exo_gravity.core.motors.boards import CHECK, Boards
+from exo_gravity.core.motors.damiao import DAMIAO_MIT, PMAX, TIMEOUT, TMAX
+from exo_gravity.core.motors.families import FAMILIES, FORMATS, MOTORS, format_of
 from exo_gravity.core.motors.frames import (
     ALIAS,
     BROADCAST_ID,
     COMMAND,
+    ELSEWHERE,
     ENTER,
     EXIT,
     EXTENDED,
@@ -31,18 +39,19 @@ from exo_gravity.core.motors.frames import (
     REPLY,
     SERVO,
     SET_ZERO,
+    SETTING,
     MotorReply,
     is_special,
     pack_command,
     unpack_command,
 )
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, motors_of
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, JointSample, Traffic, motors_of, traffic_of
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 
 AK60 = MOTORS["AK60-6"]
 V3_AK60, V3_AK80 = MIT_V3.ranged(AK60), MIT_V3.ranged(MOTORS["AK80-9"])
-SPECS = pytest.mark.parametrize("spec", MOTORS.values(), ids=MOTORS)
+SPECS = pytest.mark.parametrize("spec", AK.values(), ids=AK)
 OF_COMMAND, OF_REPLY = ("position", "velocity", "kp", "kd", "torque"), ("position", "velocity", "torque")
 # Seven bytes FF and one of EE to FF are special on some firmware: codes by which the torque is then reduced at most.
 SPECIAL_FRAMES = [b"\xff" * 7 + bytes((last,)) for last in range(0xEE, 0x100)]
@@ -60,7 +69,7 @@ SHARES = st.floats(-1.0, 1.0) | st.sampled_from((-1.0, 0.0, 1.0))
 @st.composite
 def specs(draw):
     """A motor with its default ranges or with those of another firmware."""
-    spec = draw(st.sampled_from(list(MOTORS.values())))
+    spec = draw(st.sampled_from(list(AK.values())))
     ranges = {"velocity_range": st.floats(1.0, 100.0), "torque_range": st.floats(1.0, 100.0)}
     return draw(st.just(spec) | st.builds(partial(replace, spec), **ranges))
 
@@ -287,40 +296,6 @@ def test_a_reply_has_any_temperature_of_a_byte_and_no_angle_beyond_its_range():
             pack_reply(AK60, 1, value, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("can_id", 0), ("can_id", 127), ("direction", 0), ("zero", 11.0), ("zero", math.nan), ("torque_scale", 0.0)],
-)
-def test_an_impossible_motor_is_rejected_by_name(field, value):
-    with pytest.raises(ParameterError) as caught:
-        JointMotor(AK60, **{"can_id": 1, field: value})
-    assert caught.value.name == field
-
-
-def test_a_v1_command_and_reply_have_the_bytes_worked_out_by_hand():
-    # position 0 -> 32767.5 -> 32768, velocity 0 -> 2047.5 -> 2048, kp 0, kd 4095, torque 3 of +-15 -> 2457
-    assert pack_command(AK60, 0.0, 0.0, 0.0, 5.0, 3.0) == bytes.fromhex("8000800000fff999")
-    # motor 7, position 0xffff -> 12.5, velocity 0 -> -45, torque 2457 -> 3, 70 - 40 degC, error 2
-    data = bytes.fromhex("07 ffff 000999 46 02")
-    assert unpack_reply(AK60, data) == (7, *(pytest.approx(value) for value in (12.5, -45.0, 3.0)), 30, 2)
-
-
-def test_a_v3_command_has_the_bytes_worked_out_by_hand():
-    # kp 0, kd 4095/4095, position 0 -> 32767.5 -> 32768, velocity 0 -> 2047.5 -> 2048, torque 12 -> 4095
-    assert MIT_V3.pack_command(V3_AK60, 0.0, 0.0, 0.0, 5.0, 12.0) == bytes.fromhex("000fff8000800fff")
-    assert JointMotor(V3_AK60, 0x7E, wire_format=MIT_V3).command_id == EXTENDED | 0x87E
-
-
-def test_a_v3_status_frame_has_the_values_worked_out_by_hand():
-    # 90.0 deg, 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm, -2 A x 0.2997 Nm/A, -5 degC, error 7
-    data = bytes.fromhex("0384 0348 ff38 fb 07")
-    reply = MIT_V3.unpack_reply(V3_AK60, 3, data)
-    assert reply[:3] == (3, pytest.approx(math.pi / 2), pytest.approx(100.0 * 2.0 * math.pi / 60.0))
-    assert reply[3:] == (pytest.approx(-2.0 * 0.2997), -5, 7)
-    assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
-    assert MIT_V3.unpack_reply(V3_AK80, 3, data).velocity == pytest.approx(8400.0 / 21 / 9 * 2.0 * math.pi / 60.0)
-
-
 def test_a_v3_board_is_switched_off_by_a_current_of_0_and_obeys_every_control_mode():
     motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)
     assert motor.exit == ((EXTENDED | 0x105, bytes(4)),)
@@ -350,28 +325,6 @@ def test_each_joint_has_the_ranges_of_its_own_wire_format():
     assert [motor.spec.velocity_range for motor in motors] == [45.0, 65.0, 60.0, 45.0]
 
 
-def test_the_torque_range_of_a_v1_board_is_refused_for_a_v3_board():
-    given = {"wire_format": ["mit_v3"] * 4, "torque_range": [15.0, 0.0, 0.0, 0.0]}
-    with pytest.raises(ParameterError, match=r"torque_range = 15\.0: must be 12 or 0 for an AK60-6 with wire_format"):
-        motors_of(parameters(**given))
-    assert motors_of(parameters(**{**given, "torque_range": [9.0, 0.0, 0.0, 0.0]}))[0].spec.torque_range == 9.0
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "sentence"),
-    [
-        ("motor_timeout", 0.1, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
-        ("motor_timeout", 3.0, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
-        ("motor_timeout", math.nan, r"must be 0 \(never\) or from 0\.15 to 0\.5 s"),
-        ("position_range", 10.0, r"must be 0, the usual one of the motor, or from 12\.4 to 12\.6"),
-        ("torque_per_ampere", 0.3, "must be 0 with wire_format = mit, whose replies carry the torque itself"),
-    ],
-)
-def test_a_value_that_no_firmware_has_is_refused(name, value, sentence):
-    with pytest.raises(ParameterError, match=f"{name} = .*: {sentence}"):
-        motors_of(parameters(**{name: [0.0, value, 0.0, 0.0]}))
-
-
 def test_each_motor_has_the_time_out_and_position_range_of_its_own_firmware():
     motors = motors_of(parameters(motor_timeout=[0.0, 0.15, 0.5, 0.3], position_range=[12.56, 0.0, 12.5, 12.566]))
     assert [motor.timeout for motor in motors] == [0.0, 0.15, 0.5, 0.3]
@@ -386,3 +339,271 @@ def test_the_torque_of_a_v3_board_is_its_current_times_the_torque_per_ampere_of_
     data = bytes.fromhex("0000 0000 03e8 19 00")  # 10 A
     efforts = [motor.sample(data, 0.0).effort for motor in motors_of(parameters(**given))]
     assert efforts == pytest.approx([2.997, 10.0 * 9.0 / 10.3, 4.5, 2.997])
+
+
+PUBLIC = json.loads((Path(__file__).parents[1] / "data" / "motor_frames.json").read_text())
+DRIVERS_OWN = {"AK60-6": {"velocity_range": 50.0}}  # ranges that the public driver has otherwise
+DM4310, DM8009 = MOTORS["DM-J4310"], MOTORS["DM-J8009"]
+REPLY_IDS = {1: 0x11, 2: 0x12, 8: 0x18}
+
+
+def damiao(spec=DM4310, can_id=1, timeout=0.2, **changes):
+    return JointMotor(spec, can_id, wire_format=DAMIAO_MIT, timeout=timeout, **changes)
+
+
+@pytest.mark.parametrize("name", PUBLIC["ak"])
+def test_a_public_driver_reads_the_same_in_the_replies_of_every_ak_motor(name):
+    spec = replace(MOTORS[name], **DRIVERS_OWN.get(name, {}))
+    for data, *state, temperature, error in PUBLIC["ak"][name]:
+        reply = unpack_reply(spec, bytes.fromhex(data))
+        assert reply[1:4] == pytest.approx(state, abs=1e-6)
+        assert (reply.temperature, reply.error) == (temperature - 40, error)
+
+
+@pytest.mark.parametrize("name", PUBLIC["damiao"]["replies"])
+def test_a_public_driver_reads_the_same_in_the_replies_of_every_damiao_motor(name):
+    for data, can_id, state, *readings, mosfet, coil in PUBLIC["damiao"]["replies"][name]:
+        reply = DAMIAO_MIT.unpack_reply(MOTORS[name], can_id, bytes.fromhex(data))
+        assert reply[1:4] == pytest.approx(readings, abs=1e-6)
+        assert reply.motor_id == can_id and reply.temperature == max(mosfet, coil)
+        assert reply.error == (state if state > 1 else 0)
+        assert DAMIAO_MIT.says_on(bytes.fromhex(data)) == (state == 1)
+
+
+@pytest.mark.parametrize("name", PUBLIC["damiao"]["commands"])
+def test_a_public_driver_sends_the_same_commands_but_for_its_truncation(name):
+    for *values, expected in PUBLIC["damiao"]["commands"][name]:
+        ours, theirs = pack_command(MOTORS[name], *values), bytes.fromhex(expected)
+        for shift, bits in ((48, 16), (36, 12), (24, 12), (12, 12), (0, 12)):
+            codes = [int.from_bytes(data, "big") >> shift & (1 << bits) - 1 for data in (ours, theirs)]
+            assert codes[0] - codes[1] in (0, 1)
+
+
+# position 0 -> 32767.5 -> 32768, velocity 0 -> 2047.5 -> 2048, kp 0, kd 5 of 5 -> 4095
+COMMANDS = [
+    (MIT, AK60, 3.0, "8000800000fff999"),  # torque 3 of +-15 -> 2457
+    (MIT_V3, V3_AK60, 12.0, "000fff8000800fff"),  # kp and kd first, torque 12 of +-12 -> 4095
+    (DAMIAO_MIT, DM4310, 3.0, "8000800000fffa66"),  # torque 3 of +-10: 13 / 20 x 4095 = 2661.75 -> 2662
+]
+SPEED = 100.0 * 2.0 * math.pi / 60.0  # rad/s, of 840 x 10 electrical rpm / 14 pole pairs / gear 6 = 100 rpm
+REPLIES = [
+    # motor 7, position 0xffff -> 12.5, velocity 0 -> -45, torque 2457 -> 3, 70 - 40 degC, error 2
+    (MIT, AK60, 7, "07 ffff 000999 46 02", (12.5, -45.0, 3.0, 30, 2)),
+    # 90.0 deg, 100 rpm, -2 A x 0.2997 Nm/A, -5 degC, error 7
+    (MIT_V3, V3_AK60, 3, "0384 0348 ff38 fb 07", (math.pi / 2, SPEED, -2.0 * 0.2997, -5, 7)),
+    (MIT_V3, V3_AK80, 3, "0384 0348 ff38 fb 07", (math.pi / 2, SPEED * 14 * 6 / 21 / 9, -2.0 * 9.0 / 10.3, -5, 7)),
+    # on (1), motor 3, position 0xffff -> 12.5, velocity 0 -> -30, torque 4095 -> 10, MOSFET 40, coil 55 degC
+    (DAMIAO_MIT, DM4310, 3, "13 ffff 000fff 28 37", (12.5, -30.0, 10.0, 55, 0)),
+]
+
+
+def test_commands_and_replies_have_the_bytes_worked_out_by_hand():
+    for wire_format, spec, torque, data in COMMANDS:
+        assert wire_format.pack_command(spec, 0.0, 0.0, 0.0, 5.0, torque) == bytes.fromhex(data)
+    for wire_format, spec, can_id, data, values in REPLIES:
+        assert wire_format.unpack_reply(spec, can_id, bytes.fromhex(data)) == pytest.approx((can_id, *values))
+    assert JointMotor(V3_AK60, 0x7E, wire_format=MIT_V3).command_id == EXTENDED | 0x87E
+    assert MIT_V3.reply_id(3) == EXTENDED | 0x2903
+
+
+@pytest.mark.parametrize(("state", "on", "error"), [(0, False, 0), (1, True, 0), (0xD, False, 0), (0xE, False, 0xE)])
+def test_a_reply_says_whether_the_motor_is_on_and_a_lost_command_is_no_defect(state, on, error):
+    sample = damiao(can_id=2, direction=-1).sample(bytes((state << 4 | 2, 0x80, 0, 0x80, 0x08, 0, 30, 31)), 1.0)
+    assert (sample.on, sample.error, sample.temperature, sample.time) == (on, error, 31, 1.0)
+    assert bool(sample.trouble) == (state > 1)
+
+
+def test_a_reply_of_another_length_is_refused_with_its_bytes():
+    with pytest.raises(FrameError, match=r"frame \[01 02\]: must be a reply of 8 bytes"):
+        DAMIAO_MIT.unpack_reply(DM4310, 1, b"\x01\x02")
+
+
+STATE = bytes((0x11, 0x80, 0, 0x80, 0x08, 0, 30, 30))
+ANSWER = bytes((1, 0, 0x33, 21)) + struct.pack("<f", 12.5)
+
+
+@pytest.mark.parametrize(
+    ("frame_id", "data", "expected"),
+    [
+        (0x11, STATE, (REPLY, 1)),
+        (0x11, ANSWER, (SETTING, 1)),
+        (0x11, STATE[:7], (MALFORMED, 1)),
+        (0x21, STATE, (ELSEWHERE, 1)),
+        (0x18, bytes((0x18, *STATE[1:])), (REPLY, 8)),
+        (0x19, bytes((0x19, *STATE[1:])), (OTHER, 0)),  # another device's motor 9
+        (0x01, STATE, (COMMAND, 1)),
+        (0x101, bytes(8), (COMMAND, 1)),  # another control mode
+        (0x702, b"", (COMMAND, 2)),
+        (0x7FF, bytes((1, 0, 0x33, 21, 0, 0, 0, 0)), (OTHER, 0)),  # a question
+        (0x7FF, bytes((1, 0, 0x55, 23, 0, 0, 0, 0)), (COMMAND, 1)),  # changes what a torque means
+        (0x7FF, bytes((9, 0, 0x55, 23, 0, 0, 0, 0)), (OTHER, 0)),
+        (1 << 31 | 1, STATE, (OTHER, 0)),
+    ],
+)
+def test_a_frame_is_what_a_motor_would_take_it_for(frame_id, data, expected):
+    assert DAMIAO_MIT.classify(frame_id, data, REPLY_IDS) == expected
+
+
+def damiao_parameters(**given):
+    usual = {"motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"], "motor_timeout": [0.2] * 4}
+    return values_of(CAN_BRIDGE, {"can.interface": "socketcan", "can.channel": "can0", **usual, **given})
+
+
+def test_damiao_motors_need_no_more_than_their_names_and_time_outs():
+    motors = motors_of(damiao_parameters())
+    assert [damiao.reply_id for damiao in motors] == [0x11, 0x12, 0x13, 0x14]
+    assert [damiao.spec.torque_range for damiao in motors] == [54.0, 54.0, 28.0, 10.0]
+    assert limits_of(damiao_parameters()).home_tolerance == (0.5,) * 4  # an encoder at the output: no ambiguity
+
+
+def test_every_motor_of_a_family_can_be_had_in_each_format_that_has_ranges_for_it():
+    for family in FAMILIES.values():
+        for spec in family.motors.values():
+            assert spec.family == family.name and spec.peak_torque <= spec.torque_range
+            assert 0.0 < spec.rated_torque < spec.peak_torque and 0.0 < spec.rated_speed < spec.no_load_speed
+            assert spec.source
+    assert format_of("AK10-9", "mit_v3").ranged(MOTORS["AK10-9"]).torque_range == 54.0
+
+
+def test_an_effort_is_impossible_beyond_what_the_own_motor_could_ever_give():
+    limits = limits_of(damiao_parameters(motor=["AK80-64", "DM-J10010", "AK60-6", "DM-J8009"], can_id=[1, 2, 3, 4]))
+    assert limits.max_command == (240.0, 300.0, 40.0, 80.0)
+
+
+def told(boards, joint, number, value, now):
+    form = "<I" if number < 20 else "<f"
+    boards.told(joint, bytes((joint + 1, 0, 0x33, number)) + struct.pack(form, value), now)
+
+
+RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
+
+
+@pytest.mark.parametrize(
+    ("number", "value", "sentence"),
+    [
+        (TMAX, 28.0, r"its TMAX \(register 23\) is 28, must be 10, or torque_range 28 in the file"),
+        (PMAX, 12.566, r"its PMAX \(register 21\) is 12\.566, must be 12\.5, or position_range 12\.566 in"),
+        (10, 2, r"its CTRL_MODE \(register 10\) is 2, must be 1$"),
+        (TIMEOUT, 8000, r"its TIMEOUT \(register 9\) is 8000, must be 4000, or motor_timeout 0\.4 in the file"),
+        (7, 0x21, r"its MST_ID \(register 7\) is 33, must be 17"),
+        (22, 30.001, "^$"),  # a float, and the file's decimal
+    ],
+)
+def test_a_register_that_is_not_as_the_file_says_hinders_a_start_with_what_to_set(number, value, sentence):
+    boards = Boards([damiao()])
+    boards.take(0, JointSample(0.0, 0.0, 0.0, 30, 0, 1.0, False))
+    assert boards.hindrance(1.0, 250.0) == "motor 1 to tell its CTRL_MODE"
+    for register, right in (RIGHT | {number: value}).items():
+        told(boards, 0, register, right, 1.0)
+    assert re.search(sentence, boards.hindrance(1.0, 250.0)), boards.hindrance(1.0, 250.0)
+
+
+def test_settings_are_asked_for_one_by_one_and_again_after_a_while():
+    boards = Boards([damiao()])
+    asked = set()
+    for _ in RIGHT:
+        ((frame_id, data),) = boards.question(0, 1.0)
+        assert (frame_id, data[:3]) == (0x7FF, bytes((1, 0, 0x33)))
+        asked.add(data[3])
+        told(boards, 0, data[3], RIGHT[data[3]], 1.0)
+    assert asked == set(RIGHT) and boards.question(0, 1.0) == ()
+    assert boards.question(0, 1.0 + CHECK.ask_again)
+    boards.take(0, JointSample(0.0, 0.0, 0.0, 30, 0, 2.5, False))
+    assert boards.hindrance(2.5, 250.0).startswith("motor 1 to tell its")
+
+
+def test_a_motor_that_replies_with_another_id_is_named_with_both():
+    boards = Boards([damiao(can_id=3)])
+    boards.heard(0, ELSEWHERE, (0x23, STATE), 1.0)
+    assert boards.hindrance(1.1, 250.0) == "motor 3 replies with the ID 35: set master_id = 35, or 19 on the motor"
+
+
+def test_eight_motors_fit_on_classic_can_at_500_hz_and_on_can_fd_at_1000():
+    classic, fd = Traffic(8), Traffic(8, data_bitrate=5_000_000)
+    assert classic.load(500.0) == pytest.approx(0.97, abs=0.01)
+    assert fd.load(1000.0) == pytest.approx(0.84, abs=0.01) and fd.load(1000.0, worst=True) < 1.0
+    assert Traffic(7, data_bitrate=5_000_000).load(500.0) < 0.4
+
+
+def test_can_fd_has_its_own_bit_rate():
+    fd = {"fd": True}
+    assert traffic_of(damiao_parameters(), fd)["can0"] == Traffic(4, data_bitrate=5_000_000)
+    assert traffic_of(damiao_parameters(), fd | {"data_bitrate": 2_000_000})["can0"].data_bitrate == 2_000_000
+
+
+RATE = 400.0  # Hz of the control loop
+
+
+def boards_of(board):
+    return tuple(JointMotor(board.ranged(MOTORS["AK60-6"]), can_id, wire_format=board) for can_id in (1, 2, 3, 4))
+
+
+def sample(time, temperature=25):
+    return JointSample(0.0, 0.0, 0.0, temperature, 0, time)
+
+
+def report(boards, rates, seconds):
+    """Let each motor send `rates` (Hz) frames a second; return what hinders a start then."""
+    times = [(count / rate, joint) for joint, rate in enumerate(rates) if rate for count in range(int(seconds * rate))]
+    boards.hindrance(0.0, RATE)
+    for time, joint in sorted(times):
+        boards.take(joint, sample(time))
+    return boards.hindrance(seconds, RATE)
+
+
+ENOUGH = (500.0, 480.0, 420.0, 500.0)
+REPORTS = [  # a format, frames a second of each motor, for how many s, and what hinders a start then
+    (MIT_V3, ENOUGH, 2.0, "^$"),
+    *(
+        (MIT_V3, (500.0, 500.0, 50.0, 500.0), seconds,  # as the board's files ship it
+         "^motor 3 sends 50 status frames a second, rate = 400 needs at least that many: set 500 on its board$")
+        for seconds in (0.7, 1.0, 3.0)
+    ),
+    (MIT_V3, (500.0, 0.0, 500.0, 500.0), 1.0, "^$"),  # it may report once a second
+    (MIT_V3, (500.0, 0.0, 500.0, 500.0), 1.5, "^motor 2 sends no status frame: switch its supply"),
+    (MIT, (250.0, 0.0, 0.0, 0.0), 3.0, "^$"),  # of a V1 board that does not reply the state machine takes care
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("board", "rates", "seconds", "sentence"), REPORTS)
+def test_a_board_that_reports_too_seldom_hinders_a_start_with_what_to_set(board, rates, seconds, sentence):
+    assert re.search(sentence, report(Boards(boards_of(board)), rates, seconds))
+
+
+def test_a_malformed_reply_is_shown_until_the_motor_replies_or_falls_silent():
+    boards = Boards(boards_of(MIT))
+    boards.heard(2, MALFORMED, (3, bytes.fromhex("0380017ff8")), 1.0)
+    expected = "motor 3 sent 5 bytes [03 80 01 7f f8] as its reply: must be 6, 7 or 8 bytes"
+    assert boards.hindrance(1.5, RATE) == expected
+    assert boards.hindrance(2.1, RATE) == ""
+    boards.heard(2, MALFORMED, (3, b"\x03"), 3.0)
+    boards.take(2, sample(3.1))
+    assert boards.hindrance(3.2, RATE) == ""
+
+
+def test_a_motor_that_sends_status_frames_in_place_of_replies_is_told_what_to_set():
+    boards = Boards(boards_of(MIT))
+    boards.heard(0, SERVO, (0x2901, bytes(8)), 1.0)
+    assert boards.hindrance(1.1, RATE).startswith("motor 1 does not reply, but sends status frames: set it to MIT mode")
+
+
+@pytest.mark.parametrize(
+    ("temperatures", "odd"),
+    [
+        ((24, 25, 26, 27), ""),
+        ((-15, 25, 26, 27), "motor 1 read -15 degC when it was switched on, the others 25 to 27"),
+        ((-15, -15, -16, -14), "motor 1 read -15 degC when it was switched on, the others -16 to -14"),
+        ((25, 25, 66, 27), "motor 3 read 66 degC when it was switched on, the others 25 to 27"),
+        ((64, 70, 30, 30), ""),  # they have worked before
+        ((None, None, None, None), ""),  # of 6 bytes
+        ((None, -15, None, None), "motor 2 read -15 degC when it was switched on: a cold motor"),
+    ],
+)
+def test_a_motor_that_is_switched_on_must_read_room_temperature(temperatures, odd):
+    boards = Boards(boards_of(MIT))
+    for joint, temperature in enumerate(temperatures):
+        boards.take(joint, sample(1.0, temperature))
+        boards.take(joint, sample(1.1, 80))  # later ones do not matter
+    assert boards.odd_temperature.startswith(odd) and bool(boards.odd_temperature) is bool(odd)
+    boards.take(0, sample(9.0, -15))  # it was switched off and on
+    assert "motor 1 read -15 degC" in boards.odd_temperature

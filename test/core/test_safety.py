@@ -1,9 +1,11 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Faults of a carried arm in the safety machine, and what holds under random sequences of events."""
+"""The safety machine on one pure run: rows of what happens to an arm, and of what the machine must do then."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,115 +15,381 @@ from hypothesis import strategies as st
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
+from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
 from exo_gravity.core.safety.monitors import RIDE
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
-from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun
+from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun, reading
 from ..support.simulated_device import OFF
 
-FAULTS = [
-    (lambda arm: arm.silent.add(3), "motor_silent"),
-    (lambda arm: arm.changes[0].update(error=2), "motor_error"),
-    (lambda arm: arm.changes[0].update(temperature=81), "over_temperature"),
-    (lambda arm: arm.changes[1].update(velocity=5.2), "over_speed"),
-    (lambda arm: arm.off.add(1), "torque_not_delivered"),
-    (lambda arm: arm.changes[1].update(position=0.2), "position_jump"),
-    (lambda arm: setattr(arm, "effort_age", 0.051), "command_stale"),
-    (lambda arm: setattr(arm, "effort", None), "command_withdrawn"),
-    (lambda arm: setattr(arm, "effort", (0.0, math.nan, 0.0, 0.0)), "command_impossible"),
-    (lambda arm: setattr(arm, "effort", (0.0, 1e308, 0.0, 0.0)), "command_impossible"),
-    (lambda arm: arm.machine.trip(FaultCode.BUS_ERROR, "unplugged", arm.now), "bus_error"),
+Step = Callable[[SafetyRun], object]
+TURN = math.radians(40.0)  # of an AK80-9's rotor, at the joint
+LATE = LIMITS.command_timeout + PERIOD  # s
+
+
+def enable(arm: SafetyRun) -> None:
+    arm.machine.enable(arm.now)
+
+
+def disable(arm: SafetyRun) -> None:
+    arm.machine.disable(arm.now)
+
+
+def clear(arm: SafetyRun) -> None:
+    assert arm.machine.clear(arm.now)
+
+
+def confirm(arm: SafetyRun) -> None:
+    assert arm.machine.confirm_pose(arm.now) == ""
+
+
+def carried(arm: SafetyRun) -> None:
+    arm.until_active()
+    arm.steps.clear()
+
+
+def wait(seconds: float = PERIOD) -> Step:
+    return lambda arm: arm.cycle(seconds)
+
+
+def until(state: State, limit: float = 10.0) -> Step:
+    return lambda arm: arm.until(state, limit)
+
+
+def let(**inputs: Any) -> Step:
+    """Set inputs of the machine from now on."""
+    return lambda arm: vars(arm).update(inputs)
+
+
+def reads(joint: int, **change: Any) -> Step:
+    return lambda arm: arm.changes.__setitem__(joint, change)
+
+
+def trip(code: FaultCode, reason: str = "test", later: float = 0.0) -> Step:
+    return lambda arm: arm.machine.trip(code, reason, arm.now + later)
+
+
+def stall(seconds: float) -> Step:
+    """Let the loop stand still, and run it once."""
+
+    def go_on(arm: SafetyRun) -> None:
+        arm.now += seconds
+        arm.cycle()
+
+    return go_on
+
+
+def move(joint: int, angle: float, speed: float, is_felt: bool = True) -> Step:
+    """Move a joint from 0 to `angle` rad. is_felt: its motor's velocity says so."""
+
+    def turn(arm: SafetyRun) -> None:
+        for position in np.arange(0.0, angle, math.copysign(speed * PERIOD, angle)):
+            arm.changes[joint] = {"position": float(position), "velocity": speed * is_felt}
+            arm.cycle()
+        arm.changes[joint] = {"position": angle}
+
+    return turn
+
+
+def see(state: State | None = None, fault: str | None = None, words: str = "") -> Step:
+    """Assert the state, the fault's code ('' for none), and what the machine tells people."""
+
+    def check(arm: SafetyRun) -> None:
+        machine = arm.machine
+        assert state is None or machine.state is state
+        assert fault is None or (arm.fault_code or "") == fault
+        assert words in f"{machine.waiting_for}; {machine.fault}; {machine.why_not_resumed}; {machine.pose.text}"
+
+    return check
+
+
+def has(holds: Callable[[SafetyRun], bool]) -> Step:
+    def check(arm: SafetyRun) -> None:
+        assert holds(arm), (arm.machine.state, arm.machine.fault, arm.drive)
+
+    return check
+
+
+def never_entered(seconds: float) -> Step:
+    """Run for `seconds`, in which the second motor is never switched on."""
+    return has(lambda arm: Send.ENTER not in [arm.cycle().drive.send[1] for _ in range(round(seconds / PERIOD))])
+
+
+SMOOTH = has(lambda arm: max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001)
+ALL_OFF = has(lambda arm: arm.machine.is_off and not arm.drive.powered and arm.drive[:2] == OFF[:2])
+DISABLED_AGAIN = (disable, wait(8.0), see(State.DISABLED))
+FRESH, TOO_LATE = {"effort_age": 0.002, "held": False}, {"effort_age": LATE, "held": True}
+
+
+def let_down_by(code: FaultCode) -> tuple[Step, ...]:
+    """Let an arm down as a One-G descent leaves a shoulder that no gravity turns back."""
+    return (carried, trip(code), move(0, 0.64, 0.4), until(State.FAULT), wait(0.1), ALL_OFF)
+
+
+def late_by_turns(count: int, fresh: float, **late: Any) -> list[Step]:
+    return [let(**late), wait(0.06), let(**FRESH), wait(fresh)] * count
+
+
+RESUMABLE = [code for code in FaultCode if code.is_resumable]
+FINAL = [code for code in FaultCode if not code.is_resumable][::4]
+LIMITS_OF_ROW = {"confirm": {"start_pose": "confirm"}}
+ROWS: dict[str, Sequence[Step]] = {
+    "a new machine keeps the motors off, and torque begins slowly and without a step": [
+        wait(1.0), see(State.DISABLED), has(lambda arm: arm.drive == OFF),
+        enable, wait(1.65), see(State.RAMPING_IN), has(lambda arm: abs(arm.drive.effort[1] + 2.0) < 0.15),
+        wait(1.0), has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)), SMOOTH,
+    ],
+    "the checks require a whole second without trouble": [
+        enable, *[wait(0.9), let(silent={1}), wait(0.1), let(silent=set())] * 5, see(State.CHECKING),
+    ],
+    "efforts may be late for a moment in the checks as while the arm is carried": [
+        enable, *[let(effort_age=0.06), wait(0.02), let(effort_age=0.002), wait(0.23)] * 6,
+        has(lambda arm: arm.machine.state is not State.CHECKING),
+    ],
+    "an error in the checks is latched": [
+        reads(2, error=5), enable, wait(1.0), see(State.FAULT, "motor_error", "c:"),
+    ],
+    "heat in the checks is latched": [
+        reads(2, temperature=95), enable, wait(1.0), see(State.FAULT, "over_temperature", "c:"),
+    ],
+    "an arm away from home is refused": [
+        reads(1, position=TURN), enable, wait(1.0), see(State.FAULT, "implausible_zero", "b: 0.698 rad at the start"),
+    ],
+    "an arm that was carried once may start away from home until a supply was interrupted": [
+        carried, *DISABLED_AGAIN, move(1, 0.6, 1.0), enable, until(State.ACTIVE), *DISABLED_AGAIN,
+        let(silent={2}), wait(0.4), let(silent=set()), enable, wait(1.0), see(fault="implausible_zero"),
+    ],
+    "a jump while the arm is off has its zeros checked again": [
+        carried, *DISABLED_AGAIN, reads(1, position=TURN), wait(2 * PERIOD), enable, wait(1.0),
+        see(fault="implausible_zero"),
+    ],
+    "a motor that is found off is switched on again, once, with damping and without torque": [
+        carried, let(off={1}),
+        has(lambda arm: any(Send.ENTER in arm.cycle().drive.send for _ in range(15))),  # in 60 ms
+        has(lambda arm: arm.drive.send == (Send.COMMAND, Send.ENTER, Send.COMMAND, Send.COMMAND)),
+        see(fault="torque_not_delivered", words="b: -4.00 Nm commanded"),
+        has(lambda arm: abs(arm.drive.effort[1]) < 0.1),
+        reads(1, velocity=1.0), wait(0.3),  # it sinks
+        has(lambda arm: arm.drive.damping[1] > 3.0 and arm.drive.effort[1] < -3.0),
+        lambda arm: arm.off.add(1), never_entered(2.0),
+    ],
+    "a motor with an error is not switched on again": [
+        carried, let(off={1}), reads(1, error=5), never_entered(10.0), see(fault="motor_error"),
+    ],
+    "a start is refused in time while a motor is not off whose error is to be cleared": [
+        carried, let(silent={1}), wait(30.0), see(State.FAULT), clear, enable, wait(LIMITS.enable_timeout + 1.0),
+        see(State.DISABLED), has(lambda arm: bool(arm.machine.refusal)),
+    ],
+    "a motor that does not switch on is refused at every start": [
+        carried, *DISABLED_AGAIN, reads(3, effort=0.02), enable, wait(1.6), see(fault="torque_not_delivered"),
+        see(words="d: the motor did not switch on: 0 % of the commanded torque replied"), see(words="in servo mode"),
+    ],
+    "a motor that missed its ENTER gets another one": [
+        let(off={0, 3}), enable, wait(1.2), has(lambda arm: not arm.off), until(State.ACTIVE),
+    ],
+    "a silent motor is damped and faded, and lowered from what it applies when it replies again": [
+        carried, let(silent={1}), wait(0.5), see(State.LETTING_DOWN, "motor_silent"),
+        has(lambda arm: arm.drive.damping[1] == DAMPING and arm.drive.effort[1] == -4.0),
+        wait(5.0), has(lambda arm: arm.drive.damping[1] == DAMPING and -3.0 < arm.drive.effort[1] < -2.0),
+        wait(12.0), see(State.FAULT), has(lambda arm: arm.machine.is_unreached and arm.drive.powered),
+        has(lambda arm: arm.drive.send[1] is Send.COMMAND and arm.drive.effort == NO_TORQUE),
+        let(silent=set()), wait(0.05), see(State.LETTING_DOWN), until(State.FAULT, 20.0), wait(0.1), ALL_OFF,
+        see(fault="motor_silent"),
+    ],
+    "a motor that lost its power while silent is not pushed when it replies again": [
+        carried, let(silent={1}), wait(1.0), let(silent=set()), lambda arm: arm.applied.__setitem__(1, 0.0), wait(1.0),
+        has(lambda arm: max(map(abs, (arm.applied[1], arm.drive.effort[1]))) < 0.01),
+    ],
+    "only the operator clears a fault, and clearing enables nothing": [
+        carried, trip(FaultCode.BUS_ERROR), wait(8.0), has(lambda arm: not arm.machine.enable(arm.now)),
+        clear, wait(5.0), see(State.DISABLED), has(lambda arm: arm.machine.enable(arm.now)),
+    ],
+    "a fault with a later time than the next cycle does no harm": [
+        carried, trip(FaultCode.BUS_ERROR, later=10 * PERIOD), wait(),
+        has(lambda arm: max(arm.drive.damping) == 0.0 and arm.drive.effort == pytest.approx(EFFORT)),
+    ],
+    "the first fault stays": [
+        carried, trip(FaultCode.BUS_ERROR), trip(FaultCode.MOTOR_SILENT), wait(8.0), see(fault="bus_error"),
+    ],
+    "torque exceeds neither its limit nor its rate": [
+        carried, let(effort=(39.0, -39.0, 39.0, -39.0)), wait(1.0),
+        has(lambda arm: arm.drive.effort == (3.0, -9.0, 3.0, -3.0) and "max_effort (b)" in arm.machine.acted), SMOOTH,
+    ],
+    "a hot motor gets less torque": [
+        carried, let(effort=(3.0, 9.0, 3.0, 3.0)), reads(1, temperature=75), wait(1.0),
+        has(lambda arm: arm.drive.effort[1] == pytest.approx(6.75) and "derating (b)" in arm.machine.acted),
+    ],
+    "the motors are switched off once nothing holds the arm and it rests": [
+        carried, disable, move(2, -0.12, 0.02, is_felt=False),  # for 6 s, slower than the velocity's resolution
+        has(lambda arm: arm.drive.powered and arm.drive[:2] == OFF[:2]),
+        wait(2.1), see(State.DISABLED), wait(0.1), ALL_OFF,
+    ],
+    "late efforts are ridden through under rising damping, which falls again": [
+        carried, let(effort_age=LATE), wait(), has(lambda arm: 0.0 < min(arm.drive.damping) < 0.2),
+        wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 1),
+        has(lambda arm: min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DESCENT.damping_rise)),
+        has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)),
+        let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: max(arm.drive.damping) == 0.0),
+        has(lambda arm: max(arm.steps) <= 1e-6),
+    ],
+    **{
+        f"a ride on {name} ends": [
+            carried, let(**late), wait(RIDE.longest - PERIOD), see(State.ACTIVE),
+            wait(2 * PERIOD), see(State.LETTING_DOWN, "command_stale"),
+        ]
+        for name, late in {"a late tilt": {"held": True}, "late efforts": TOO_LATE}.items()
+    },
+    **{
+        f"who is late more often than once in ten is let down: {name}": [
+            carried, *late_by_turns(20, 0.6, **late), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 20),
+            *late_by_turns(4, 0.2, **late), see(fault="command_stale"),
+        ]
+        for name, late in {"a late tilt": {"held": True}, "late efforts": TOO_LATE}.items()
+    },
+    "after a pause of the loop itself only the age of the efforts counts": [
+        carried, let(effort_age=0.1), stall(0.1), see(State.ACTIVE),  # no motor was asked; the ride has only begun
+        let(effort_age=RIDE.longest_age + PERIOD), wait(), see(fault="command_stale"),
+    ],
+    **{
+        f"after {code} resume carries the arm from where it is": [
+            *let_down_by(code), has(lambda arm: arm.machine.resume(arm.now)), until(State.ACTIVE, 3.3), see(fault=""),
+        ]
+        for code in RESUMABLE
+    },
+    **{
+        f"resume is refused after {code}": [
+            *let_down_by(code), has(lambda arm: not arm.machine.resume(arm.now)), see(State.FAULT, code),
+            has(lambda arm, code=code: code in arm.machine.why_not_resumed),
+        ]
+        for code in FINAL
+    },
+    "resume is refused in any other state, and after a silence": [
+        has(lambda arm: not arm.machine.resume(arm.now)), carried, has(lambda arm: not arm.machine.resume(arm.now)),
+        trip(FaultCode.COMMAND_STALE), wait(), has(lambda arm: not arm.machine.resume(arm.now)), until(State.FAULT),
+        let(silent={1}), wait(0.5), let(silent=set()), wait(0.1), has(lambda arm: not arm.machine.resume(arm.now)),
+        has(lambda arm: "zeros" in arm.machine.why_not_resumed),
+    ],
+    **{
+        f"a silence of {seconds} s with a turn by {turned} keeps zeros {'trusted' if is_trusted else 'in doubt'}": [
+            *let_down_by(FaultCode.COMMAND_STALE), let(silent={1}), wait(seconds), let(silent=set()),
+            reads(1, position=turned), wait(0.1),
+            has(lambda arm, is_trusted=is_trusted: (arm.machine.why_not_resumed == "") == is_trusted),
+        ]
+        for seconds, turned, is_trusted in (
+            (0.08, 0.0, True), (0.08, TURN, False), (0.2, 0.0, True), (0.2, -TURN, False), (0.4, 0.0, False),
+        )
+    },
+    **{
+        f"the checks wait for {words}": [spoil, enable, wait(2.0), see(State.CHECKING, words=words), ALL_OFF]
+        for words, spoil in {
+            "c: no reply": let(silent={2}),
+            "at rest": reads(1, velocity=0.15),
+            "the watchdog to start": lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"),
+            "effort commands": let(effort=None),
+            "fresh effort commands": let(effort_age=0.06),
+            "c to be moved by -5.8 degrees, within its limits -46": reads(2, position=2.6),
+        }.items()
+    },
+    **{
+        f"a turn that an encoder loses while the loop stands still for {seconds} s in the proof is a fault": [
+            enable, until(State.PROVING), wait(0.05), reads(1, position=TURN), stall(seconds), wait(0.1),
+            see(fault="position_jump"), wait(0.1), ALL_OFF,
+        ]
+        for seconds in (0.004, 0.09, 0.2, 2.0)
+    },
+    **{
+        f"after {code}, which may have moved them, zeros are checked again": [
+            carried, trip(FaultCode(code)), wait(10.0), clear, reads(1, position=TURN), wait(2 * PERIOD), enable,
+            wait(1.0), see(fault="implausible_zero"),
+        ]
+        for code in ("position_jump", "motor_error", "outside_limits", "torque_not_delivered")
+    },
+    "a jump ends trust although heat wins": [
+        carried, reads(1, position=0.7, temperature=90), wait(0.02), see(State.LETTING_DOWN, "over_temperature"),
+        reads(1, position=0.7), until(State.FAULT, 20.0), clear, enable, wait(1.0), see(fault="implausible_zero"),
+    ],
+    "a jump out of the limits ends trust": [
+        carried, reads(1, position=3.3), wait(0.02), see(State.LETTING_DOWN),
+        has(lambda arm: arm.machine.clear(arm.now) or "zeros" in arm.machine.why_not_resumed),
+    ],
+    # issue 42: over_speed hid position_jump; clear and enable carried the arm 40 degrees wrong
+    "after a slip with a filtered velocity the arm is not carried again from wrong angles": [
+        carried,
+        *(
+            step
+            for n in range(25)  # the velocity follows the slip within 20 ms
+            for step in (reads(1, position=TURN, velocity=TURN / 0.02 * math.exp(-n * PERIOD / 0.02)), wait())
+        ),
+        reads(1, position=TURN), has(lambda arm: arm.fault_code in ("over_speed", "position_jump")),
+        until(State.FAULT), clear, enable, wait(1.5), see(State.FAULT, "implausible_zero"),
+    ],
+    "a hanging arm for which much torque is asked is refused at an untrusted start only": [
+        let(while_hanging=(0.0, 3.8, 0.0, 0.0)),  # of the robot alone, by an IMU that is mounted 90 degrees otherwise
+        enable, wait(3.0), see(State.FAULT, "torque_while_hanging"),
+        let(while_hanging=(0.0, 1.0, 0.0, 0.0)), clear, carried,
+    ],
+    "confirm: a restart of the motors after an emergency stop asks the operator again": [
+        enable, wait(1.0), confirm, carried, let(silent={0, 1, 2, 3}), wait(0.5), let(off={0, 1, 2, 3}, silent=set()),
+        reads(3, position=0.4),  # in the lap, off by a turn of its rotor: within the gate's tolerance
+        until(State.FAULT), clear, enable, wait(5.0), see(State.CHECKING, words="the operator to confirm the pose"),
+        see(words="d 23"),
+    ],
+    "confirm: there is nothing to confirm while the arm is disabled": [
+        has(lambda arm: arm.machine.confirm_pose(arm.now).startswith("nothing to confirm: the arm is disabled")),
+    ],
+    **{
+        f"confirm: a confirmation lapses and is asked for again when {name}": [
+            enable, wait(0.5), has(lambda arm: arm.machine.pose.asked), confirm,
+            has(lambda arm: not arm.machine.pose.asked),
+            lambda arm, hindrance=hindrance: setattr(arm.machine, "hindrance", hindrance),
+            reads(3, position=moved, velocity=0.0), wait(waited),
+            lambda arm: setattr(arm.machine, "hindrance", NO_REASON), wait(2.0),
+            see(State.CHECKING), has(lambda arm: arm.machine.pose.asked),
+        ]
+        for name, moved, waited, hindrance in (
+            ("the arm moves", 0.1, 0.02, NO_REASON),
+            ("time passes", 0.0, 11.0, Reason(Wait.WATCHDOG, "the watchdog to start")),
+        )
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_the_machine_does_what_the_row_says(name):
+    arm = SafetyRun(**LIMITS_OF_ROW.get(name.split(":")[0], {}))
+    for step in ROWS[name]:
+        step(arm)
+
+
+FAULTS: list[tuple[Step, str]] = [
+    (let(silent={3}), "motor_silent"),
+    (reads(0, error=2), "motor_error"),
+    (reads(0, temperature=81), "over_temperature"),
+    (reads(1, velocity=5.2), "over_speed"),
+    (let(off={1}), "torque_not_delivered"),
+    (reads(1, position=0.2), "position_jump"),
+    (let(effort_age=LIMITS.command_timeout + 0.001), "command_stale"),
+    (let(effort=None), "command_withdrawn"),
+    (let(effort=(0.0, math.nan, 0.0, 0.0)), "command_impossible"),
+    (let(effort=(0.0, 1e308, 0.0, 0.0)), "command_impossible"),
+    (trip(FaultCode.BUS_ERROR), "bus_error"),
 ]
 
 
 @pytest.mark.parametrize(("spoil", "code"), FAULTS, ids=[code for _, code in FAULTS])
 def test_after_a_fault_the_arm_is_let_down_gently_and_the_fault_stays_latched(spoil, code):
-    arm = SafetyRun().until_active()
-    arm.steps.clear()
-    spoil(arm)
-    arm.cycle(0.15)
-    assert arm.machine.state is State.LETTING_DOWN
-    assert arm.fault_code == code
+    arm = SafetyRun()
+    for step in (carried, spoil, wait(0.15), see(State.LETTING_DOWN, code)):
+        step(arm)
     assert arm.drive.powered
     assert all(damping > 0.0 for damping in arm.drive.damping) or code == "motor_silent"
-    arm.silent.clear()
     arm.changes = [{} for _ in range(4)]
-    arm.effort, arm.effort_age = EFFORT, 0.002
-    arm.until(State.FAULT, 20.0).until_off()
-    assert max(arm.steps) <= MAX_EFFORT_RATE * PERIOD * 1.0001
-    arm.cycle(1.0)
-    assert arm.machine.state is State.FAULT
-
-
-def test_the_motors_are_switched_off_once_nothing_holds_the_arm_and_it_rests():
-    arm = SafetyRun().until_active()
-    arm.machine.disable(arm.now)
-    for step in range(1500):  # creeps for 6 s at 0.02 rad/s, less than the velocity's resolution
-        arm.changes[2].update(position=-0.02 * PERIOD * step)
-        arm.cycle()
-        assert arm.drive.powered
-    assert arm.drive.effort == arm.drive.damping == OFF.effort
-    arm.cycle(2.1)
-    assert arm.machine.state is State.DISABLED
-    arm.until_off()
-
-
-def test_a_silent_motor_is_damped_and_faded_and_lowered_from_what_it_applies_when_it_replies_again():
-    arm = SafetyRun().until_active()
-    arm.silent.add(1)
-    arm.cycle(0.5)
-    assert arm.machine.state is State.LETTING_DOWN
-    assert arm.drive.damping[1] == DAMPING and arm.drive.effort[1] == -4.0
-    arm.cycle(5.0)
-    assert arm.drive.damping[1] == DAMPING and -3.0 < arm.drive.effort[1] < -2.0
-    arm.cycle(12.0)
-    assert arm.machine.state is State.FAULT
-    assert arm.machine.is_unreached
-    assert arm.drive.powered and arm.drive.send[1] is Send.COMMAND and arm.drive.effort == (0.0,) * 4
-    arm.silent.clear()
-    arm.cycle(0.05)
-    assert arm.machine.state is State.LETTING_DOWN
-    arm.until(State.FAULT, 20.0).until_off()
-    assert arm.fault_code == "motor_silent"
-
-
-def test_a_motor_that_lost_its_power_while_silent_is_not_pushed_when_it_replies_again():
-    arm = SafetyRun().until_active()
-    arm.silent.add(1)
-    arm.cycle(1.0)
-    arm.silent.clear()
-    arm.applied[1] = 0.0
-    arm.steps.clear()
-    arm.cycle(1.0)
-    assert max(abs(effort) for effort in (arm.applied[1], arm.drive.effort[1])) < 0.01
-
-
-def test_only_the_operator_clears_a_fault_and_clearing_enables_nothing():
-    arm = SafetyRun().until_active()
-    arm.machine.trip(FaultCode.BUS_ERROR, "unplugged", arm.now)
-    arm.cycle(8.0)
-    assert not arm.machine.enable(arm.now)
-    assert arm.machine.clear(arm.now)
-    arm.cycle(5.0)
-    assert arm.machine.state is State.DISABLED
-    assert arm.machine.enable(arm.now)
-
-
-def test_a_fault_with_a_later_time_than_the_next_cycle_does_no_harm():
-    arm = SafetyRun().until_active()
-    arm.machine.trip(FaultCode.BUS_ERROR, "late", arm.now + 10 * PERIOD)
-    arm.cycle()
-    assert max(arm.drive.damping) == 0.0
-    assert arm.drive.effort == pytest.approx(EFFORT)
-
-
-def test_the_first_fault_stays():
-    arm = SafetyRun().until_active()
-    arm.machine.trip(FaultCode.BUS_ERROR, "cause", arm.now)
-    arm.machine.trip(FaultCode.MOTOR_SILENT, "consequence", arm.now)
-    arm.cycle(8.0)
-    assert arm.fault_code == "bus_error"
+    for step in (let(silent=set(), effort=EFFORT, **FRESH), until(State.FAULT, 20.0), wait(0.1), ALL_OFF):
+        step(arm)
+    for step in (SMOOTH, wait(1.0), see(State.FAULT, code)):
+        step(arm)
 
 
 SET = {  # of an event, what its value sets
@@ -178,130 +446,118 @@ def check(arm: SafetyRun, had_fault: Fault | None) -> None:
         assert machine.fault == had_fault
 
 
-def test_late_efforts_are_ridden_through_under_rising_damping_which_falls_again():
-    arm = SafetyRun().until_active()
-    arm.steps.clear()
-    arm.effort_age = LIMITS.command_timeout + PERIOD
-    arm.cycle()
-    assert 0.0 < min(arm.drive.damping) < 0.2
-    arm.cycle(0.1)
-    assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 1
-    assert min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DESCENT.damping_rise)
-    assert arm.drive.effort == pytest.approx(EFFORT)
-    arm.effort_age = 0.002
-    arm.cycle(0.12)
-    assert arm.machine.state is State.ACTIVE and max(arm.drive.damping) == 0.0
-    assert max(arm.steps) <= 1e-6
-
-
-@pytest.mark.parametrize("age", [0.002, LIMITS.command_timeout + PERIOD], ids=["a late tilt", "late efforts"])
-def test_a_ride_ends_and_who_is_late_more_often_than_once_in_ten_is_let_down(age):
-    arm = SafetyRun().until_active()
-    arm.effort_age, arm.held = age, True
-    arm.cycle(RIDE.longest - PERIOD)
-    assert arm.machine.state is State.ACTIVE
-    arm.cycle(2 * PERIOD)
-    assert (arm.machine.state, arm.fault_code) == (State.LETTING_DOWN, "command_stale")
-
-    arm = SafetyRun().until_active()
-    for late, fresh in [(0.06, 0.6)] * 20:
-        arm.effort_age, arm.held = age, True
-        arm.cycle(late)
-        arm.effort_age, arm.held = 0.002, False
-        arm.cycle(fresh)
-    assert arm.machine.state is State.ACTIVE and arm.machine.ride.rides == 20
-    for late, fresh in [(0.06, 0.2)] * 4:
-        arm.effort_age, arm.held = age, True
-        arm.cycle(late)
-        arm.effort_age, arm.held = 0.002, False
-        arm.cycle(fresh)
-    assert arm.fault_code == "command_stale"
-
-
-def test_after_a_pause_of_the_loop_itself_only_the_age_of_the_efforts_counts():
-    arm = SafetyRun().until_active()
-    arm.now += 0.1  # the computer stood still: no motor was asked, and the ride has only begun
-    arm.effort_age = 0.1
-    arm.cycle()
-    assert arm.machine.state is State.ACTIVE
-    arm.effort_age = RIDE.longest_age + PERIOD
-    arm.cycle()
-    assert arm.fault_code == "command_stale"
-
-
-def let_down_by(code: FaultCode) -> SafetyRun:
-    arm = SafetyRun().until_active()
-    arm.machine.trip(code, "test", arm.now)
-    for step in range(400):  # as a One-G descent leaves a shoulder that no gravity turns back
-        arm.changes[0].update(position=0.4 * PERIOD * step, velocity=0.4)
-        arm.cycle()
-    arm.changes[0].update(velocity=0.0)
-    return arm.until(State.FAULT).until_off()
-
-
-@pytest.mark.parametrize("code", [code for code in FaultCode if code.is_resumable])
-def test_after_a_let_down_that_leaves_nothing_to_repair_resume_carries_the_arm_from_where_it_is(code):
-    arm = let_down_by(code)
-    assert arm.machine.resume(arm.now)
-    arm.until(State.ACTIVE, limit=3.3)
-    assert arm.machine.fault is None
-
-
-def test_resume_is_refused_after_any_other_fault_and_in_any_other_state():
-    for code in [code for code in FaultCode if not code.is_resumable][::4]:
-        arm = let_down_by(code)
-        assert not arm.machine.resume(arm.now)
-        assert (arm.machine.state, arm.fault_code) == (State.FAULT, code)
-        assert code in arm.machine.why_not_resumed
-    arm = SafetyRun()
-    assert not arm.machine.resume(arm.now)
-    arm.until_active()
-    assert not arm.machine.resume(arm.now)
-    arm.machine.trip(FaultCode.COMMAND_STALE, "test", arm.now)
-    arm.cycle()
-    assert not arm.machine.resume(arm.now)
-    arm.until(State.FAULT)
-    arm.silent.add(1)
-    arm.cycle(0.5)
-    arm.silent.clear()
-    arm.cycle(0.1)
-    assert not arm.machine.resume(arm.now) and "zeros" in arm.machine.why_not_resumed
-
-
-SILENCES = [(0.08, 0.0, True), (0.08, 0.698, False), (0.2, 0.0, True), (0.2, -0.698, False), (0.4, 0.0, False)]
-
-
-@pytest.mark.parametrize(("silence", "turned", "is_trusted"), SILENCES)
-def test_a_short_silence_keeps_zeros_trusted_unless_the_angle_has_lost_a_turn(silence, turned, is_trusted):
-    arm = let_down_by(FaultCode.COMMAND_STALE)
-    arm.silent.add(1)
-    arm.cycle(silence)
-    arm.silent.clear()
-    arm.changes[1].update(position=turned)
-    arm.cycle(0.1)
-    assert (arm.machine.why_not_resumed == "") == is_trusted
-
-
 def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_neither_steps_nor_stays():
     run = SafetyRun().until_active()
-    run.damped = True
-    run.changes[1] = {"velocity": GUIDANCE.calm}
-    run.changes[2] = {"velocity": -1.0}
-    run.changes[3] = {"velocity": 0.4}
-    steps = [run.drive.damping]
-    for step in range(100):
-        for change in run.changes[1:]:
-            change["position"] = change["velocity"] * PERIOD * step
-        steps.append(run.cycle().drive.damping)
-    assert run.drive.damping[:2] == (0.0, 0.0)
-    assert run.drive.damping[2] == pytest.approx(GUIDANCE.brake)
-    assert 0.5 < 0.4 * run.drive.damping[3] < GUIDANCE.brake
-    run.damped = False
-    for change in run.changes[1:]:
-        change["velocity"] = 0.0
-    for _ in range(100):
-        steps.append(run.cycle().drive.damping)
+    run.damped, speeds = True, (0.0, GUIDANCE.calm, -1.0, 0.4)
+    dampings = [run.drive.damping]
+    for step in range(200):
+        if step == 100:
+            assert run.drive.damping[:2] == (0.0, 0.0)
+            assert run.drive.damping[2] == pytest.approx(GUIDANCE.brake)
+            assert 0.5 < 0.4 * run.drive.damping[3] < GUIDANCE.brake
+            run.damped = False
+        moved = min(99, step) * PERIOD
+        run.changes = [{"position": v * moved, "velocity": v * run.damped} for v in speeds]
+        dampings.append(run.cycle().drive.damping)
     assert run.drive.damping == NO_TORQUE
-    largest = np.abs(np.diff(steps, axis=0)).max()
-    assert largest <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
+    assert np.abs(np.diff(dampings, axis=0)).max() <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE
+
+
+class YieldingArm(SafetyRun):
+    """An arm whose joints yield to torque: by `mobility` (4,) rad/s per Nm beyond 0.45 Nm of friction.
+
+    parallel: joints (0..) whose angles add up to the one by which the last of them is asked to lift; () for none.
+    largest_effort: Nm of each joint so far.
+    """
+
+    def __init__(self, mobility: Sequence[float], parallel: Sequence[int] = ()) -> None:
+        super().__init__(sign_check_torque=1.5)
+        self.mobility, self.parallel = mobility, parallel
+        self.position = [0.0] * 4
+        self.largest_effort = [0.0] * 4
+        self.effort = NO_TORQUE
+
+    def cycle(self, seconds: float = PERIOD) -> YieldingArm:
+        for _ in range(max(1, round(seconds / PERIOD))):
+            for i, (effort, mobility) in enumerate(zip(self.drive.effort, self.mobility, strict=True)):
+                self.largest_effort[i] = max(self.largest_effort[i], effort)
+                excess = effort - max(-0.45, min(0.45, effort))
+                self.position[i] += excess * mobility * PERIOD
+                self.changes[i] = {"position": self.position[i]}
+            if self.parallel:
+                lift = 3.6 * sum(self.position[i] for i in self.parallel)
+                self.effort = [lift if i == self.parallel[-1] else 0.0 for i in range(4)]
+            super().cycle()
+        return self
+
+    def proven(self) -> YieldingArm:
+        """Enable the machine and run it until the signs are proven or a fault is found."""
+        self.machine.enable(self.now)
+        self.cycle()
+        while self.machine.state in (State.CHECKING, State.PROVING):
+            self.cycle()
+        return self
+
+
+def test_each_joints_sign_is_checked_once_and_gently_before_the_arm_is_carried():
+    arm = YieldingArm((0.5, 0.2, 0.5, 0.5))
+    for step in (enable, wait(1.5), see(State.PROVING), until(State.ACTIVE, 16.0), SMOOTH):
+        step(arm)
+    assert all(-0.05 < position < 0.06 for position in arm.position)
+    for step in DISABLED_AGAIN:
+        step(arm)
+    arm.largest_effort = [0.0] * 4
+    arm.until_active()
+    assert arm.largest_effort == [SWITCH_ON.torque] * 4  # the check that the motors are on
+
+
+SLOWER, FASTER = (0.5, 0.2, 0.2, 0.5), (0.5, 0.2, 0.5, 0.2)  # the third joint than the fourth, which it carries
+ARMS = {  # mobility, joints with parallel axes, the fault, and how its reason begins
+    "a joint that moves backwards": ((0.5, 0.2, -0.5, 0.5), (), "wrong_sign", "c: "),
+    "a joint that does not move": ((0.5, 0.2, 0.0, 0.5), (), "sign_unproven", "c: "),
+    "of two parallel joints the one nearer to the base is slower": (SLOWER, (2, 3), None, ""),
+    "it is faster": (FASTER, (2, 3), "joints_exchanged", "c moved sooner than d, which it carries: "),
+    "no axis is parallel to that of the last joint, which gravity turns": (FASTER, (3,), None, ""),
+    "gravity turns none": (FASTER, (), None, ""),
+}
+
+
+@pytest.mark.parametrize(("mobility", "parallel", "code", "reason"), ARMS.values(), ids=ARMS)
+def test_signs_and_the_order_of_joints_are_proven_before_the_arm_is_carried(mobility, parallel, code, reason):
+    arm = YieldingArm(mobility, parallel).proven()
+    assert arm.fault_code == code
+    assert code is None or arm.machine.fault.reason.startswith(reason)
+    assert code in (None, "joints_exchanged") or arm.largest_effort[3] == 0.0
+
+
+def test_efforts_that_are_nan_while_signs_are_proven_compare_no_joints_and_are_refused_before_they_are_applied():
+    arm = YieldingArm(FASTER)
+    arm.effort = (math.nan,) * 4
+    assert arm.proven().fault_code == "command_impossible"
+    assert max(map(abs, arm.drive.effort)) < 0.1
+
+
+HANDS = {  # joint speed (rad/s) over time (s), friction (Nm), and the message to the wearer
+    "moves it before it is pushed": (lambda now: 0.5 if 0.2 < now < 0.3 else 0.0, 10.0, ""),
+    "keeps moving it": (lambda now: 1.0 if now % 0.5 > 0.25 else 0.0, 10.0, "hold still"),
+    "shakes it": (lambda now: (0.2 if now % 0.04 < 0.02 else -0.2) if now > 0.3 else 0.0, 0.3, ""),
+    "drags it up": (lambda now: 0.04 if now > 0.4 else 0.0, 10.0, ""),
+    "drags it down": (lambda now: -0.04 if now > 0.4 else 0.0, 10.0, ""),
+}
+
+
+@pytest.mark.parametrize(("hand", "friction", "told"), HANDS.values(), ids=HANDS)
+def test_a_hand_that_moves_a_joint_proves_no_sign_and_the_joint_is_not_pushed_on_and_on(hand, friction, told):
+    """The first joint alone yields at 0.2 rad/s per Nm beyond `friction`, and to the hand."""
+    check, pushes, position, now, fault = SignCheck(("a", "b", "c", "d"), (1.5, 0.0, 0.0, 0.0)), [], 0.0, 0.0, None
+    while now < 60.0 and not (fault or check.done):
+        effort = check.effort[0]
+        pushes.append(abs(effort))
+        velocity = 0.2 * (effort - max(-friction, min(friction, effort))) + hand(now)
+        position, now = position + velocity * PERIOD, now + PERIOD
+        sample = reading(position=position, velocity=velocity, effort=effort, time=now)
+        fault = check.step(PERIOD, (sample,) * 4, NO_TORQUE)
+    assert not check.done
+    assert fault is not None and fault.code in ("sign_unproven", "wrong_sign") and told in fault.reason
+    assert max(pushes) < friction

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -148,18 +147,16 @@ def test_nothing_is_raised_without_the_adaptation_or_in_one_g(change: dict[str, 
     assert not Settings("right", ROBOT).support_adapts
 
 
-def applied(change: Callable[[Arm], None]) -> Arm:
-    """Return an arm at 70 %, one step after `change`."""
+@pytest.mark.parametrize(
+    ("change", "support", "more"), [({"payload_mass": 0.5}, 0.7, 0.5), ({"support": 0.8}, 0.8, 0.0)]
+)
+def test_a_raised_support_outlives_another_change_of_the_settings(
+    change: dict[str, Any], support: float, more: float
+) -> None:
     arm = raised()
-    change(arm)
+    arm.compensator.apply(replace(SETTINGS, **change))
     arm.run(PERIOD)
-    return arm
-
-
-def test_a_raised_support_outlives_another_change_of_the_settings() -> None:
-    arm = applied(lambda arm: arm.compensator.apply(replace(SETTINGS, payload_mass=0.5)))
-    assert arm.support == 0.7 and arm.compensator.settings.arm.total_mass > ROBOT.total_mass + 0.5
-    assert applied(lambda arm: arm.compensator.apply(replace(SETTINGS, support=0.8))).support == 0.8
+    assert arm.support == support and arm.compensator.settings.arm.total_mass > ROBOT.total_mass + more
 
 
 def test_a_change_that_is_not_yet_in_use_is_not_lost_when_the_support_rises() -> None:

@@ -1,5 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Trunk tilt against SciPy's Rotation, and the signs of pitch and roll."""
+"""The tilt of the trunk: its angles, its messages, how sure it is, and the motion that the arm feels."""
+
+from __future__ import annotations
 
 import math
 
@@ -9,8 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.gravity import exact_torque, mobile_torque, static_torque
-from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk, pitch_roll, rotation_matrix
+from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.trunk.inputs import FELT, TILT, FeltMotion, TiltInput
+from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
+from exo_gravity.hardware.trunk_estimator import TUNING, VqfFusion
+from exo_gravity.lab.inputs.references import pinocchio
+
+from ..support.compensator_run import ROBOT, THETA, CompensatorRun
 
 
 def random_tilts(count=500):
@@ -29,22 +37,15 @@ def test_gravity_in_the_trunk_agrees_with_a_roll_then_a_pitch_about_fixed_axes()
 
 def test_bowing_forward_is_positive_pitch_and_leaning_to_the_right_positive_roll():
     assert gravity_in_trunk(0.3, 0.0)[0] > 0 > gravity_in_trunk(0.0, 0.3)[1]
+    for side, phi in (("left", 0.2), ("right", -0.2)):  # beta is minus the pitch, and phi the outward roll
+        tilt = Tilt.of(side, 0.1, 0.2)
+        assert (tilt.beta, tilt.phi) == (-0.1, phi)
 
 
 def test_pitch_and_roll_are_recovered_from_gravity():
     for tilt in random_tilts():
         assert pitch_roll(gravity_in_trunk(*tilt)) == pytest.approx(tuple(tilt), abs=1e-6)
-
-
-def test_gravity_straight_forward_is_a_pitch_of_90_degrees():
     assert pitch_roll((1.0, 0.0, 0.0))[0] == pytest.approx(math.pi / 2)
-
-
-@pytest.mark.parametrize("gravity", [(0, 0, 0), (math.nan, 0, 1), (math.inf, 0, 1)])
-def test_gravity_without_a_direction_is_rejected(gravity):
-    for function in (pitch_roll, lambda vector: Tilt.of_gravity("left", vector)):
-        with pytest.raises(ParameterError, match="gravity_in_trunk"):
-            function(gravity)
 
 
 def test_the_right_arms_direction_is_the_left_arms_at_the_opposite_roll():
@@ -58,32 +59,10 @@ def test_the_axis_angle_is_the_angle_between_the_trunks_vertical_and_gravity():
         assert Tilt.of("left", pitch, roll).axis_angle == pytest.approx(expected, abs=1e-7)
 
 
-@pytest.mark.parametrize(("side", "phi"), [("left", 0.2), ("right", -0.2)])
-def test_beta_is_minus_the_pitch_and_phi_is_the_outward_roll(side, phi):
-    tilt = Tilt.of(side, 0.1, 0.2)
-    assert (tilt.beta, tilt.phi) == (-0.1, phi)
-
-
-@pytest.mark.parametrize("arguments", [("middle", 0, 0), ("left", math.nan, 0), ("left", 0, 4.0), ("left", None, 0)])
-def test_an_impossible_tilt_is_rejected(arguments):
-    with pytest.raises(ParameterError):
-        Tilt.of(*arguments)
-
-
-def test_the_rotation_matrix_agrees_with_scipy():
+def test_the_rotation_matrix_agrees_with_scipy_also_for_a_rounded_quaternion():
     for turn in Rotation.random(200, random_state=4):
         assert rotation_matrix(turn.as_quat()) == pytest.approx(turn.as_matrix(), abs=1e-12)
-
-
-def test_a_quaternion_rounded_by_a_driver_is_normalised():
-    quaternion = Rotation.from_euler("x", 0.4).as_quat()
-    assert rotation_matrix(1.005 * quaternion) == pytest.approx(rotation_matrix(quaternion), abs=1e-12)
-
-
-@pytest.mark.parametrize("quaternion", [(0, 0, 0, 0), (0, 0, 0, 1.1), (math.nan, 0, 0, 1), (0, 0, 1), (1, 1, 1, 1)])
-def test_a_quaternion_that_is_not_a_unit_one_is_rejected_by_name(quaternion):
-    with pytest.raises(ParameterError, match="rotation_trunk_from_imu"):
-        rotation_matrix(quaternion, "rotation_trunk_from_imu")
+        assert rotation_matrix(1.005 * turn.as_quat()) == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -100,3 +79,313 @@ def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity():
     for law in (exact_torque, static_torque, mobile_torque):
         felt = law(arm, theta, tilt._replace(magnitude=1.5))
         np.testing.assert_allclose(felt, 1.5 * np.array(law(arm, theta, tilt)))
+
+
+UPRIGHT = (0.0, 0.0, -1.0)
+BASE_FROM_TRUNK = {
+    "left": np.array(((0, 1, 0), (1, 0, 0), (0, 0, -1))),
+    "right": np.array(((0, -1, 0), (1, 0, 0), (0, 0, -1))),
+}
+TIMEOUT = 0.08
+
+
+def great_circles(count=4):
+    """Gravity in the trunk's axes, (n, 3), on turns by 360 degrees about `count` axes, in steps of 0.5 degrees."""
+    angles = np.radians(np.arange(0.0, 360.0, 0.5))
+    for heading in np.arange(count) * math.pi / count:
+        axis = np.array((math.cos(heading), math.sin(heading), 0.0))
+        yield Rotation.from_rotvec(angles[:, None] * axis).apply(UPRIGHT)
+
+
+@pytest.mark.parametrize(("side", "by_angles"), [("left", False), ("right", False), ("left", True)])
+def test_bowed_beyond_90_degrees_lying_and_upside_down_the_torque_is_pinocchios_and_never_steps(side, by_angles):
+    reference = pinocchio(ROBOT)
+    for circle in great_circles():
+        run = CompensatorRun(side=side, use_imu=True)
+        efforts = []
+        for gravity in (*[circle[0]] * 600, *circle):  # past the ramp
+            run.now += 0.01  # the trunk turns as people turn
+            if by_angles:
+                run.compensator.tilt.set_tilt(run.now, *pitch_roll(gravity))
+            else:
+                run.compensator.tilt.set_gravity(run.now, gravity)
+            efforts.append(run.cycle().effort)
+        efforts = efforts[600:]
+        directions = circle @ BASE_FROM_TRUNK[side].T
+        expected = reference(np.tile(THETA, (len(circle), 1)), directions)
+        np.testing.assert_allclose(efforts, expected, atol=1e-9)
+        assert np.abs(np.diff(efforts, axis=0)).max() < 0.1  # Nm; 0.5 degrees of at most 5 Nm are 0.04
+
+
+def turning(axis, speed, age):
+    """A tilt measured `age` s ago on a trunk that turns about `axis`, and gravity's true direction now."""
+    rate = speed * np.array(axis) / np.linalg.norm(axis)
+    then = Rotation.from_euler("xyz", (0.2, -0.5, 0.9))
+    now = then * Rotation.from_rotvec(rate * age)
+    before, after = (turn.inv().apply(UPRIGHT) for turn in (then, now))
+    tilt = TiltInput("left", TIMEOUT)
+    tilt.set_gravity(9.0, before)  # a first one: it bounds how far the next may be
+    tilt.set_gravity(10.0, before, rate, age)
+    return tilt, BASE_FROM_TRUNK["left"] @ before, BASE_FROM_TRUNK["left"] @ after
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (1, 1, 1)])
+def test_a_tilt_is_extrapolated_by_the_gyroscope_over_its_age(axis):
+    tilt, before, after = turning(axis, speed=1.5, age=0.03)
+    assert math.degrees(angle_between(before, after)) > 1.0
+    assert math.degrees(angle_between(tilt.at(10.0).direction, after)) < 0.1
+
+
+def test_between_two_messages_it_is_extrapolated_for_as_long_as_it_may_be_held_and_no_faster_than_a_trunk_tilts():
+    tilt, before, _ = turning((0, 1, 0), speed=1.0, age=0.0)
+    angles = [angle_between(before, tilt.at(10.0 + later).direction) for later in (0.02, 0.04, TILT.hold, 1.0)]
+    assert angles[1] == pytest.approx(2 * angles[0], rel=0.01)
+    assert angles[3] == pytest.approx(angles[2], abs=1e-9)
+    tilt, before, _ = turning((0, 1, 0), speed=30.0, age=0.0)
+    assert angle_between(before, tilt.at(10.01).direction) <= 1.001 * TILT.speed * 0.01
+
+
+def test_pitch_and_roll_are_used_only_while_no_vector_arrives():
+    tilt = TiltInput("left", TIMEOUT)
+    tilt.set_tilt(10.0, 0.1, 0.0)
+    assert tilt.at(10.0).pitch == pytest.approx(0.1)
+    tilt.set_gravity(10.01, UPRIGHT)
+    tilt.set_tilt(10.02, 0.1, 0.0)
+    assert tilt.at(10.02).pitch == 0.0
+    tilt.set_tilt(10.02 + TIMEOUT, 0.1, 0.0)
+    assert tilt.at(10.02 + TIMEOUT).pitch == pytest.approx(0.1)
+
+
+def test_a_refused_vector_is_not_replaced_by_pitch_and_roll():
+    tilt = TiltInput("left", TIMEOUT)
+    for k in range(10):
+        with pytest.raises(ParameterError):
+            tilt.set_gravity(10.0 + 0.01 * k, (0.0, 0.0, 0.0))
+        tilt.set_tilt(10.0 + 0.01 * k, 0.1, 0.0)
+    assert tilt.problem(10.1).startswith("no trunk tilt yet (the newest was refused: gravity_in_trunk must be")
+
+
+REFUSED = {
+    "a vector with a NaN": ((math.nan, 0.0, -1.0), (0.0, 0.0, 0.0), 0.0),
+    "a NaN rate": (UPRIGHT, (0.0, math.nan, 0.0), 0.0),
+    "a jump": ((0.5, 0.0, -1.0), (0.0, 0.0, 0.0), 0.0),
+    "another clock": (UPRIGHT, (0.0, 0.0, 0.0), 5.0),
+}
+
+
+@pytest.mark.parametrize("values", REFUSED.values(), ids=REFUSED)
+def test_an_impossible_vector_is_refused_and_the_last_tilt_stays(values):
+    tilt = TiltInput("left", TIMEOUT)
+    tilt.set_gravity(10.0, UPRIGHT)
+    before = tilt.at(10.01)
+    with pytest.raises(ParameterError):
+        tilt.set_gravity(10.01, *values)
+    assert tilt.at(10.01) == before and tilt.problem(10.01) == ""
+
+
+def test_a_clock_that_gains_half_a_second_in_a_quarter_of_an_hour_is_followed_and_a_lag_is_still_seen():
+    tilt, gain = TiltInput("right", TIMEOUT), 0.0006
+    for now in np.arange(0.0, 900.0, 0.05):
+        tilt.set_gravity(now, UPRIGHT, age=-gain * now)
+        assert tilt.age(now) == pytest.approx(0.0, abs=1e-3)
+    for now in np.arange(900.0, 901.0, 0.01):
+        tilt.set_gravity(now, UPRIGHT, age=0.2 - gain * now)
+        assert tilt.age(now) == pytest.approx(0.2, abs=5e-3)
+        assert "by its stamp" in tilt.problem(now)
+    with pytest.raises(ParameterError, match="synchronise the clocks"):
+        tilt.set_gravity(901.0, UPRIGHT, age=-gain * 901.0 - 0.06)
+
+
+def test_a_tilt_that_creeps_in_small_jumps_faster_than_a_trunk_is_refused():
+    tilt, period = TiltInput("left", TIMEOUT), 0.004
+    turned = Rotation.from_euler("y", np.arange(0.0, 3.1, 15.0 * period)[:, None]).inv().apply(UPRIGHT)
+    with pytest.raises(ParameterError, match="of the last ones"):
+        for n, gravity in enumerate(turned):
+            tilt.set_gravity(10.0 + n * period, gravity)
+    assert angle_between(tilt.at(10.0).direction, BASE_FROM_TRUNK["left"] @ UPRIGHT) < 0.2
+
+
+def test_noise_and_a_quick_bow_are_accepted():
+    tilt, random = TiltInput("left", TIMEOUT), np.random.default_rng(1)
+    for now in np.arange(0.0, 1.0, 0.002):
+        bowed = 0.8 * (1.0 - math.cos(math.pi * now))  # 92 degrees in a second, 2.5 rad/s at most
+        noise = random.normal(0.0, 0.02, 2)
+        tilt.set_tilt(now, bowed + noise[0], noise[1])
+    assert tilt.problem(1.0) == ""
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_tilt_faster_than_people_turn_overtakes_one_that_is_not_for_as_long_as_that_takes(side):
+    tilt, overtaken = TiltInput(side, TIMEOUT), []
+    for k in range(200):
+        angle = min(0.6, 1.5 * TILT.usual * 0.01 * k)
+        tilt.set_gravity(10.0 + 0.01 * k, (0.0, -math.sin(angle), -math.cos(angle)))
+        overtaken.append(tilt.overtaken.roll if tilt.overtaken else None)
+    behind = [k for k, roll in enumerate(overtaken) if roll is not None]
+    expected = 2.0 * TILT.sudden / TILT.usual, (0.6 - TILT.sudden) / TILT.usual  # s
+    assert 0.01 * np.array((behind[0], behind[-1])) == pytest.approx(expected, abs=0.021)
+    assert [overtaken[k] for k in behind] == pytest.approx([TILT.usual * 0.01 * k for k in behind], abs=0.01)
+
+
+G = 9.80665
+RANGE = 34.9  # rad/s
+STILL = (0.0, 0.0, 0.0)
+
+
+def settled(acceleration=0.0, seconds=12.0):
+    """An uncertainty after `seconds` at 100 Hz, while the rate changes by `acceleration` rad/s^2."""
+    uncertainty = TiltUncertainty(0.01)
+    for _ in range(round(50 * seconds)):
+        go_on(uncertainty, acceleration)
+    return uncertainty
+
+
+def go_on(uncertainty, acceleration=0.0, square=0.0):
+    uncertainty.advance(0.02, 2, acceleration, 0.0, square, 0.0)
+
+
+def added(uncertainty):
+    """The standard deviation in rad beyond that of an estimate that has lost nothing."""
+    return math.sqrt(uncertainty.sigma**2 - MODEL.fused**2)
+
+
+SATURATED = TUNING.overshoot * RANGE  # rad/s
+LOST = {  # the rate's change before in rad/s^2; what was not measured; what it adds in rad, and its tolerance
+    "three saturated samples": (0.0, [(0.001, 0.0, SATURATED, 0.0)] * 3, 3 * SATURATED * 0.001, 0.01),
+    **{
+        f"a gap of {gap} s, at {before:g} rad/s^2": (
+            before, [(gap, 0.0, 0.0, 0.0)], assumed * gap**2 * share, 0.05,
+        )
+        for before, assumed in ((0.0, 20.0), (100.0, 100.0))
+        for gap, share in ((0.05, 1 / 6), (0.02, 1 / 15))
+    },
+    "repeated samples": (100.0, [(0.01, 0.0, 0.0, 0.01 * k) for k in (1, 2, 3)], 0.5 * 100.0 * 0.03**2, 0.1),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("before", "lost", "adds", "tolerance"), LOST.values(), ids=LOST)
+def test_what_is_not_measured_adds_to_the_uncertainty(before, lost, adds, tolerance):
+    uncertainty = settled(before)
+    assert before or uncertainty.sigma == pytest.approx(MODEL.fused)  # an estimate that has lost nothing
+    for part in lost:
+        uncertainty.add_unmeasured(*part)
+    assert added(uncertainty) == pytest.approx(adds, rel=tolerance)
+
+
+def test_what_was_lost_decays_and_too_much_makes_the_estimate_begin_anew():
+    uncertainty = settled()
+    assert not uncertainty.add_unmeasured(0.002, 0.0, TUNING.overshoot * RANGE, 0.0)
+    before = added(uncertainty)
+    uncertainty.add_unmeasured(0.01, 0.0, 0.0, 0.0)  # a good sample ends the run
+    for _ in range(round(50 * MODEL.decay_time)):
+        go_on(uncertainty)
+    assert added(uncertainty) == pytest.approx(before / math.e, rel=0.02)
+    assert uncertainty.add_unmeasured(0.004, 0.0, TUNING.overshoot * RANGE, 0.0)
+    assert added(uncertainty) > 0.03 and uncertainty.sigma > MODEL.limit
+
+
+def test_a_start_in_motion_takes_longer_and_an_unknown_bias_and_a_contradiction_widen_it():
+    still, moving = TiltUncertainty(0.01), TiltUncertainty(0.01)
+    for _ in range(60):
+        go_on(still, square=4e-6)
+        go_on(moving, square=0.5)
+    assert still.sigma < MODEL.limit < moving.sigma
+    still.advance(0.02, 2, 0.0, 0.02, 0.0, 0.0)
+    assert still.sigma > MODEL.limit
+    still.advance(0.02, 2, 0.0, 0.0, 0.0, math.radians(3.5))
+    assert still.sigma > MODEL.limit
+
+
+def turned(samples):
+    """The angle in rad about z after (dt, rate about z) for each sample."""
+    orientation, last = VqfFusion(0.01), STILL
+    for dt, rate in samples:
+        now = (0.0, 0.0, rate)
+        _, _, z, w = orientation.advance(dt, now, last, (0.0, 0.0, G))
+        last = now
+    return 2.0 * math.atan2(z, w)
+
+
+def test_over_a_gap_the_rates_between_are_interpolated():
+    ramp = [(0.01, 0.02 * k) for k in range(1, 41)]
+    whole = turned(ramp)
+    with_gap = turned([*ramp[:19], (0.04, ramp[22][1]), *ramp[23:]])
+    assert whole > 0.15 and with_gap == pytest.approx(whole, abs=1e-4)
+
+
+def test_a_restart_keeps_the_bias():
+    orientation = VqfFusion(0.01)
+    random = np.random.default_rng(4)
+    for _ in range(1000):
+        x, y, z = random.normal(0.0, 1e-3, 3)
+        orientation.advance(0.01, (0.02 + x, y, z), (0.02, 0.0, 0.0), (x, y, G))
+    orientation.restart()
+    for _ in range(30):
+        orientation.advance(0.01, (0.02, 0.0, 0.0), (0.02, 0.0, 0.0), (0.0, 0.0, G))
+    assert orientation.bias[0] == pytest.approx(0.02, abs=2e-3)
+
+
+G = 9.80665
+STILL = (0.0, 0.0, 0.0)
+
+
+def following(force, spin, until=1.0, period=0.01):
+    """A follower of the vectors force(t) and spin(t), sampled until `until`."""
+    felt = FeltMotion()
+    for t in np.arange(0.0, until + period / 2, period):
+        felt.add(t, force(t), spin(t))
+    return felt
+
+
+def shaken(t, frequency=1.9):
+    return 0.0, 0.0, G + 2.0 * math.cos(2 * math.pi * frequency * t)
+
+
+def test_an_arm_on_a_trunk_at_rest_feels_gravity():
+    motion = following(lambda t: (0.0, 0.0, G), lambda t: STILL)
+    motion.add(0.5, (5.0, 5.0, 5.0), STILL)  # a sample that is late is ignored
+    felt = motion.at(1.004)
+    np.testing.assert_allclose(felt.gravity, (0.0, 0.0, -G), atol=1e-9)
+    np.testing.assert_allclose(felt.angular_acceleration, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("age", [0.0, 0.004, 0.01])
+@pytest.mark.parametrize(
+    ("frequency", "rate", "most"),  # Hz, of the shake and of its samples, and m/s^2 of error
+    [(1.9, 100.0, 0.06), (3.8, 100.0, 0.3), *((1.9, rate, 0.1) for rate in (40.0, 50.0, 250.0, 1000.0))],
+)
+def test_a_shake_is_felt_as_it_will_be_when_the_motors_answer(age, frequency, rate, most):
+    felt = following(lambda t: shaken(t, frequency), lambda t: STILL, period=1.0 / rate).at(1.0 + age)
+    assert felt.gravity[2] == pytest.approx(-shaken(1.0 + age + FELT.effect, frequency)[2], abs=most)
+
+
+def test_the_angular_acceleration_is_that_of_the_sway_when_the_motors_answer():
+    w, sway = 2 * math.pi * 0.95, 0.2
+    felt = following(shaken, lambda t: (sway * math.sin(w * t), 0.0, 0.0)).at(1.004)
+    assert felt.angular_acceleration[0] == pytest.approx(sway * w * math.cos(w * (1.004 + FELT.effect)), rel=0.05)
+
+
+def test_too_few_or_too_old_samples_and_a_gap_give_no_motion():
+    assert FeltMotion().at(0.0) is None
+    assert following(shaken, lambda t: STILL, until=0.02).at(0.02) is None
+    felt = following(shaken, lambda t: STILL)
+    assert felt.at(1.1) is None
+    felt.add(1.3, shaken(1.3), STILL)
+    assert felt.at(1.3) is None
+
+
+@pytest.mark.parametrize("force", [0.1, 8.0 * G])
+def test_free_fall_and_blows_are_felt_only_within_a_range(force):
+    felt = following(lambda t: (0.0, 0.0, force), lambda t: STILL).at(1.0)
+    low, high = FELT.range
+    assert low - 1e-9 <= np.linalg.norm(felt.gravity) <= high + 1e-9
+
+
+def test_the_shoulder_of_a_trunk_that_turns_accelerates_other_than_the_imu():
+    w, sway, lever = 2 * math.pi * 0.95, 0.3, (0.0, -0.2, 0.1)
+    felt = following(lambda t: (0.0, 0.0, G), lambda t: (sway * math.sin(w * t), 0.0, 0.0)).at(1.0, lever)
+    phase = w * (1.0 + FELT.effect)
+    turning, spin_up = np.array((sway * math.sin(phase), 0, 0)), np.array((sway * w * math.cos(phase), 0, 0))
+    expected = (0, 0, -G) - np.cross(spin_up, lever) - np.cross(turning, np.cross(turning, lever))
+    np.testing.assert_allclose(felt.gravity, expected, atol=0.02)
+    assert np.linalg.norm(expected - (0, 0, -G)) > 0.3

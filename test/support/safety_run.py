@@ -47,17 +47,15 @@ class SafetyRun:
         self.machine = SafetyMachine(replace(LIMITS, **limits), PERIOD)
         self.now = 100.0
         self.changes: list[dict[str, Any]] = [{} for _ in range(4)]
-        self.silent: set[int] = set()
         self.effort: Sequence[float] | None = EFFORT
         self.while_hanging: Sequence[float] = NO_TORQUE
         self.effort_age = 0.002
         self.damped = self.held = False
         self.joints = [UNKNOWN] * 4
-        self.off: set[int] = set()
+        self.silent, self.off = set[int](), set[int]()
         self.drive = OFF
         self.applied = [0.0] * 4
         self.steps: list[float] = []
-        self._is_proving = False
 
     def cycle(self, seconds: float = PERIOD) -> SafetyRun:
         """Run the machine for `seconds`, at least one cycle."""
@@ -68,29 +66,18 @@ class SafetyRun:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
-            before, was_proving = list(self.applied), self._is_proving
+            before, was_proving = list(self.applied), self.machine.state is State.PROVING
             hangs = self.effort is not None and self.machine.state is State.CHECKING
             effort = self.while_hanging if hangs else self.effort
             efforts = Efforts(effort, self.now - self.effort_age, self.damped, self.held)
             self.drive = self.machine.step(self.now, tuple(self.joints), efforts)
-            for i in range(4):
-                if i not in self.silent:
-                    self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
-                if self.drive.send[i] is Send.ENTER:
-                    self.off.discard(i)
-            self._is_proving = self.machine.state is State.PROVING
+            for i in {0, 1, 2, 3} - self.silent:
+                self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
+            self.off -= {i for i in self.off if self.drive.send[i] is Send.ENTER}
             if not was_proving:  # its small pushes end at once
-                own = [i for i in range(4) if i not in self.off]
-                self.steps.append(max([abs(self.applied[i] - before[i]) for i in own], default=0.0))
+                own = {0, 1, 2, 3} - self.off
+                self.steps.append(max((abs(self.applied[i] - before[i]) for i in own), default=0.0))
         return self
-
-    def enable(self) -> SafetyRun:
-        self.machine.enable(self.now)
-        return self
-
-    def until_active(self) -> SafetyRun:
-        """Enable the machine and run it until the arm is carried."""
-        return self.enable().until(State.ACTIVE).cycle(0.1)
 
     def until(self, state: State, limit: float = 10.0) -> SafetyRun:
         """Run the machine until it is in `state`, in `limit` s at most."""
@@ -100,12 +87,10 @@ class SafetyRun:
             self.cycle()
         return self
 
-    def until_off(self) -> SafetyRun:
-        """Run the machine until each motor has confirmed that it is off, and receives nothing else."""
-        self.cycle(0.1)
-        assert self.machine.is_off and not self.drive.powered
-        assert self.drive.effort == self.drive.damping == OFF.effort
-        return self
+    def until_active(self) -> SafetyRun:
+        """Enable the machine and run it until the arm is carried."""
+        self.machine.enable(self.now)
+        return self.until(State.ACTIVE).cycle(0.1)
 
     @property
     def fault_code(self) -> str | None:

@@ -17,7 +17,6 @@ UNDER_COLCON = "COLCON" in os.environ  # on a ROS host, which has what package.x
 # What a file starts as a process or by its path needs its packages too.
 STARTS = {
     "test/support/launched_nodes.py": ("exo_gravity.nodes.simulator", "exo_gravity.nodes.imu"),
-    "test/core/test_added_motor.py": ("test.support.added_motor",),
     "test/test_examples.py": ("examples.simulated_loop", "examples.emg_assistance", "examples.teach_and_repeat"),
 }
 

@@ -44,7 +44,7 @@ class ContinuityLimits:
     #: half a code of an AK80-9 (0.012 rad/s) adds 0.024 rad
     memory: float = 2.0
     #: rad of difference: knocks at 5 rad/s, a velocity that lags by 20 ms, lost frames and a late computer together
-    #: make 0.09 (test/core/test_trust.py)
+    #: make 0.09 (test/core/test_readings.py)
     slip: float = 0.15
     #: of the way that the velocity shows, in addition: a `velocity_range` of 50 in place of 45 rad/s is wrong by 0.11,
     #: which no arm feels

@@ -1,16 +1,22 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Each term alone, and the sum of all behind its shaper."""
+"""The terms: each alone, their sum, and on the simulated arm through 12-bit frames, up to 10 ms late.
+
+A passive term gives no more energy than it took plus what it may have stored. `friction` and `inertia` are fed by the
+joints' own friction: what they give is bounded by what that takes.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.kinematics import least_inertia, links_of
 from exo_gravity.core.compensation.terms.catalogue import (
     DELAY,
@@ -26,9 +32,11 @@ from exo_gravity.core.compensation.terms.catalogue import (
     TermState,
 )
 from exo_gravity.core.compensation.terms.terms import SUM, Terms, TermSettings, term_parameters, term_settings_of
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
+from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
+
+from ..support.terms_run import COULOMB, POSE, TermsRun, sines
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
 ZERO = (0.0,) * 4
@@ -95,27 +103,6 @@ def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
         assert torque == pytest.approx(2.0 * np.array(pose))
 
 
-def test_viscous_friction_in_another_unit_is_refused():
-    with pytest.raises(ParameterError, match=r"^viscous = .* from 0 to 1 Nm s/rad"):
-        Friction(0.5, (0.2, 0.4, 0.2, 0.2), (0.02, 0.05, 0.02, 2.0))
-
-
-@pytest.mark.parametrize(
-    "rows",
-    [(), (0.0,) * 3, (0.0,) * 6, (0.0,) * 10, (1.0, *ZERO), (0.0, 0.0, 0.0, 0.0, math.nan),
-     (0.0, *ZERO, 0.1, 3, 0, 0, 0), (0.0, *ZERO, math.nan, *ZERO), (0.0, *ZERO, math.inf, *ZERO),
-     (0.0, *ZERO, 2.0, *ZERO, 1.0, *ZERO)],
-)  # fmt: skip
-def test_an_impossible_path_is_refused(rows):
-    with pytest.raises(ParameterError, match=r"path|pose"):
-        Spring((1.0,) * 4, rows)
-
-
-def test_a_pose_is_four_angles():
-    with pytest.raises(ParameterError, match=r"^spring.pose = .*4 angles"):
-        Spring((1.0,) * 4, (0.0, 0.0, 0.0, math.nan))
-
-
 def test_the_tank_gives_what_it_holds_and_no_more():
     tank, given = EnergyTank(), 0.0
     for _ in range(4000):
@@ -138,18 +125,12 @@ class Driven:
         return self.outputs[-1]
 
 
-def test_without_terms_nothing_is_added():
-    driven = Driven(TermSettings())
-    assert driven.run(1.0, velocity=(1.0,) * 4) == ZERO
-    assert driven.terms.active == []
-
-
 def test_what_the_terms_before_a_change_would_give_stays_known():
     driven = Driven(TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4)))
     expected = driven.run(0.1)
     before = driven.terms.in_force
     driven.terms.apply(TermSettings(), DEFAULT_LINKS)
-    assert driven.run(0.002) == ZERO
+    assert driven.run(0.002, velocity=(1.0,) * 4) == ZERO and driven.terms.active == []
     assert driven.terms.torque_of(before) == pytest.approx(expected)
 
 
@@ -178,39 +159,142 @@ def test_whatever_the_terms_give_their_sum_is_bounded(sums):
         assert bool(terms.problem) is not math.isfinite(sum(total))
 
 
-@pytest.mark.parametrize(
-    ("chosen", "name"),
-    [
-        (TermSettings(spring=Spring((50.0, 0.0, 0.0, 0.0))), "spring.stiffness"),
-        (TermSettings(damping=Damping((0.0, 0.0, 0.0, 3.0))), "damping.viscosity"),
-        (TermSettings(coupling=Coupling((0.0, -15.0, 30.0, 0.0))), "coupling.stiffness"),
-    ],
-)
-def test_a_spring_or_damper_that_would_be_unstable_when_late_is_refused_with_the_most_that_is_stable(chosen, name):
-    with pytest.raises(ParameterError, match=f"^{name} = .* at most .* late is stable"):
-        chosen.on_arm(DEFAULT_LINKS)
-    assert ALL.on_arm(DEFAULT_LINKS) == ALL
-
-
 def test_soft_limits_are_no_stiffer_than_is_stable():
     stiff = TermSettings(limits=SoftLimits(LOWER, UPPER)).on_arm(DEFAULT_LINKS).limits.stiffness
     most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
+    assert ALL.on_arm(DEFAULT_LINKS) == ALL
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 
 
-def test_parameters_make_settings_and_name_their_group_in_errors():
+def test_parameters_make_settings():
     table = term_parameters()
     assert term_settings_of(values_of(table, {})) == TermSettings()
     coupling = [0.0, -1.0, 2.0, 0.0]
     values = values_of(table, {"friction.share": 0.5, "coupling.stiffness": coupling, "spring.pose": [0.1] * 4})
     built = term_settings_of(values)
     assert (built.friction.share, built.coupling.stiffness, built.spring.pose) == (0.5, tuple(coupling), (0.1,) * 4)
-    with pytest.raises(ParameterError, match=r"^coupling.stiffness = .* two joints or more"):
-        term_settings_of({**values, "coupling.stiffness": [0.0, 1.0, 0.0, 0.0]})
-    with pytest.raises(ParameterError, match=r"^limits.lower = .* below limits.upper"):
-        term_settings_of({**values, "limits.lower": [0.5] * 4, "limits.upper": [0.5] * 4})
 
 
 @pytest.mark.parametrize("edge", [{"lower": (-3.15, 0.2, -3.15, -3.15)}, {"upper": (3.15, 3.15, 1.0, 3.15)}])
 def test_one_edge_of_the_workspace_switches_the_limits_on(edge):
     assert SoftLimits(**edge).on and not SoftLimits().on
+
+
+PUSHED = 3.0  # s
+
+
+@dataclass
+class Case:
+    """A random arm, what the controller knows of it, and the loop's period and delay in s."""
+
+    seed: int
+    smoothness: float = 1.0  # factor on the friction
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.seed)
+        mass, cog = DEFAULT_LINKS.mass * rng.uniform(0.97, 1.03, 4), DEFAULT_LINKS.cog * rng.uniform(0.97, 1.0, 4)
+        self.links = ArmModel(DEFAULT_LINKS.length, cog, mass)
+        self.friction = tuple((np.array(COULOMB) * self.smoothness * rng.uniform(0.5, 1.5)).tolist())
+        self.config = ArmConfig(
+            coulomb_friction=self.friction,
+            viscous_friction=tuple(rng.uniform(0.0, 0.05, 4).tolist()),
+            stribeck_friction=tuple((0.2 * np.array(self.friction) * rng.uniform(0.0, 1.0)).tolist()),
+        )
+        self.identified = (np.array(self.friction) * rng.uniform(0.8, 1.0)).tolist()
+        self.period = float(rng.choice((0.002, 0.004, 0.005)))
+        self.delay = float(rng.choice((0.0, 0.005, 0.01)))
+        self.least = np.array(least_inertia(links_of(self.links)))
+        #: Nm/rad up to which springs are accepted
+        self.stiffest = tuple((0.999 * self.least / (4.0 * DELAY**2)).tolist())
+
+    def pushed(self, settings: TermSettings, strength: float = 0.6) -> TermsRun:
+        """Return a run in which a wearer pushes the arm about, and then leaves it alone until it rests."""
+        settings = settings.on_arm(self.links)
+        run = TermsRun(settings, self.config, self.links, self.period, self.delay)
+        run.push(sines(self.seed, PUSHED, strength))
+        run.run(PUSHED)
+        assert run.comes_to_rest()
+        return run
+
+
+GAP = abs(POSE[3] - 0.5 * POSE[2])  # rad
+STORED = float(np.abs(np.subtract(POSE, (0.0, 0.4, 0.4, 0.5))) @ (1.0, 2.0, 1.0, 1.0))  # J
+ENERGIES: dict[str, tuple[Any, Any]] = {  # the terms on a case, and what must hold of its energies in J
+    "friction gives less than the joints' friction takes, and does help": (
+        lambda case: {"friction": Friction(0.85, case.identified, case.config.viscous_friction)},
+        lambda run: run.given > 0.3 * run.rubbed and run.worst_balance < 0.02,
+    ),
+    "inertia gives no more than its tank and the joints' friction": (
+        lambda case: {"inertia": Inertia(0.8), "friction": Friction(0.7, case.identified)},
+        lambda run: run.worst_balance < 2.0 * INERTIA.tank,
+    ),
+    "inertia whose friction has no share": (
+        lambda case: {"inertia": Inertia(0.8), "friction": Friction(0.0, case.identified)},
+        lambda run: run.worst_balance < 2.0 * INERTIA.tank,
+    ),
+    "inertia without an identified friction lives on its tank": (
+        lambda case: {"inertia": Inertia(0.8)},
+        lambda run: 0.05 < run.most_given < 2.5 * INERTIA.tank and run.worst_balance < 2.0 * INERTIA.tank,
+    ),
+    "the strongest damping only takes": (
+        lambda case: {"damping": Damping(tuple((0.999 * case.least / (2.0 * DELAY)).tolist()))},
+        lambda run: run.given < -0.02 and run.most_given < 0.01,
+    ),
+    "the stiffest spring gives no more than it stored": (
+        lambda case: {"spring": Spring(case.stiffest, (0.0, 0.4, 0.4, 0.5), (1.0, 2.0, 1.0, 1.0))},
+        lambda run: run.most_given < STORED,
+    ),
+    "the stiffest edges of a workspace return no more than they took": (
+        lambda case: {"limits": SoftLimits(np.subtract(POSE, 0.1), np.add(POSE, 0.1), case.stiffest)},
+        lambda run: run.given < 0.0 and run.most_given < 0.05,
+    ),
+    "a coupling gives no more than it stored": (
+        lambda case: {"coupling": Coupling((0.0, 0.0, -1.5, 3.0))},
+        lambda run: run.most_given < 0.5 * 3.0 * GAP**2 + 0.25,
+    ),
+    "all terms together let the arm come to rest": (
+        lambda case: {
+            "friction": Friction(0.8, case.identified),
+            "inertia": Inertia(0.8),
+            "damping": Damping((0.02,) * 4),
+            "spring": Spring(tuple(0.5 * k for k in case.stiffest), POSE),
+            "coupling": Coupling((0.0, 0.0, -0.5, 1.0)),
+            "limits": SoftLimits(LOWER, (1.5, 1.6, 1.6, 2.5), tuple(0.5 * k for k in case.stiffest)),
+        },
+        lambda run: True,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_terms_give_no_more_energy_than_they_took_and_may_have_stored(name):
+    chosen, holds = ENERGIES[name]
+    case = Case(0)
+    run = case.pushed(TermSettings(**chosen(case)))
+    assert holds(run), (run.given, run.most_given, run.rubbed, run.worst_balance)
+
+
+def test_inertia_10_ms_late_on_an_arm_with_little_friction_starts_no_limit_cycle():
+    case = Case(2, smoothness=0.3)
+    case.delay = 0.01
+    run = case.pushed(TermSettings(inertia=Inertia(0.8), friction=Friction(0.0, case.identified)))
+    assert run.worst_balance < 2.0 * INERTIA.tank
+
+
+THIRTEEN = [
+    (0.0, 0.3, 0.2, 0.3), (0.0, 0.3, 0.8, 1.2), (0.0, 0.3, 1.5, 0.4), (-0.6, 0.5, 1.1, 1.6), (0.6, 0.5, 1.1, 0.6),
+    (0.0, 0.9, -0.3, 0.5), (0.0, 0.9, 0.5, 1.0), (-0.8, 0.9, 0.9, 0.4), (0.8, 0.9, 0.3, 1.8), (0.0, 1.4, 0.0, 0.3),
+    (0.4, 1.4, 0.5, 1.4), (-0.4, 1.8, 0.3, 0.8), (0.0, 0.6, 2.0, 0.5),
+]  # fmt: skip
+
+
+def test_friction_and_inertia_let_no_held_pose_creep_or_cycle():
+    """Each pose is left at 0.3 rad/s, as a hand that lets go leaves it; 0.2 degrees a minute is the limit."""
+    case = Case(1)
+    chosen = TermSettings(inertia=Inertia(0.8), friction=Friction(0.85, case.friction))
+    for pose in THIRTEEN[::4]:
+        run = TermsRun(chosen, case.config, case.links, 0.004, 0.008, pose)
+        run.device.arm.data.qvel[:] = 0.3
+        run.run(4.0)
+        assert run.travel(3.0) < 0.2 * 3.0 / 60.0, pose
+        assert math.degrees(np.abs(np.subtract(run.positions[-1], pose)).max()) < 15.0
