@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,8 @@ import pytest
 from exo_gravity.core import paper_static_torque
 from exo_gravity.core.arm.arm import ArmModel, papers
 from exo_gravity.core.arm.gravity import NO_TORQUE
-from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
+from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
@@ -28,13 +27,12 @@ from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MOTION
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
-from exo_gravity.sim.controllers import DirectController
+from exo_gravity.sim.events import ACTS, efforts
+from exo_gravity.sim.rig import Rig
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.virtual_arm import TrunkReading, VirtualArm
 from exo_gravity.sim.virtual_wearer import path_between
 
 from ..support.compensator_run import ROBOT
@@ -47,8 +45,6 @@ LIFT = 1.5  # s in which the wearer raises the arm to the pose of a case
 WINDOW = 0.01  # s, over which a rate of torque is taken
 DRIVES = 0.5  # Nm; gravity and the other joints move an arm that gets less
 WORN = {"mode": "zero_g", "support": 1.0, "wearer_mass": MASS, "wearer_cog": COG}
-
-Change = Callable[[Sequence[float], Sequence[float]], Sequence[float]]  # of efforts (4,) Nm at angles (4,) rad
 
 
 class LyingMotor(SimulatedMotor):
@@ -63,141 +59,94 @@ class LyingMotor(SimulatedMotor):
         return super().receive(data, position, velocity, now, frame_id)
 
 
-class Misled:
-    """A controller whose efforts may be made wrong. change: what is done to them."""
+class ThrownArm(Rig):
+    """A right arm that hangs, with a compensator, and what it does, n times from `begin` on.
 
-    def __init__(self, direct: DirectController) -> None:
-        self.direct = direct
-        self.change: Change = lambda theta, effort: effort
-        self._theta: list[float] = []
-
-    def efforts(self, latest: float):
-        given = self.direct.efforts(latest)
-        return given if given.effort is None else given._replace(effort=self.change(self._theta, given.effort))
-
-    def take(self, now: float, samples) -> None:
-        self._theta = [sample.position for sample in samples]
-        self.direct.take(now, samples)
-
-
-class ArmInTrouble(VirtualArm):
-    """A right arm that hangs, a controller, and what the arm does, n times from `begin` on.
-
-    time: s. velocity: rad/s. forward, torque: Nm, feed-forward and whole of the motors; all (n, 4). fault_time: s.
+    time: s. velocity: rad/s. forward, torque: Nm, feed-forward and whole of the motors; all (n, 4).
     """
 
-    def __init__(self, worn: bool, settings: dict[str, Any], rate: float, **limits: Any) -> None:
+    def __init__(self, is_worn: bool, rate: float, settings: dict[str, Any] | None = None, **limits: Any) -> None:
         most = limits.setdefault("max_effort", RATED)
-        config = ArmConfig(wearer_mass=MASS, wearer_cog=COG) if worn else ArmConfig()
+        config = ArmConfig(wearer_mass=MASS, wearer_cog=COG) if is_worn else ArmConfig()
         motors = [JointMotor(MOTORS[name], n + 1) for n, name in enumerate(USUAL_MOTORS)]
-        limits = Limits(JOINTS, sign_check_torque=0.0, **limits)
-        self.compensator = Compensator(Settings(**{"side": "right", "robot": ROBOT, "max_effort": most, **settings}))
-        self.misled = Misled(DirectController(self.compensator, limits))
         device = SimulatedDevice(SimulatedArm(config), [LyingMotor(motor) for motor in motors])
         device.arm.reset((0.0, 0.05, 0.05, 0.05))
-        super().__init__(device, self.misled, motors, limits, rate, look=self.note)
-        self.begin = self.fault_time = math.inf
+        assumed = {"side": "right", "robot": ROBOT, "max_effort": most, **(WORN if is_worn else {}), **(settings or {})}
+        self.begin = math.inf
         self.time: list[float] = []
         self.velocity: list[Sequence[float]] = []
         self.forward: list[Sequence[float]] = []
         self.torque: list[Sequence[float]] = []
+        limits = Limits(JOINTS, sign_check_torque=0.0, **limits)
+        super().__init__(device, Settings(**assumed), motors, limits, rate, look=self.note)
 
     def note(self) -> None:
         if self.now < self.begin:
             return
         theta, velocity = self.device.arm.positions, self.device.arm.velocities
-        at = list(zip(self.device.motors, theta, velocity, strict=True))
+        at = list(zip(self.motors, theta, velocity, strict=True))
         self.time.append(self.now)
         self.velocity.append(velocity)
         self.forward.append([motor.torque(angle, 0.0) for motor, angle, _ in at])
         self.torque.append([motor.torque(angle, speed) for motor, angle, speed in at])
-        if self.safety.fault:
-            self.fault_time = min(self.fault_time, self.now - self.begin)
 
-    def carried(self, tilt_error: float = 0.0) -> ArmInTrouble:
-        """Run until the arm is carried or refused. tilt_error: rad, about the pitch axis, of an IMU."""
-        self.add_imu(
-            lambda now, trunk: TrunkReading(gravity_in_trunk(trunk.pitch + tilt_error, trunk.roll).tolist()),
-            self.compensator,
-            0.01,
-        )
-        self.enable()
-        self.run_until(lambda: self.safety.state is State.ACTIVE or self.safety.fault)
-        return self
+    def play(self, *steps: dict[str, Any]) -> None:
+        """Let the wearer do `steps` of a script."""
+        self.act(*steps)
+        self.run(self.device.wearer.script.duration)
 
-    def play(self, *steps: dict[str, Any], wearer: VirtualWearer | None = None) -> ArmInTrouble:
-        """Let a wearer do `steps` of a script."""
-        script = TrialScript.parse({"name": "steps", "steps": list(steps)})
-        self.device.start(wearer or VirtualWearer(script))
-        self.run(script.duration)
-        return self
-
-    def judged(self) -> ArmInTrouble:
-        """Judge the arm from now on."""
+    def brought(self, pose: Sequence[float], over: float = LIFT, settle: float = 0.0) -> ThrownArm:
+        """Carry the arm, let the wearer bring it to `pose` (4,) rad, and judge it from then on."""
+        self.carry()
+        self.raise_to(pose, over, settle)
         self.begin = self.now
         return self
-
-    @property
-    def fault(self) -> str:
-        return str(self.safety.fault.code) if self.safety.fault else ""
 
     def speed(self, until: float = math.inf) -> float:
         """The fastest joint, rad/s, in the first `until` s."""
         speeds = np.abs(self.velocity)[np.array(self.time) - self.begin <= until]
         return float(speeds.max(initial=0.0))
 
-    @property
-    def driven(self) -> float:
-        """The fastest joint whose feed-forward drives it, by DRIVES at least, rad/s."""
-        velocity, forward = np.array(self.velocity), np.array(self.forward)
-        is_driven = (velocity * forward > 0.0) & (np.abs(forward) > DRIVES)
-        return float(np.where(is_driven, np.abs(velocity), 0.0).max())
-
-    @property
-    def rate_of_torque(self) -> float:
-        """The fastest change of a motor's torque over WINDOW, Nm/s."""
-        times, torque = np.array(self.time), np.array(self.torque)
-        later = np.minimum(np.searchsorted(times, times + WINDOW), len(times) - 1)
-        return float((np.abs(torque[later] - torque).max(axis=1) / np.maximum(WINDOW, times[later] - times)).max())
-
-
-def leave_cuff(arm: ArmInTrouble) -> None:
-    arm.device.arm.config = replace(arm.device.arm.config, wearer_mass=NO_TORQUE)
-    arm.device.arm.carry(0.0)
-
 
 RAISED, OUT = (0.2, 0.35, -0.20, 0.9), (0.1, 0.5, 0.5, 0.6)  # rad, which the rated and the peak torques carry
 THROWN = {  # pose, most torque, what happens then, rad/s at most
-    "out of the cuff, rated torques": (RAISED, RATED, leave_cuff, 2.9),
-    "out of the cuff, peak torques": (OUT, PEAK, leave_cuff, 2.9),
-    "clamped, arm abducted": ((0.0, 1.8, 0.2, 0.2), RATED, lambda arm: None, 1.9),
+    "out of the cuff, rated torques": (RAISED, RATED, "out_of_cuff", 2.9),
+    "out of the cuff, peak torques": (OUT, PEAK, "out_of_cuff", 2.9),
+    "clamped, arm abducted": ((0.0, 1.8, 0.2, 0.2), RATED, "limp", 1.9),
 }
 
 
 @pytest.mark.parametrize("name", quick(["out of the cuff, peak torques"], THROWN))
 def test_whatever_drives_an_arm_by_mistake_does_not_throw_it(name):
-    pose, most, event, driven = THROWN[name]
-    arm = ArmInTrouble(True, WORN, 250.0, max_effort=most).carried()
-    arm.play({"move": list(pose), "over": LIFT}).judged()
-    event(arm)
+    pose, most, event, fastest = THROWN[name]
+    arm = ThrownArm(True, 250.0, max_effort=most).brought(pose)
+    ACTS[event](arm)
     arm.run(3.0)
+    velocity, forward = np.array(arm.velocity), np.array(arm.forward)
+    is_driven = (velocity * forward > 0.0) & (np.abs(forward) > DRIVES)
     assert arm.time and arm.fault == ""
-    assert arm.driven < driven
+    assert np.where(is_driven, np.abs(velocity), 0.0).max() < fastest
 
 
 def test_an_arm_whose_imu_is_wrong_by_30_degrees_is_not_carried():
-    assert ArmInTrouble(True, WORN, 250.0, max_effort=PEAK).carried(math.radians(30.0)).fault == "torque_while_hanging"
+    arm = ThrownArm(True, 250.0, max_effort=PEAK)
+    arm.imu_error = [math.radians(30.0), 0.0]
+    with pytest.raises(RuntimeError, match="torque_while_hanging"):
+        arm.carry()
 
 
 @pytest.mark.thorough
 def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_nothing():
-    lie = ArmInTrouble(True, WORN, 250.0).carried().play({"move": list(RAISED), "over": LIFT}).judged()
-    lie.device.motors[-1].lie = 3.0
+    lie = ThrownArm(True, 250.0).brought(RAISED)
+    lie.motors[-1].lie = 3.0
     lie.run(3.0)
-    assert lie.speed() < 0.02 and lie.rate_of_torque < 5.0
+    times, torque = np.array(lie.time), np.array(lie.torque)
+    later = np.minimum(np.searchsorted(times, times + WINDOW), len(times) - 1)
+    rates = np.abs(torque[later] - torque).max(axis=1) / np.maximum(WINDOW, times[later] - times)
+    assert lie.speed() < 0.02 and rates.max() < 5.0
     low, high = [0.0, 0.2, 0.1, 0.3], [0.0, 0.2, 0.1, 1.5]
     over = 1.875 * 1.2 / 0.75  # s, of a minimum-jerk path that reaches 1 rad/s, three quarters of the step
-    reach = ArmInTrouble(True, WORN, 250.0, max_effort=PEAK).carried().play({"move": low, "over": LIFT}).judged()
+    reach = ThrownArm(True, 250.0, max_effort=PEAK).brought(low)
     reach.play({"move": high, "over": over}, {"move": low, "over": over})
     np.testing.assert_allclose(reach.torque, reach.forward, atol=0.02)
 
@@ -207,7 +156,7 @@ class Wrong:
     """A compensator that is wrong: by its settings from the start, or from when the bare arm is let go at `pose`."""
 
     settings: dict[str, Any] = field(default_factory=dict)
-    change: Change = lambda theta, effort: effort
+    change: Callable[[Sequence[float], Sequence[float]], Sequence[float]] = lambda theta, effort: effort
     pose: Sequence[float] | None = None
     lean: float = 0.0  #: rad, of the trunk
     time: float = math.inf  #: s, in which the fault must come
@@ -235,13 +184,17 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
 def test_a_wrong_compensator_is_let_down_before_a_free_arm_is_fast(wrong):
-    arm = ArmInTrouble(False, wrong.settings, 100.0, largest_moment=MOMENT).carried()
+    arm = ThrownArm(False, 100.0, wrong.settings, largest_moment=MOMENT)
     if wrong.pose:
-        arm.play({"move": list(wrong.pose), "over": 2.0}, {"hold": 1.0})
-    arm.misled.change = wrong.change
-    arm.judged().play({"lean": wrong.lean, "over": 1.0}, {"hold": 4.0})
+        arm.brought(wrong.pose, 2.0, 1.0)
+    else:
+        arm.carry()
+    arm.begin, true = arm.now, arm.device.arm
+    efforts(lambda answer: answer._replace(effort=wrong.change(true.positions, answer.effort)))(arm)
+    arm.play({"lean": wrong.lean, "over": 1.0}, {"hold": 4.0})
+    after = next(change.time for change in arm.changes if change.fault) - arm.begin
     assert arm.fault == "unexplained_torque"
-    assert arm.fault_time < wrong.time and arm.speed() < wrong.speed and arm.speed(arm.fault_time) < wrong.until
+    assert after < wrong.time and arm.speed() < wrong.speed and arm.speed(after) < wrong.until
 
 
 FASTEST = 3.5  # rad/s, from which on the wearer brakes; 5 rad/s, of the elbow 6, trips over_speed
@@ -308,25 +261,26 @@ def test_a_fast_wearer_is_not_let_down(is_assisted):
         spring=Spring((2.0, 4.0, 2.0, 1.0)),
         assist=Assist((2.0, 4.0, 2.0, 2.0)),
     )
-    settings, addition = {**WORN, "max_effort": RATED}, NO_TORQUE
+    settings, addition = {"max_effort": RATED}, NO_TORQUE
     if is_assisted:
         settings |= {"terms": terms, "inertial": True}
         addition = tuple(map(sum, zip(SUM.effort, terms.assist.max_effort, strict=True)))
     moment = papers(Settings("right", ROBOT, **WORN).arm).first_moment
-    arm = ArmInTrouble(True, settings, 100.0, largest_moment=moment, largest_addition=addition).carried().judged()
+    arm = ThrownArm(True, 100.0, settings, largest_moment=moment, largest_addition=addition)
+    arm.carry()
+    arm.begin = arm.now
 
-    def assist(theta, effort):
+    def assist(answer):
         """Push the way that the arm moves; the push fades towards FASTEST."""
         pushed = [math.copysign(4.0 * max(0.0, 1.0 - abs(v) / FASTEST), v) for v in arm.device.arm.velocities]
         arm.compensator.terms.assist.receive(arm.now, JOINTS, pushed, arm.now)
-        return effort
+        return answer
 
-    arm.misled.change = assist if is_assisted else arm.misled.change
-    wearer = Fast(TrialScript.parse({"name": "fast", "steps": [{"hold": 4.0}]}), seed=3)
+    arm.controller.change = assist if is_assisted else None
+    arm.device.start(Fast(TrialScript.parse({"name": "fast", "steps": [{"hold": 4.0}]}), seed=3))
     largest = 0.0
-    arm.device.start(wearer)
     while arm.now < arm.begin + 4.0:
-        arm.loop.cycle()
+        arm.cycle()
         columns = zip(arm.safety.motion.impulse, arm.safety.motion.full, strict=True)
         largest = max(largest, *(impulse / (MOTION.patience * full) for impulse, full in columns if full))
     assert not arm.fault and 3.0 < arm.speed() < 5.0 and largest < 0.5
