@@ -282,14 +282,18 @@ ROWS: dict[str, Sequence[Step]] = {
         )
     },
     **{
-        f"the checks wait for {words}": [spoil, enable, wait(2.0), see(State.CHECKING, words=words), ALL_OFF]
-        for words, spoil in {
-            "c: no reply": let(silent={2}),
-            "at rest": reads(1, velocity=0.15),
-            "the watchdog to start": lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"),
-            "effort commands": let(effort=None),
-            "fresh effort commands": let(effort_age=0.06),
-            "c to be moved by -5.8 degrees, within its limits -46": reads(2, position=2.6),
+        f"the checks wait: {cause}": [spoil, enable, wait(2.0), see(State.CHECKING, words=words), ALL_OFF]
+        for cause, (spoil, words) in {
+            "a silent motor": (let(silent={2}), "c: no reply"),
+            "an arm that moves": (reads(1, velocity=0.15), "at rest"),
+            "a hindrance": (
+                lambda arm: setattr(arm.machine, "hindrance", "the watchdog to start"), "the watchdog to start",
+            ),
+            "no efforts": (let(effort=None), "effort commands"),
+            "old efforts": (let(effort_age=0.06), "effort commands"),
+            "a joint beyond its limits": (
+                reads(2, position=2.6), "c to be moved by -5.8 degrees, within its limits -46",
+            ),
         }.items()
     },
     **{

@@ -27,6 +27,7 @@ from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MOTION
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
@@ -153,7 +154,10 @@ def test_a_wrong_speed_moves_nothing_and_a_wearer_who_reaches_at_1_rad_s_feels_n
 
 @dataclass(frozen=True)
 class Wrong:
-    """A compensator that is wrong: by its settings from the start, or from when the bare arm is let go at `pose`."""
+    """A compensator that is wrong: by its settings from the start, or from when the bare arm is let go at `pose`.
+
+    Times in s are from then on, or from when the motors were switched on.
+    """
 
     settings: dict[str, Any] = field(default_factory=dict)
     change: Callable[[Sequence[float], Sequence[float]], Sequence[float]] = lambda theta, effort: effort
@@ -165,7 +169,7 @@ class Wrong:
 
 
 WRONG = {
-    "three times the mass": Wrong({"robot": ArmModel(ROBOT.length, ROBOT.cog, 3.0 * ROBOT.mass)}, time=1.2, speed=0.4),
+    "three times the mass": Wrong({"robot": ArmModel(ROBOT.length, ROBOT.cog, 3.0 * ROBOT.mass)}, time=2.2, speed=0.4),
     "the sign of joint 2": Wrong(
         change=lambda theta, effort: (effort[0], -effort[1], *effort[2:]),
         pose=(0.0, 0.9, 0.3, 0.3),
@@ -188,10 +192,11 @@ def test_a_wrong_compensator_is_let_down_before_a_free_arm_is_fast(wrong):
     if wrong.pose:
         arm.brought(wrong.pose, 2.0, 1.0)
     else:
-        arm.carry()
+        arm.between_cycles(arm.safety.enable)
+        arm.run_until(lambda: arm.state is State.PROVING)  # the motors are on
     arm.begin, true = arm.now, arm.device.arm
     efforts(lambda answer: answer._replace(effort=wrong.change(true.positions, answer.effort)))(arm)
-    arm.play({"lean": wrong.lean, "over": 1.0}, {"hold": 4.0})
+    arm.play({"hold": 0.1 if wrong.pose else 4.0}, {"lean": wrong.lean, "over": 1.0}, {"hold": 4.0})
     after = next(change.time for change in arm.changes if change.fault) - arm.begin
     assert arm.fault == "unexplained_torque"
     assert after < wrong.time and arm.speed() < wrong.speed and arm.speed(after) < wrong.until
