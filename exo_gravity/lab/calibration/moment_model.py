@@ -2,13 +2,25 @@
 """What a calibration needs of an arm: its torque, linear in k moments, and which of them it takes for known.
 
 The paper's arm has the eight moments of `core.arm.gravity`; any other those of `UrdfArm.base`, which a QR decomposition
-of its regressor leaves. Both are first moments in kg m.
+of its regressor leaves. Both are first moments in kg m. Both arms have
+
+    count, names, moments, start   n joints; of the k moments: names, kg m as far as known, kg m from which a fit begins
+    gravity                        m/s^2
+    suggested                      (m, n) rad, poses from which a missing one is taken
+    beside                         number of directions in which a weight may hang beside its link
+    turns                          of the joints' places that are fitted
+    keeps_axes, keeps_tilt         whether the parameter file takes over axes that are askew; and gravity's direction as
+                                   found, as an IMU's mounting
+    shows_tilt, expects_scales     whether gravity's direction is fitted, too; and whether a torque scale is expected to
+                                   be near that of the file
+    compared                       joints whose torque scales have a product of 1 without a weight
+    positive                       numbers of the moments that are at least 0
+    optional                       numbers of the unknowns of `pose_fit.FitLayout` that need not show
 """
 
 import itertools
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -30,71 +42,6 @@ TURNS = 3  # of a joint's place: about its axis, and about two directions across
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
 FITTED = 60  # of them, in which the moments of an arm with turned axes are found
 STEP = 10.0  # deg, of their angles
-
-
-class MomentModel(Protocol):
-    """An arm of n joints, whose torque is linear in k moments."""
-
-    count: int  #: n
-    names: tuple[str, ...]  #: of the moments (k,)
-    moments: np.ndarray  #: (k,) kg m, as far as known
-    start: np.ndarray  #: (k,) kg m, from which the fit begins
-    gravity: float  #: m/s^2
-    beside: int  #: number of directions in which a weight may hang beside its link
-    turns: int  #: of the joints' places that are fitted: 3 n or 0
-    keeps_axes: bool  #: whether the parameter file takes over axes that are askew
-    compared: tuple[int, ...]  #: joints whose torque scales have a product of 1 without a weight
-    positive: tuple[int, ...]  #: numbers of the moments that are at least 0
-    optional: tuple[int, ...]  #: numbers of the unknowns of `pose_fit.FitLayout` that need not show
-    shows_tilt: bool  #: whether gravity's direction is fitted, too
-    keeps_tilt: bool  #: whether the parameter file takes over the direction that is found, as an IMU's mounting
-    expects_scales: bool  #: whether a torque scale is expected to be near that of the file
-    suggested: np.ndarray  #: (m, n) rad, from which a missing pose is taken
-
-    def down(self, tilt: Tilt) -> np.ndarray:
-        """Return gravity's unit vector (3,) in the base frame."""
-        ...
-
-    def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
-        ...
-
-    def load(self, mass: float, lever: float) -> np.ndarray:
-        """Return the moments (k,) of `mass` kg on the last link, `lever` m from its joint. Raises ParameterError."""
-        ...
-
-    def load_beside(self, mass: float, lever: float) -> np.ndarray:
-        """Return how these moments change, (k, `beside`) kg m per rad, with how far the weight hangs off its link."""
-        ...
-
-    def turned(self, theta: np.ndarray) -> np.ndarray:
-        """Return the derivative (m, n, k, 3, 3 n) of `along_axes` at `theta` (m, n) by turns of the joints' frames.
-
-        Of each joint by a turn of its place about its own axis, which is an error of its zero, and about two directions
-        across it: so is an axis askew. In Nm per kg m and rad.
-        """
-        ...
-
-    def holding(self, moments: np.ndarray) -> Holder:
-        """Return what returns the torque (n,) in Nm of one pose. moments: (n, k), what each joint shows."""
-        ...
-
-    def common(self, moments: np.ndarray) -> np.ndarray:
-        """Return the moments (k,) that the joints show together, of those (n, k) that each shows."""
-        ...
-
-    def matrix(self, theta: Sequence[float], moments: np.ndarray, load: tuple[float, float]) -> np.ndarray:
-        """Return an approximate mass matrix (n, n) in kg m^2. moments: (k,). load: kg, m."""
-        ...
-
-    def upwards(self, theta: np.ndarray) -> np.ndarray:
-        """Return the sine (m,) of the largest angle above the horizontal of a link, at `theta` (m, n) rad."""
-        ...
-
-
-def along_axes(model: MomentModel, theta: np.ndarray) -> np.ndarray:
-    """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
-    return np.stack([model.rows(theta, axis) for axis in np.eye(3)], axis=-1)
 
 
 def turned_by(
@@ -146,7 +93,7 @@ class PapersMoments:
         return np.array(tilt.direction)
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return `lab.moments.regressor`."""
+        """Return the torque (m, 4, 8) in Nm per kg m at `theta` (m, 4) rad. direction: (3,) or (m, 3)."""
         return regressor(theta, direction, self.gravity)
 
     def load(self, mass: float, lever: float) -> np.ndarray:
@@ -154,7 +101,7 @@ class PapersMoments:
         return load_moments(self.length.tolist(), mass, lever)
 
     def load_beside(self, mass: float, lever: float) -> np.ndarray:
-        """Return the change (8, 3) of these moments: from M3 to Y3, from M4 to Y4, and from M4 to Z."""
+        """Return their change (8, 3) by how far the weight hangs off its link: M3 to Y3, M4 to Y4, and M4 to Z."""
         load, change = self.load(mass, lever), np.zeros((len(MOMENTS), self.beside))
         for angle, (along, across) in enumerate(((2, 6), (3, 7), (3, 5))):
             change[across, angle] = load[along]
@@ -243,7 +190,7 @@ class UrdfMoments:
         return np.array(tilt.gravity_in_trunk)
 
     def rows(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return `UrdfArm.regressor`."""
+        """Return the torque (m, n, k) in Nm per kg m at `theta` (m, n) rad. direction: (3,) or (m, 3)."""
         return self.arm.regressor(theta, direction)
 
     def load(self, mass: float, lever: float) -> np.ndarray:
@@ -313,3 +260,11 @@ class UrdfMoments:
             none = [0.0] * (self.count - 1)
             self._loaded[key] = self.arm.with_wearer([*none, mass], [*none, lever])
         return self._loaded[key]
+
+
+MomentModel = PapersMoments | UrdfMoments
+
+
+def along_axes(model: MomentModel, theta: np.ndarray) -> np.ndarray:
+    """Return the torque (m, n, k, 3) in Nm per kg m with gravity along each axis of the base frame."""
+    return np.stack([model.rows(theta, axis) for axis in np.eye(3)], axis=-1)

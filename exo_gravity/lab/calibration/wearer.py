@@ -65,13 +65,14 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     """
     worn, observations = worn_arm(arm), at_links(arm, observations)
     theta, direction, effort, spread = columns(observations)
-    torque = effort - worn.robot(theta, direction) - joint_spring_of(arm.compensator).torques(theta)
+    rows = worn.model.rows(theta, direction)
+    torque = effort - rows @ worn.model.moments - joint_spring_of(arm.compensator).torques(theta)
     pairs = visits(theta)
     again = len({other for _, other in pairs})
     least = min(WEARER.least_poses, WEARER.least_of_one + len(arm.joint_names) - 1)
     if len(observations) - again < least:
         raise DataError(f"{len(observations) - again} different poses were measured, must be at least {least}")
-    fit = fit_wearer(worn.columns(theta, direction), theta, torque, spread, worn.known)
+    fit = fit_wearer(rows @ worn.to_moments, theta, torque, spread, worn.known)
     change = unrest(pairs, fit.remainder)
     restless = [
         f"{name}: {off:.2f} Nm between two visits of a pose: must be at most {WEARER.unrest:g}: did the wearer relax?"
@@ -83,7 +84,7 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     found = worn.found(fit, theta, direction)
     low, high = worn.comfortable
     poses = np.random.default_rng(0).uniform(low, high, (WEARER.samples, len(arm.joint_names)))
-    unsure = fit.torque_error(worn.columns(poses, direction[0]), poses)
+    unsure = fit.torque_error(worn.model.rows(poses, direction[0]) @ worn.to_moments, poses)
     refusals = found.refusals + tuple(
         f"{name}: a spring of {stiffness:.1f} Nm/rad: must be at most {MAX_TISSUE:g}: was the arm touched?"
         for name, stiffness in zip(arm.joint_names, fit.stiffness.tolist(), strict=True)

@@ -3,11 +3,19 @@
 
 On the paper's arm links 3 and 4 carry the wearer: their mass, which pulls at the links before, and five first moments.
 On an arm from a URDF each link on which the table places mass (`wearer.links`) adds a mass and a first moment (3,).
+
+Of a robot arm of n joints and k moments, and m moments that a wearer's arm can have, both have
+
+    model, to_moments   of the robot, and what each of the wearer's moments adds to its moments, (k, m)
+    known               (r, m) and (r,), as `fit_wearer` takes it
+    comfortable         (2, n) rad, lowest and highest angles
+    changes, expected   parameters of `calibrator`, and moments (k,) for `tour_parameters`, or None: so that its tour
+                        expects this wearer
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,10 +27,10 @@ from exo_gravity.core.compensation.settings import WORN_MOMENTS, wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.result import Change
-from exo_gravity.lab.calibration.tours import row, urdf_model_of
+from exo_gravity.lab.calibration.tours import model_of, row, urdf_model_of
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit
 from exo_gravity.lab.inputs.arms import AnyArm
-from exo_gravity.lab.moments import MOMENTS, regressor
+from exo_gravity.lab.moments import MOMENTS
 
 
 @dataclass(frozen=True)
@@ -52,39 +60,6 @@ class Found(NamedTuple):
     refusals: tuple[str, ...]  #: why it is no person's arm
 
 
-class WornArm(Protocol):
-    """A robot arm of n joints and k moments, and m moments that a wearer's arm can have."""
-
-    known: tuple[np.ndarray, np.ndarray]  #: (r, m) and (r,), as `fit_wearer` takes it
-    comfortable: np.ndarray  #: (2, n) rad, lowest and highest angles
-    changes: Mapping[str, Any]  #: of `calibrator`, so that its tour expects this wearer
-    expected: np.ndarray | None  #: (k,) kg m, for `tour_parameters`, likewise
-
-    def columns(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the torque (p, n, m) in Nm per unit of each of the wearer's moments, at `theta` (p, n) rad."""
-        ...
-
-    def robot(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return what the robot alone needs, (p, n) Nm."""
-        ...
-
-    def found(self, fit: WearerFit, theta: np.ndarray, direction: np.ndarray) -> Found:
-        """Return what a fit says. Raises DataError if it is not an arm."""
-        ...
-
-    def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return what can_bridge must let through with these moments (k,) of a wearer.
-
-        `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm.
-        """
-        ...
-
-
-def worn_arm(arm: AnyArm) -> WornArm:
-    """Return what a wearer can add to `arm`. Raises ParameterError."""
-    return UrdfWorn(arm) if arm.by_urdf else PapersWorn(arm)
-
-
 class PapersWorn:
     """A wearer on links 3 and 4 of the paper's arm."""
 
@@ -92,31 +67,23 @@ class PapersWorn:
     comfortable = np.array(WORN.comfortable)
 
     def __init__(self, arm: AnyArm) -> None:
-        self._arm, self._robot = arm, papers(arm.robot)
-        self._to_moments = worn_moments(self._robot.length)
+        self._arm, self._robot, self.model = arm, papers(arm.robot), model_of(arm)
+        self.to_moments = worn_moments(self._robot.length)
         self._table = tuple(map(np.array, self._wearer(tabled=True)))
         self.known = _known(self._robot.length, *self._table)
         self.expected: np.ndarray | None = moments_of(self._robot.with_wearer(*self._wearer()))
 
-    def columns(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the torque (p, 4, 6) in Nm per kg of the mass, and per kg m of M3, M4, Z, Y3, Y4."""
-        return np.asarray(regressor(theta, direction, self._robot.gravity) @ self._to_moments)
-
-    def robot(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return what the robot alone needs, (p, 4) Nm."""
-        return np.asarray(regressor(theta, direction, self._robot.gravity) @ moments_of(self._robot))
-
     def found(self, fit: WearerFit, theta: np.ndarray, direction: np.ndarray) -> Found:
         """Return what a fit says. Raises DataError if it is not an arm."""
         own = fit.covariance[: len(fit.moments), : len(fit.moments)]
-        moments, error = self._to_moments @ fit.moments, np.sqrt(np.diag(self._to_moments @ own @ self._to_moments.T))
+        moments, error = self.to_moments @ fit.moments, np.sqrt(np.diag(self.to_moments @ own @ self.to_moments.T))
         for index in (2, 3):
             shown = f"{MOMENTS[index]} of the wearer = {moments[index]:.3f} +- {error[index]:.3f} kg m"
             if not moments[index] > error[index] / WORN.largest_error:
                 raise DataError(f"{shown}: {HAS_WEIGHT}")
         mass, beside = _bounded(fit.moments, self._robot.length)
         _check_mass(mass)
-        moments = self._to_moments @ np.array((mass, *fit.moments[1:3], *beside))
+        moments = self.to_moments @ np.array((mass, *fit.moments[1:3], *beside))
         mass_table, cog_table = self._table
         ratio = moments[2:4] / moments_along(self._robot.length, cog_table, mass_table)[2:]
         body_mass, (low, high) = self._arm.compensator["wearer.body_mass"], WORN.table_ratio
@@ -197,17 +164,17 @@ class UrdfWorn:
     expected: np.ndarray | None = None
 
     def __init__(self, arm: AnyArm) -> None:
-        values, self._arm, self._model = arm.compensator, arm, urdf_model_of(arm)
-        robot = self._model.arm
+        values, self._arm, self.model = arm.compensator, arm, urdf_model_of(arm)
+        robot = self.model.arm
         mass, cog = (np.array(part) for part in wearer_of(values, robot.length, values["wearer.links"]))
         if not np.any(mass):
             expected = "the wearer's, in kg, or wearer.mass and wearer.cog: they also give the inertia"
             raise ParameterError(f"{arm.namespace}/compensator wearer.body_mass", values["wearer.body_mass"], expected)
         self.changes: Mapping[str, Any] = {"tour.wearer_mass": mass.tolist(), "tour.wearer_cog": cog.tolist()}
         self._links = np.flatnonzero(mass)
-        self._to_moments = np.column_stack([column for link in self._links for column in self._columns_of(int(link))])
-        self._mass_columns = np.arange(0, self._to_moments.shape[1], 4)
-        self._expected = robot.with_wearer(mass, cog).moments - self._model.moments
+        self.to_moments = np.column_stack([column for link in self._links for column in self._columns_of(int(link))])
+        self._mass_columns = np.arange(0, self.to_moments.shape[1], 4)
+        self._expected = robot.with_wearer(mass, cog).moments - self.model.moments
         self.known = self._prior(mass, cog)
         home, low, high = np.array(arm.limits.home), arm.low, arm.high
         down, up = (np.clip(WORN.share * way, *WORN.reach) for way in (home - low, high - home))
@@ -215,7 +182,7 @@ class UrdfWorn:
 
     def _columns_of(self, link: int) -> list[np.ndarray]:
         """Return what 1 kg in the link's joint, and 1 kg m along x, y and z, add to the robot's moments, (k,) each."""
-        robot, own = self._model.arm, self._model.moments
+        robot, own = self.model.arm, self.model.moments
         each = np.eye(len(robot.names))[link]
         masses = robot.with_wearer(each, 0.0 * each).moments - own
         return [masses, *(robot.with_wearer_moments(np.outer(each, way)).moments - own for way in np.eye(3))]
@@ -224,9 +191,9 @@ class UrdfWorn:
         """Return what is known before: the table's masses within a half, and their places within some centimetres."""
         rows, values = list[np.ndarray](), list[float]()
         for number, link in enumerate(self._links):
-            own, way = mass[link], self._model.arm.directions[link]
+            own, way = mass[link], self.model.arm.directions[link]
             across = np.linalg.svd(way[None])[2][1:]
-            block = np.zeros((4, self._to_moments.shape[1]))
+            block = np.zeros((4, self.to_moments.shape[1]))
             at = slice(4 * number, 4 * number + 4)
             block[0, at] = np.array((1.0, 0.0, 0.0, 0.0)) / (PRIOR.moments * own)
             block[1, at] = np.array((-cog[link], *way)) / (PRIOR.along * own)
@@ -235,23 +202,15 @@ class UrdfWorn:
             values += [1.0 / PRIOR.moments, 0.0, 0.0, 0.0]
         return np.vstack(rows), np.array(values)
 
-    def columns(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return the torque (p, n, m) in Nm per unit of each of the wearer's moments, at `theta` (p, n) rad."""
-        return np.asarray(self._model.rows(theta, direction) @ self._to_moments)
-
-    def robot(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Return what the robot alone needs, (p, n) Nm."""
-        return np.asarray(self._model.rows(theta, direction) @ self._model.moments)
-
     def found(self, fit: WearerFit, theta: np.ndarray, direction: np.ndarray) -> Found:
         """Return what a fit says. Raises DataError if it is not an arm."""
         _check_mass(float(fit.moments[self._mass_columns].sum()))
-        moments, rows = self._to_moments @ fit.moments, self._model.rows(theta, direction)
+        moments, rows = self.to_moments @ fit.moments, self.model.rows(theta, direction)
         torque, table = rows @ moments, rows @ self._expected
         n = int(np.argmax((table**2).sum(axis=0)))  # the joint that carries most of the wearer
         name, size = self._arm.joint_names[n], float(np.sqrt(np.mean(table[:, n] ** 2)))
         share = float((torque[:, n] * table[:, n]).sum() / (table[:, n] ** 2).sum())
-        error = float(fit.torque_error(self.columns(theta, direction), theta)[n])
+        error = float(fit.torque_error(rows @ self.to_moments, theta)[n])
         if not share * size > error / WORN.largest_error:
             shown = f"the wearer's arm needs {share * size:.2f} +- {error:.2f} Nm at {name}"
             raise DataError(f"{shown}: {HAS_WEIGHT}")
@@ -260,7 +219,7 @@ class UrdfWorn:
         plausible = low <= share <= high
         refusals = () if plausible else (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
         own = fit.covariance[: len(fit.moments), : len(fit.moments)]
-        worst = float(np.sqrt(np.diag(self._to_moments @ own @ self._to_moments.T)).max())
+        worst = float(np.sqrt(np.diag(self.to_moments @ own @ self.to_moments.T)).max())
         node, noted = f"{self._arm.namespace}/compensator", f"kg m, +-{worst:.2g} at most"
         changes = [
             Change(node, parameter, (column.round(5) + 0.0).tolist(), noted)
@@ -270,16 +229,24 @@ class UrdfWorn:
 
     def _in_links(self, moments: np.ndarray) -> np.ndarray:
         """Return moments (k,) as first moments of the links, (n, 3) kg m in their joints' frames."""
-        base = self._model.arm.base
-        in_links = np.zeros((len(self._model.arm.names), 3))
+        base = self.model.arm.base
+        in_links = np.zeros((len(self.model.arm.names), 3))
         for (link, way), moment in zip(base, moments, strict=True):
             in_links[link] += moment * way
         return in_links
 
     def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `largest_moment`, (n,) kg m, and the torque of what lies beside the links, (n,) Nm."""
-        robot = self._model.arm
+        robot = self.model.arm
         skeleton = robot.with_wearer_moments(self._in_links(moments)).skeleton()
         if skeleton is None:
             return np.zeros(len(robot.names)), np.zeros(len(robot.names))
         return skeleton.moments, robot.gravity * skeleton.beside
+
+
+WornArm = PapersWorn | UrdfWorn
+
+
+def worn_arm(arm: AnyArm) -> WornArm:
+    """Return what a wearer can add to `arm`. Raises ParameterError."""
+    return UrdfWorn(arm) if arm.by_urdf else PapersWorn(arm)
