@@ -86,8 +86,6 @@ class Fit:
     """The errors that the fit expects, and what it makes of larger ones."""
 
     least_spread: float = 0.003  #: Nm; about half a code of an AK motor's 12-bit torque
-    #: of torque: error of all sweeps of a joint in one tour, which their scatter does not show
-    common_error: float = 0.0005
     beside_error: float = 0.05  #: rad, of a weight's place; 3 degrees
     #: rad about each axis, of gravity's measured direction: an IMU's mounting, mostly its heading
     tilt_error: float = 0.05
@@ -211,7 +209,6 @@ class Solution(NamedTuple):
     left: np.ndarray  #: (m, n), part of each residual's variance that the fit leaves, 0..1
     freedom: np.ndarray  #: (n,), degrees of freedom of each joint's residuals
     hat: np.ndarray  #: (m, n, m, n), derivative of the predicted by the measured effort, both divided by sigma
-    inverse: np.ndarray  #: (count, m n + c), change of the unknowns with each effort and condition, by its error
 
 
 def rows_of(observations: Sequence[Observation], model: MomentModel, places: Places) -> Rows:
@@ -297,7 +294,7 @@ def solve(rows: Rows, start: np.ndarray | None = None, weight: np.ndarray | floa
     left_over = 1.0 - np.einsum("njnj->nj", hat)
     freedom = np.maximum(left_over.sum(axis=0), 0.0)
     covariance = inverse @ inverse.T
-    return Solution(unknowns, covariance, hidden, singular_values, residual, left_over, freedom, hat, inverse)
+    return Solution(unknowns, covariance, hidden, singular_values, residual, left_over, freedom, hat)
 
 
 def robust(rows: Rows) -> tuple[Rows, Solution]:
@@ -313,17 +310,14 @@ def robust(rows: Rows) -> tuple[Rows, Solution]:
 
 
 def final(rows: Rows) -> tuple[Rows, Solution]:
-    """Return the plain least-squares solution, and the rows with the error that its residuals show.
-
-    The covariance includes a relative error of `FIT.common_error` that all poses of a joint with the same weight share.
-    """
+    """Return the plain least-squares solution, and the rows with the error that its residuals show."""
     scaled, solution = rows, solve(rows)
     for _ in range(3):
         squares = ((solution.residual / rows.sigma) ** 2).sum(axis=0)
         factor = _pooled(squares / np.maximum(solution.freedom, 1e-9), solution.freedom)
         scaled = rows._replace(sigma=rows.sigma * np.sqrt(factor))
         solution = solve(scaled, solution.unknowns)
-    return scaled, solution._replace(covariance=solution.covariance + _common_error(scaled, solution))
+    return scaled, solution
 
 
 def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
@@ -369,16 +363,6 @@ def possible_extras(rows: Rows) -> tuple[int, ...]:
     spring, slope = rows.layout.spring, rows.layout.slope
     slopes = [index for index, is_warm in zip(range(slope.start, slope.stop), warms.tolist(), strict=True) if is_warm]
     return (*range(spring.start, spring.stop), *slopes)
-
-
-def _common_error(rows: Rows, solution: Solution) -> np.ndarray:
-    """Return the covariance (count, count) that the error `FIT.common_error` of each joint and weight causes."""
-    torque = (rows.predicted(solution.unknowns) - solution.unknowns[rows.layout.offset]) / rows.sigma
-    loads, group = np.unique(rows.load, axis=0, return_inverse=True)
-    shared = np.arange(len(loads))[:, None, None, None] == group.reshape(-1, 1)
-    columns = FIT.common_error * torque * shared * np.eye(rows.layout.joints)[:, None, :]
-    change = columns.reshape(-1, torque.size) @ solution.inverse[:, : torque.size].T
-    return np.asarray(change.T @ change)
 
 
 def _pooled(factor: np.ndarray, freedom: np.ndarray) -> np.ndarray:
