@@ -24,8 +24,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN
-from exo_gravity.lab.calibration.record import line_of
-from exo_gravity.lab.calibration.tour import calibrator_table, side_of, tour_of
+from exo_gravity.lab.calibration.tour import calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, by_name, status_values
 from exo_gravity.nodes.ros.parameters import declare, given_to

@@ -119,12 +119,13 @@ def _run(options: argparse.Namespace) -> int:
     from exo_gravity.lab.calibration.result import check_output, page_of, write_changes
 
     command: str = options.command
+    check_output(options.output)
     if command == NEW:
         return _write_new(options)
     if command == ACCEPTANCE:
         return _accept(options, Person())
     options.record, page = options.output.with_suffix(".jsonl"), options.output.with_suffix(".html")
-    for path in (options.output, options.record, page):
+    for path in (options.record, page):
         check_output(path)
     for path in (options.bag, options.rests, options.earlier):
         if path is not None and not path.exists():
@@ -153,9 +154,7 @@ def _run(options: argparse.Namespace) -> int:
 def _write_new(options: argparse.Namespace) -> int:
     """Write the first file of an arm; return the exit code."""
     from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
-    from exo_gravity.lab.calibration.result import check_output
 
-    check_output(options.output)
     said = (getattr(options, name) for name in ("urdf", "motors", "ids", "joints", "hand", "side", "channel"))
     for note in write_new(NewArm(*said), options.output):
         print(note)
@@ -166,8 +165,6 @@ def _write_new(options: argparse.Namespace) -> int:
 def _accept(options: argparse.Namespace, person: "Person") -> int:
     """Run the bench acceptance; return the exit code."""
     from exo_gravity.lab.acceptance import Weight, accept_arm
-    from exo_gravity.lab.calibration.result import check_output
 
-    check_output(options.output)
     arm, weight = any_arm(options.params, options.side), Weight(options.mass, options.lever)
     return 0 if accept_arm(options.params, options.output, arm, weight, person) else 1

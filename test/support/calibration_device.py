@@ -26,8 +26,7 @@ from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
 from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
 from exo_gravity.lab.calibration.poses import Itinerary, guess_for, next_pose
-from exo_gravity.lab.calibration.record import line_of
-from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, side_of, tour_of
+from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of

@@ -25,8 +25,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.lab.calibration import live, recorded
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
-from exo_gravity.lab.calibration.record import observations_in
-from exo_gravity.lab.calibration.tour import CALIBRATOR, tour_of
+from exo_gravity.lab.calibration.tour import CALIBRATOR, observations_in, tour_of
 from exo_gravity.lab.calibration.tours import checked, friction_from, moments_from
 from exo_gravity.lab.calibration.wearer import wearer_from
 from exo_gravity.lab.calibration.worn_arm import worn_arm

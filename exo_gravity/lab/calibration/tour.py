@@ -4,9 +4,10 @@
 Pure: time is an argument. At each pose all joints sweep through it there and back: the mean of both directions is
 gravity, half of the difference is friction. What was measured improves the expected torque, which carries the arm and
 distinguishes a hand on it from its weight. The tour begins and ends at the hanging arm; after trouble it withdraws its
-efforts.
+efforts. Its record has one line of JSON for each pose, as `calibrator` prints it.
 """
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +23,7 @@ from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
-from exo_gravity.core.errors import ExoGravityError
+from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
 from exo_gravity.core.params import Param, table_for
@@ -31,7 +32,6 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
-from exo_gravity.lab.calibration.record import observations_in
 from exo_gravity.sim.controllers import SampleController
 
 # Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it
@@ -277,6 +277,23 @@ class TourController(SampleController):
         else:
             effort = self.tour.wait(position, self._tilt)
         return Efforts(effort, min(times), False, False)
+
+
+def line_of(observation: Observation) -> str:
+    """Return the line of an observation, without its end."""
+    return json.dumps({"observation": observation._asdict()}, default=np.ndarray.tolist)
+
+
+def observations_in(record: Path, joints: int) -> list[Observation]:
+    """Return what a tour of an arm of so many `joints` wrote to its `record`. Raises DataError if it is not one."""
+    try:
+        lines = record.read_text(encoding="utf-8").splitlines()
+        observations = [Observation(**json.loads(line)["observation"]) for line in lines]
+        if other := {len(one.theta) for one in observations} - {joints}:
+            raise ValueError(f"poses of {other.pop()} joints")
+        return observations
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{record}: {error}: must be the record (.jsonl) of a tour of this arm") from None
 
 
 ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's

@@ -31,10 +31,9 @@ from exo_gravity.lab.calibration.live import Say, tour_parameters
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
 from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
-from exo_gravity.lab.calibration.record import observations_in
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tour import urdf_moments
+from exo_gravity.lab.calibration.tour import observations_in, urdf_moments
 from exo_gravity.lab.inputs.arms import AnyArm
 from exo_gravity.lab.moments import MOMENTS
 
