@@ -71,6 +71,7 @@ class Wait(Word):
     REST = "rest"
     EFFORTS = "efforts"
     MOTORS_OFF = "motors_off"
+    TRUNK = "trunk"
     POSE = "pose"
     CALM = "calm"
     HOLD_STILL = "hold_still"

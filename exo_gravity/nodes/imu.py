@@ -18,9 +18,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
+from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
-from exo_gravity.core.trunk.inputs import NOT_REPORTED
+from exo_gravity.core.trunk.inputs import NOT_REPORTED, check_trunk
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -101,6 +102,8 @@ class ImuNode(Node):
         try:
             # The stamps of a record that is played back are not this computer's: the compensator refuses their age.
             orientation = self._estimator.update(sample, now if abs(now - sample.time) < SAME_CLOCK else None)
+            if orientation is not None:
+                check_trunk(Tilt.of_gravity(SIDES[0], orientation.gravity))
         except ParameterError as error:
             self._refused += 1
             self._refusal, self._refused_at = error, self._arrived

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck
@@ -365,6 +366,29 @@ def test_the_machine_does_what_the_row_says(name):
     arm = SafetyRun(**LIMITS_OF_ROW.get(name.split(":")[0], {}))
     for step in ROWS[name]:
         step(arm)
+
+
+@pytest.mark.parametrize(
+    ("pitch", "roll", "limits", "starts"),
+    [
+        (0.9, 0.0, {}, True),  # a person who bows, or sits back
+        (0.0, 3.1, {}, False),  # upside down, by an IMU that is mounted otherwise
+        (-1.57, 0.0, {}, False),
+        (-1.57, 0.0, {"start_tilt": 1.8}, True),  # a person who lies, as the parameters say
+    ],
+)
+def test_a_start_waits_for_a_trunk_near_upright_and_a_carried_arm_does_not(pitch, roll, limits, starts):
+    arm = SafetyRun(**limits)
+    arm.machine.motion.follow(Tilt.of("right", pitch, roll), None)
+    enable(arm)
+    wait(2.0)(arm)
+    assert (arm.machine.state is State.CHECKING) is not starts
+    assert starts or "near upright" in arm.machine.waiting_for
+    arm.machine.motion.follow(Tilt.of("right"), None)
+    until(State.ACTIVE, 20.0)(arm)
+    arm.machine.motion.follow(Tilt.of("right", pitch, roll), None)
+    wait(1.0)(arm)
+    see(State.ACTIVE)(arm)
 
 
 FAULTS: list[tuple[Step, str]] = [

@@ -89,16 +89,17 @@ BASE_FROM_TRUNK = {
 TIMEOUT = 0.08
 
 
-def great_circles(count=4):
-    """Gravity in the trunk's axes, (n, 3), on turns by 360 degrees about `count` axes, in steps of 0.5 degrees."""
-    angles = np.radians(np.arange(0.0, 360.0, 0.5))
+def great_circles(count=4, farthest=118.0):
+    """Gravity in the trunk's axes, (n, 3), on turns there and back about `count` axes, in steps of 0.5 degrees."""
+    steps = np.arange(0.0, farthest, 0.5)
+    angles = np.radians(np.concatenate((steps, steps[::-1], -steps, -steps[::-1])))
     for heading in np.arange(count) * math.pi / count:
         axis = np.array((math.cos(heading), math.sin(heading), 0.0))
         yield Rotation.from_rotvec(angles[:, None] * axis).apply(UPRIGHT)
 
 
 @pytest.mark.parametrize(("side", "by_angles"), [("left", False), ("right", False), ("left", True)])
-def test_bowed_beyond_90_degrees_lying_and_upside_down_the_torque_is_pinocchios_and_never_steps(side, by_angles):
+def test_lying_and_bowed_beyond_90_degrees_the_torque_is_pinocchios_and_never_steps(side, by_angles):
     reference = pinocchio(ROBOT)
     for circle in great_circles():
         run = CompensatorRun(side=side, use_imu=True)
@@ -115,6 +116,23 @@ def test_bowed_beyond_90_degrees_lying_and_upside_down_the_torque_is_pinocchios_
         expected = reference(np.tile(THETA, (len(circle), 1)), directions)
         np.testing.assert_allclose(efforts, expected, atol=1e-9)
         assert np.abs(np.diff(efforts, axis=0)).max() < 0.1  # Nm; 0.5 degrees of at most 5 Nm are 0.04
+
+
+UPSIDE_DOWN = {  # what an IMU shows of a person who stands
+    "a mounting written w, x, y, z: half a turn about x": Rotation.from_quat((1.0, 0.0, 0.0, 0.0)),
+    "an accelerometer whose sign is reversed": Rotation.from_euler("y", 180.0, degrees=True),
+    "a driver's own axes, z down": Rotation.from_euler("xyz", (180.0, 0.0, 30.0), degrees=True),
+}
+
+
+@pytest.mark.parametrize("shown", UPSIDE_DOWN.values(), ids=UPSIDE_DOWN)
+@pytest.mark.parametrize("bow", [0.0, 0.5, -0.9])
+def test_a_trunk_that_is_upside_down_is_refused_with_the_likely_causes(shown, bow):
+    run = CompensatorRun(use_imu=True)
+    gravity = shown.apply(Rotation.from_euler("y", -bow).apply(UPRIGHT))
+    with pytest.raises(ParameterError, match=r"within 120 degrees of upright.*order x, y, z, w.*\+9.8 upward.*z up"):
+        run.compensator.tilt.set_gravity(run.now, gravity)
+    assert run.cycle().effort is None
 
 
 def turning(axis, speed, age):

@@ -113,6 +113,18 @@ def missing_for_a_start(
     return Reason(Wait.REST, "the arm to be at rest") if is_moving else NO_REASON
 
 
+def missing_of_trunk(limits: Limits, tilt: float) -> Reason:
+    """Return what a trunk that is tilted by `tilt` rad from upright lacks for a start.
+
+    While the arm hangs, gravity's torque is 0 on a trunk that is upside down too: nothing else shows it.
+    """
+    if tilt <= limits.start_tilt:
+        return NO_REASON
+    tilted = f"it is tilted by {math.degrees(tilt):.0f} degrees, at most {math.degrees(limits.start_tilt):.0f}"
+    causes = "correct rotation_trunk_from_imu or the IMU's driver, or set start_tilt for a wearer who lies"
+    return Reason(Wait.TRUNK, f"a trunk near upright: {tilted}: {causes}")
+
+
 def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | None:
     """Return the fault that `effort` (n,) in Nm, asked for on an arm that hangs, shows, or None.
 

@@ -123,6 +123,12 @@ class Limits:
     sign_check_torque: float = owned(
         1.5, "largest test torque of the sign check; 0 skips the check", (0.0, 3.0), "Nm", expert=True
     )
+    start_tilt: float = owned(
+        1.05,
+        "tilt of the trunk from upright beyond which no start begins; for a wearer who lies 1.8",
+        (0.2, math.pi),
+        "rad",
+    )
     largest_moment: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
         "M1 to M4 of robot plus heaviest wearer, by `budget`; efforts beyond their need: a fault; zeros: not checked",

@@ -37,6 +37,7 @@ from exo_gravity.core.safety.gate import (
     SignCheck,
     SwitchOnCheck,
     missing_for_a_start,
+    missing_of_trunk,
     torque_while_hanging,
 )
 from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
@@ -299,7 +300,7 @@ class SafetyMachine:
                 self._trip(missing)
                 return
             missing = Reason(missing.code, missing.reason)
-        missing = self.hindrance or missing
+        missing = self.hindrance or missing or missing_of_trunk(limits, self.motion.trunk_tilt)
         if not missing and (effort is None or are_late):
             missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:

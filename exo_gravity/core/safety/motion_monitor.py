@@ -51,7 +51,7 @@ class MotionMonitor:
     """The unexplained impulse of each joint.
 
     limits.largest_moment: (n,) kg m; zeros switch the monitor off.
-    impulse: (n,) Nm s. full: (n,) Nm, the largest load.
+    impulse: (n,) Nm s. full: (n,) Nm, the largest load. trunk_tilt: rad from upright, as last told.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -69,7 +69,7 @@ class MotionMonitor:
 
         overtaken: from which the torque is guided, if the trunk has turned suddenly (`TiltInput.overtaken`).
         """
-        self._gravity = self._down(tilt)
+        self._gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
         if overtaken:
             self._overtaken = self._overtaken if self._guided else self._down(overtaken)
             self._guided = MOTION.guided

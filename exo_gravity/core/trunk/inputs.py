@@ -34,6 +34,10 @@ NO_ROTATION = ZERO  # rad/s
 class TiltLimits:
     """What a message of the tilt may say, and how long it is used."""
 
+    #: rad from upright: a person bows by 110 degrees at most. A quaternion in the order w, x, y, z, an accelerometer
+    #: whose sign is reversed, and a z axis that points down show a person who stands as upside down
+    upside_down: float = math.radians(120.0)
+
     speed: float = 5.0  #: rad/s, faster than a trunk can tilt
     #: rad, by which a tilt may deviate from a reference direction that follows the tilts no faster than `speed`. Noise
     #: stays within it; neither a jump nor many small ones in a row do
@@ -62,6 +66,14 @@ class TiltLimits:
 
 
 TILT = TiltLimits()
+
+
+def check_trunk(tilt: Tilt) -> None:
+    """Raise ParameterError for a trunk that is upside down: the IMU is not as its parameters or its driver say."""
+    if tilt.axis_angle > TILT.upside_down:
+        within = f"within {math.degrees(TILT.upside_down):.0f} degrees of upright, not upside down"
+        causes = "is each quaternion in the order x, y, z, w; is the acceleration +9.8 upward at rest; is z up?"
+        raise ParameterError("trunk tilt", [round(tilt.pitch, 2), round(tilt.roll, 2)], f"{within}: {causes}")
 
 
 class TiltInput:
@@ -154,6 +166,7 @@ class TiltInput:
             span = f"from {-TILT.lead:g} to {TILT.lag:g} s"
             expected = f"{span}: synchronise the clocks of the IMU driver and this computer"
             raise ParameterError("age of the trunk tilt by its stamp", round(age + lead, 3), expected)
+        check_trunk(tilt)
         lead = max(lead, -age)
         measured = now - max(0.0, age + lead)
         # Directions are compared, which are continuous where pitch and roll flip, in a bow through 90 degrees.

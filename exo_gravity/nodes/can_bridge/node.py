@@ -61,12 +61,15 @@ RECOVER = "EXO_GRAVITY_RECOVER"
 WITHOUT_LOG_FILE = ("--ros-args", "--disable-external-lib-logs")
 
 
-def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None]) -> None:
-    """Tell the loop's monitor where gravity points, as the trunk's tilt arrives; before that it is upright.
+def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None], is_monitored: bool) -> None:
+    """Tell the loop where gravity points, as the trunk's tilt arrives; before that it is upright.
 
-    The side is that of the node's namespace: a compensator with the wrong `side` does not decide it.
+    The side is that of the node's namespace: a compensator with the wrong `side` does not decide it. Without one, only
+    how far the trunk is from upright counts.
     """
     side = node.get_namespace().rpartition("/")[2]
+    if side not in SIDES and not is_monitored:
+        side = SIDES[0]
     if side not in SIDES:
         expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
         raise ParameterError("largest_moment", "given", expected)
@@ -122,8 +125,7 @@ class CanBridge(LifecycleNode):
         )
         self._report = operation.BridgeReport(self, self._arm, traffic, lease, services)
         prepare_transitions(self, self._prepare)
-        if any(limits.largest_moment):
-            _follow_gravity(self, lambda: self.loop)
+        _follow_gravity(self, lambda: self.loop, any(limits.largest_moment))
         self.create_timer(REPORT_PERIOD, self._on_report)
         operation.log_risks(self, self._arm.address[0], traffic, values["rate"])
         if values["autostart"]:
