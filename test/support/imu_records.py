@@ -21,16 +21,20 @@ def record(
     upright: float = 2.0,
     posture: tuple[float, float] = (0.0, 0.0),
     late: float = 0.0,
+    right: float = 0.25,
 ) -> ImuRecord:
     """Return 2 s upright, a bow in 1.5 s that leans sideways by `lean` rad, 2 s bowed, back, and 2 s upright.
 
-    late: s by which the bow follows the lean.
+    And then a lean to the right by `right` rad in the same way. late: s by which the bow follows its lean.
     """
-    time = np.arange(0.0, upright + 7.0 + late, 1.0 / RATE)
+    bowed = upright + 7.0 + late
+    time = np.arange(0.0, bowed + 7.0, 1.0 / RATE)
     s = np.interp(time, np.cumsum((0.0, upright, 1.5, 2.0, 1.5, 2.0)), (0.0, 0.0, 1.0, 1.0, 0.0, 0.0))
     share = s * s * (3.0 - 2.0 * s)
     delayed = np.interp(time - late, time, share)
-    pitch, roll = posture[0] + bow * delayed, posture[1] + lean * share
+    leant = np.interp(time - bowed, np.cumsum((0.0, 1.5, 2.0, 1.5)), (0.0, 1.0, 1.0, 0.0))
+    pitch = posture[0] + bow * delayed
+    roll = posture[1] + lean * share + right * leant * leant * (3.0 - 2.0 * leant)
     imu = SimulatedImu(ImuConfig(tuple(quaternion), RATE, seed=seed))
     rates = np.gradient(pitch, time), np.gradient(roll, time)
     samples = [imu.sample(TrunkState(*row)) for row in zip(pitch, roll, *rates, strict=True)]

@@ -92,6 +92,10 @@ SHAKEN = np.stack([np.sin(40.0 * TIME + phase) for phase in (0, 1, 2)], axis=1)
 USELESS = {  # what a record shows of no mounting, and what is said of it
     "a small bow": (record(STRAIGHT, bow=0.2), "the bow was 1[12] degrees, must be 20 or more"),
     "a lean, then a bow": (record(STRAIGHT, lean=0.5, late=0.7), "not about one axis"),
+    "no lean": (record(STRAIGHT, right=0.0), "there is no bow before a lean to the right"),
+    "a lean to the left": (record(STRAIGHT, right=-0.25), "the lean was to the left"),
+    "an accelerometer whose sign is reversed": (scaled(GOOD, force=-1.0), "the accelerometer's sign is reversed"),
+    "two bows": (record(STRAIGHT, bow=0.4, right=0.0, late=0.0), "there is no bow before a lean to the right"),
     "never upright": (record(STRAIGHT, upright=0.0), "must begin and end upright"),
     "wrong signs": (scaled(GOOD, rate=-1.0), "check units and signs"),
     "rates in degrees": (scaled(GOOD, rate=57.3), "."),

@@ -44,7 +44,7 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 ROTATION = "rotation_trunk_from_imu"
 REQUEST = (
     "stand upright for 3 s, bow straight ahead by 45 degrees or so, stay there for 3 s, stand upright again for 3 s; "
-    "bow three times in all"
+    "bow three times in all, then lean to your right by 15 degrees or so, stay there for 3 s, and stand upright again"
 )
 BLOCK = 0.25  # s
 STILL_RATE = 0.06  # rad/s; a person who stands still sways at 0.02
@@ -52,6 +52,7 @@ STILL_ACCELERATION = 0.4  # m/s^2
 MIN_STILL = 1.0  # s
 UPRIGHT = math.radians(8.0)  # within which two phases are the same posture
 MIN_BOW = math.radians(20.0)
+MIN_LEAN = math.radians(9.0)
 MAX_OFF_AXIS = math.radians(10.0)  # between the axes that gyroscope and accelerometer show
 MAX_WOBBLE = 0.35  # of the rotation, about other axes than its main one
 ANGLE_RATIO = (0.8, 1.25)  # of the gyroscope's angle to the accelerometer's
@@ -209,26 +210,33 @@ def still_phases(record: ImuRecord) -> list[Phase]:
 
 
 def mounting(record: ImuRecord) -> Mounting:
-    """Return the mounting that a record of standing, bowing and standing, once or several times, shows.
+    """Return the mounting that a record shows of a person who bows, once or several times, and then leans to the right.
 
-    Raises DataError, which says what to do, if there are no still phases upright, bowed and upright; if the bow is too
-    small or not about one axis; or if gyroscope and accelerometer contradict each other.
+    Between and after they stand upright. Bows alone look the same where the accelerometer's sign is reversed.
+
+    Raises DataError, which says what to do, if there are no still phases upright, bowed, leaning and upright; if the
+    bow is too small or not about one axis; if the lean is to the left; or if gyroscope and accelerometer contradict
+    each other.
     """
     phases = still_phases(record)
     if not phases:
         raise DataError("the IMU was never still for 1 s: stand still, bow, keep still, and stand upright again")
     bends = [angle_between(phase.up, phases[0].up) for phase in phases]
-    bow = max(bends)
-    if bow < MIN_BOW:
-        small = f"the bow was {math.degrees(bow):.0f} degrees, must be {math.degrees(MIN_BOW):.0f} or more"
-        raise DataError(f"{small}: bow farther, and stay there for 2 s")
     standing = [index for index, bend in enumerate(bends) if bend < UPRIGHT]
-    if standing[-1] < bends.index(bow):
-        raise DataError("the record must begin and end upright: stand for 2 s before the bow and after it")
+    if standing[-1] < bends.index(max(bends)):
+        raise DataError("the record must begin and end upright: stand for 2 s before each bow or lean, and after it")
     upright = np.array([phases[index].up for index in standing])
     z = mean_direction(upright)
     lowest = [(first, max(range(first, last), key=bends.__getitem__)) for first, last in pairwise(standing)]
-    bows = [(phases[first], phases[low]) for first, low in lowest if bends[low] >= MIN_BOW]
+    turns = [(phases[first], phases[low]) for first, low in lowest if bends[low] >= MIN_LEAN]
+    if len(turns) < 2:
+        raise DataError(f"there is no bow before a lean to the right: {REQUEST}")
+    bow = max(angle_between(bowed.up, before.up) for before, bowed in turns[:-1])
+    if bow < MIN_BOW:
+        small = f"the bow was {math.degrees(bow):.0f} degrees, must be {math.degrees(MIN_BOW):.0f} or more"
+        raise DataError(f"{small}: bow farther, and stay there for 2 s")
+    bows = [turn for turn in turns[:-1] if angle_between(turn[1].up, turn[0].up) >= MIN_BOW]
+    leant = turns[-1][1]
     across = np.cross([bowed.up for _, bowed in bows], z)
     axes = across / np.linalg.norm(across, axis=1, keepdims=True)
     y = mean_direction(axes)
@@ -238,6 +246,12 @@ def mounting(record: ImuRecord) -> Mounting:
     sideways = level / math.sin(min(bow, math.pi / 2)), float(np.mean(off_axis)) / 2.0
     heading = max(level, math.hypot(*sideways) / math.sqrt(len(bows)))
     rotation = Rotation.from_matrix(np.stack((np.cross(y, z), y, z)))
+    forward, left, _ = -rotation.apply(leant.up)
+    if abs(forward) > abs(left):
+        raise DataError("the last posture was no lean to the side: after the bows lean to your right, and stay for 3 s")
+    if left > 0.0:
+        cause = "if it was to the right, the accelerometer's sign is reversed: at rest it must show +9.8 upward"
+        raise DataError(f"the lean was to the left: {cause}")
     return Mounting(rotation.as_quat(canonical=True), np.array((level, level, heading)), bow, len(bows))
 
 
