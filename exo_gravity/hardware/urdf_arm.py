@@ -28,7 +28,7 @@ from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector, floats, one_float
-from exo_gravity.hardware.urdf_checks import check_masses, usable_efforts
+from exo_gravity.hardware.urdf_checks import check_masses, check_size, usable_efforts
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
 from exo_gravity.hardware.urdf_shape import LEAST_LENGTH, UrdfShape
@@ -113,8 +113,7 @@ class UrdfArm(UrdfShape):
         self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
         self._own_mass = max(self._tree.masses[self._numbers].tolist())
-        if not self._own_mass > 0.0:
-            raise ParameterError("mass of the URDF's links", self._own_mass, "above 0 kg: it lacks inertial elements")
+        check_size(self._moves, self._own_mass, self.length)
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
         self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
@@ -320,7 +319,13 @@ class UrdfArm(UrdfShape):
 
     def _torques(self, theta: np.ndarray, gravity: np.ndarray) -> np.ndarray:
         """Return the torque (m, n) in Nm, gains of 1, at `theta` (m, n) rad. gravity: (m, 3) m/s^2 in root axes."""
-        return self._moves.folded(self._tree.torques(self._moves.positions(theta), gravity).T).T
+        model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
+        model.gravity.angular = np.zeros(3)
+        torques = np.empty((len(theta), model.nv))
+        for row, down, at in zip(torques, gravity, self._moves.configurations(theta), strict=True):
+            model.gravity.linear = down
+            row[:] = self._pin.computeGeneralizedGravity(model, data, at)
+        return self._moves.folded(torques.T).T
 
     def _rows(self, theta: np.ndarray, gravity: np.ndarray, moments: LinkMoments) -> np.ndarray:
         """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""

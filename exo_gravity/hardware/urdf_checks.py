@@ -36,6 +36,9 @@ class UrdfLimits:
     poses: int = 100  #: that are tried
     gyration: float = 0.3  #: m, radius of gyration of a link about its own joint that no link of an arm has
     strong: float = 50.0  #: times gravity's largest torque: an effort limit that limits nothing, also of a worn arm
+    least_mass: float = 0.05  #: kg for each joint, lighter than any motor
+    most_mass: float = 40.0  #: kg, more than people can wear on an arm
+    reach: float = 2.0  #: m, from the first joint to the centre of gravity that is farthest from it
     weak: float = 0.5  #: share of gravity's largest torque at the joint, which an effort limit must reach
 
 
@@ -101,6 +104,7 @@ class UrdfJoints:
         except (RuntimeError, ValueError) as error:
             expected = f"a URDF that Pinocchio reads ({error})"
             raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
+        self.inertials = read_inertials(self.root, self.model)  #: of each link, by its name
         self._pin = pin
         self.names = tuple(joint_names)
         self._mimics = dict(_mimics(self.root))
@@ -137,6 +141,10 @@ class UrdfJoints:
         """Return the positions (m, nv) of the model's joints for the angles `theta` (m, n) in rad. Raises likewise."""
         self._check_others()
         return np.asarray(theta @ self._own.T + self._still)
+
+    def configurations(self, theta: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield Pinocchio's configuration (nq,) for each row of `theta` (m, n) in rad. Raises likewise."""
+        return map(self._configuration_at, self.positions(theta))
 
     def spread(self, values: Sequence[float]) -> np.ndarray:
         """Return the velocities or accelerations (nv,) of the model for the arm's (n,)."""
@@ -219,7 +227,12 @@ class UrdfJoints:
         kept = {*self.names, *(other.name for other in others)}
         names = enumerate(self.model.names)
         locked = [n for n, name in names if n and (name not in self._leaders or self._leaders[name].joint not in kept)]
-        self.model = self._pin.buildReducedModel(self.model, locked, self._configuration_at(self._still))
+        if locked:
+            try:
+                self.model = self._pin.buildReducedModel(self.model, locked, self._configuration_at(self._still))
+            except ValueError as error:  # Pinocchio looks frames up by name alone
+                twice = ", ".join(sorted({name for name in self.model.names if name in self.inertials}))
+                raise ParameterError("joints of the URDF", twice, f"named otherwise than its links ({error})") from None
         self.others = others
         self._couple()
 
@@ -312,6 +325,22 @@ class Inertial(NamedTuple):
         return self.mass > 0.0 and not any(self.cog) and xx == yy == zz and not any(products)
 
 
+def check_size(joints: UrdfJoints, mass: float, length: Sequence[float]) -> None:
+    """Raise ParameterError for what is no arm: its URDF is in other units, as CAD exports them, or lacks masses.
+
+    mass: kg that `joints` move. length: (n,) m of its links.
+    """
+    least, most = LIMITS.least_mass * len(length), LIMITS.most_mass
+    if not least <= mass <= most:
+        expected = f"{least:.2g} to {most:g} kg in all: it lacks inertial elements, or its masses are not in kg"
+        raise ParameterError("mass of the URDF's links", float(f"{mass:.4g}"), expected)
+    moved = dict(_moved(joints.root, joints.names))
+    reach = sum(length) + max(math.hypot(*joints.inertials[link].cog) for link in moved)
+    if not reach <= LIMITS.reach:
+        expected = f"at most {LIMITS.reach:g} m: are its lengths in m?"
+        raise ParameterError("reach of the URDF's links", float(f"{reach:.4g}"), expected)
+
+
 def check_masses(joints: UrdfJoints) -> tuple[str, ...]:
     """Return a sentence for each doubt about the masses that the arm moves.
 
@@ -320,7 +349,7 @@ def check_masses(joints: UrdfJoints) -> tuple[str, ...]:
     """
     moved = dict(_moved(joints.root, joints.names))  # by link: the joint before it
     links = {link.get("name", ""): link for link in joints.root.iter("link")}
-    inertials = {name: _inertial(link) for name, link in links.items()}
+    inertials = joints.inertials
     empty = [name for name in moved if not inertials[name].mass and any(map(links[name].findall, SHAPES))]
     own = [name for name in empty if moved[name] in joints.names]
     if own:
@@ -338,6 +367,31 @@ def check_masses(joints: UrdfJoints) -> tuple[str, ...]:
             raise ParameterError(f"mass of {named}", [inertials[name].mass for name in filled_in], expected)
         notes.append(f"the masses of these links look like placeholders, {share:.1%} of the torque: {named}")
     return tuple(notes)
+
+
+def read_inertials(root: Element, model: Pinocchio) -> dict[str, Inertial]:
+    """Return what a URDF says of the mass of each link, by its name, as `model` has it, too.
+
+    urdfdom drops an inertial that it cannot read (a tab, a blank, an entity), says so on stderr, and goes on.
+
+    Raises ParameterError for a mass that is negative or no number, and where Pinocchio's model has another one.
+    """
+    inertials = {link.get("name", ""): _inertial(link) for link in root.iter("link")}
+    carrier = {child: joint for joint, _, child in _joints(root)}
+    before = {child: parent for _, parent, child in _joints(root)}
+    groups: dict[str, list[str]] = {}  # links by the joint that moves them
+    for link in inertials:
+        at = link
+        while at in before and carrier[at] not in model.names:
+            at = before[at]
+        if at in before:
+            groups.setdefault(carrier[at], []).append(link)
+    for joint, links in groups.items():
+        stated, read = sum(inertials[link].mass for link in links), model.inertias[model.getJointId(joint)].mass
+        if not math.isclose(stated, read, rel_tol=1e-6, abs_tol=1e-9):
+            expected = f"written so that Pinocchio reads it, as 1.2: it reads {read:.4g} kg"
+            raise ParameterError(f"mass of {', '.join(links)}", stated, expected)
+    return inertials
 
 
 def _filled_in(inertials: dict[str, Inertial]) -> list[str]:
@@ -377,16 +431,22 @@ def _mimics(root: Element) -> Iterator[tuple[str, Mimic]]:
             yield joint.get("name", ""), Mimic(mimic.get("joint", ""), *numbers)
 
 
+def _joints(root: Element) -> Iterator[tuple[str, str, str]]:
+    """Yield the name of each joint, its parent link and its child link."""
+    for joint in root.findall("joint"):
+        parent, child = joint.find("parent"), joint.find("child")
+        if parent is not None and child is not None:
+            yield joint.get("name", ""), parent.get("link", ""), child.get("link", "")
+
+
 def _moved(root: Element, joint_names: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Yield each link that the arm's joints move, with the name of the joint before it."""
     after: dict[str, list[tuple[str, str]]] = {}
     ends = []
-    for joint in root.findall("joint"):
-        name, parent, child = joint.get("name", ""), joint.find("parent"), joint.find("child")
-        if parent is not None and child is not None:
-            after.setdefault(parent.get("link", ""), []).append((child.get("link", ""), name))
-            if name in joint_names:
-                ends.append((child.get("link", ""), name))
+    for name, parent, child in _joints(root):
+        after.setdefault(parent, []).append((child, name))
+        if name in joint_names:
+            ends.append((child, name))
     seen: set[str] = set()
     while ends:
         link, joint_name = ends.pop()
@@ -397,13 +457,22 @@ def _moved(root: Element, joint_names: Sequence[str]) -> Iterator[tuple[str, str
 
 
 def _inertial(link: Element) -> Inertial:
-    """Return what the URDF says of a link's mass, zeros where it says nothing."""
+    """Return what the URDF says of a link's mass, zeros where it says nothing. Raises ParameterError."""
     inertial = link.find("inertial")
-    parts = {} if inertial is None else {part.tag: part for part in inertial}
+    parts = {} if inertial is None else {part.tag: part.attrib for part in inertial}
 
-    def numbers(tag: str, names: Sequence[str]) -> tuple[float, ...]:
-        return tuple(float(parts[tag].get(name, "0")) if tag in parts else 0.0 for name in names)
+    def numbers(tag: str, *names: str) -> tuple[float, ...]:
+        texts = [word for name in names for word in parts.get(tag, {}).get(name, "0").split()]
+        try:
+            values = tuple(map(float, texts))
+        except ValueError:
+            values = (math.nan,)
+        if not all(map(math.isfinite, values)):
+            raise ParameterError(f"{tag} of the link {link.get('name')}", " ".join(texts), "finite numbers, as 1.2")
+        return values
 
-    origin = parts["origin"].get("xyz", "0 0 0") if "origin" in parts else "0 0 0"
-    cog = tuple(float(number) for number in origin.split())
-    return Inertial(numbers("mass", ["value"])[0], cog, numbers("inertia", ["ixx", "iyy", "izz", "ixy", "ixz", "iyz"]))
+    mass = numbers("mass", "value")[0]
+    if mass < 0.0:
+        raise ParameterError(f"mass of the link {link.get('name')}", mass, "0 kg or more")
+    cog = numbers("origin", "xyz") if parts.get("origin", {}).get("xyz") else (0.0, 0.0, 0.0)
+    return Inertial(mass, cog, numbers("inertia", "ixx", "iyy", "izz", "ixy", "ixz", "iyz"))

@@ -1,9 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where the joints of an arm from a URDF are, and what gravity asks of each, in many poses at once, by NumPy.
+"""Where the joints of an arm from a URDF are, and what each first moment asks of them, in many poses at once, by NumPy.
 
-Pinocchio computes one pose a call. Here each step of Newton-Euler for gravity alone is done for a block of poses:
-outwards gravity in the frame of each joint, inwards the first moment of all that the joint moves, about its origin. The
-torque of a joint about its axis a is a . (g x S), the force of one that slides is -m a . g.
+Pinocchio computes one pose a call, and a calibration asks for thousands again and again.
 """
 
 from __future__ import annotations
@@ -14,13 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-BLOCK = 4096  # poses at once: what is computed on the way stays in the processor's cache
 # (3, 9): each row the matrix that multiplies crosswise by the unit vector along an axis, from the left.
 CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
 
 
 class TreeJoint(NamedTuple):
-    """One joint. Its own frame is Pinocchio's; the frame about its axis is one whose z axis that is."""
+    """One joint, in its own frame, which is Pinocchio's."""
 
     parent: int  #: number of the joint before it; -1 for the root link
     turn: np.ndarray  #: (3, 3) from its own frame while it is at 0, to that of the joint before it
@@ -28,8 +25,6 @@ class TreeJoint(NamedTuple):
     axis: np.ndarray  #: (3,) unit vector in its own frame
     slides: bool  #: along its axis; else it turns about it
     mass: float  #: kg of its link and of all beyond it
-    moment: np.ndarray  #: (3,) kg m, of its link and, in their origins, of all beyond it, in the frame about its axis
-    outwards: np.ndarray  #: (3, 3) from the frame about the axis before it to its own one, while it is at 0
 
 
 class Frames(NamedTuple):
@@ -106,17 +101,6 @@ class JointTree:
         ways = parents @ self._places + before @ self._sliding * positions[:, :, None, None]
         return Frames(before, after, self.moves.T @ ways[..., 0])
 
-    def torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-        """Return what each joint must give to hold its links, (m, nv) Nm or N.
-
-        positions: (m, nv) rad or m. gravity: (m, 3) m/s^2 in the root link's axes.
-        """
-        result = np.empty(positions.shape)
-        for begin in range(0, len(positions), BLOCK):
-            part = slice(begin, begin + BLOCK)
-            result[part] = self._torques(positions[part].T.copy(), gravity[part].T.copy()).T
-        return result
-
     def moments(self, links: Sequence[int], ways: Sequence[np.ndarray]) -> LinkMoments:
         """Return first moments of links, for `rows`: they are the same in all poses.
 
@@ -128,51 +112,12 @@ class JointTree:
     def rows(self, positions: np.ndarray, gravity: np.ndarray, moments: LinkMoments) -> np.ndarray:
         """Return what each joint must give per first moment of a link, (m, nv, k) in Nm per kg m.
 
-        positions, gravity: as in `torques`.
+        positions: (m, nv) rad or m. gravity: (m, 3) m/s^2 in the root link's axes.
         """
         turned = self.turned(positions)
         levers = (turned @ self._turning)[..., 0] @ _across(gravity)  # axis x gravity
         ways = (turned[:, moments.links] @ moments.ways)[..., 0]
         return np.asarray(levers @ ways.swapaxes(1, 2) * moments.turned_by)
-
-    def _torques(self, positions: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-        """Return the torques (nv, m). positions: (nv, m). gravity: (3, m)."""
-        sine, cosine = _sine_and_cosine(positions)
-        felt = np.empty((len(positions), *gravity.shape))  # gravity in the frames about the axes
-        for n, joint in enumerate(self._joints):
-            own = joint.outwards @ (gravity if joint.parent < 0 else felt[joint.parent])
-            if joint.slides:
-                felt[n] = own
-            else:
-                _turn_about_z(own, cosine[n], -sine[n], felt[n])
-        moment = [np.repeat(joint.moment[:, None], positions.shape[1], axis=1) for joint in self._joints]
-        torque = np.empty_like(positions)
-        for n in reversed(range(len(positions))):
-            joint, own, down = self._joints[n], moment.pop(), felt[n]
-            if joint.slides:
-                torque[n] = -joint.mass * down[2]
-                own[2] += joint.mass * positions[n]
-            else:
-                np.subtract(own[1] * down[0], own[0] * down[1], out=torque[n])
-                _turn_about_z(own, cosine[n], sine[n], own)
-            if joint.parent >= 0:
-                moment[joint.parent] += joint.outwards.T @ own
-        return torque
-
-
-def _sine_and_cosine(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both by the tangent of half the angle, as `core.arm.gravity` does: they take most of the time."""
-    tangent = np.tan(0.5 * angle)
-    one_plus_cosine = 2.0 / (1.0 + tangent * tangent)
-    return tangent * one_plus_cosine, one_plus_cosine - 1.0
-
-
-def _turn_about_z(vectors: np.ndarray, cosine: np.ndarray, sine: np.ndarray, out: np.ndarray) -> None:
-    """Write vectors (3, m) turned about the z axis to `out`, which may be the same."""
-    x, y, z = vectors
-    turned = sine * x + cosine * y
-    np.subtract(cosine * x, sine * y, out=out[0])
-    out[1], out[2] = turned, z
 
 
 def _across(vectors: np.ndarray) -> np.ndarray:
@@ -185,29 +130,10 @@ def _joints(pin: Any, model: Any) -> Iterator[TreeJoint]:
     data = model.createData()
     pin.computeJointJacobians(model, data, pin.neutral(model))
     pin.computeSubtreeMasses(model, data)
-    numbers = range(1, model.njoints)  # 0 is the root link
-    axes, slide = [], []
-    for number in numbers:
+    for number in range(1, model.njoints):  # 0 is the root link
         jacobian = np.reshape(pin.getJointJacobian(model, data, number, pin.ReferenceFrame.LOCAL), (6, -1))
         along, about = np.split(jacobian[:, model.joints[number].idx_v], 2)
-        slide.append(bool(np.any(along)))
-        axes.append(along if slide[-1] else about)
-    about_axes = [_frame_about(axis) for axis in axes]
-    for n, number in enumerate(numbers):
-        link, place, parent = model.inertias[number], model.jointPlacements[number], model.parents[number] - 1
-        moment = link.mass * link.lever
-        for other in numbers:
-            if model.parents[other] == number:
-                moment = moment + data.mass[other] * model.jointPlacements[other].translation
-        before = np.eye(3) if parent < 0 else about_axes[parent]
-        outwards = (before.T @ place.rotation @ about_axes[n]).T
-        yield TreeJoint(
-            parent, place.rotation.copy(), place.translation.copy(), axes[n], slide[n], float(data.mass[number]),
-            about_axes[n].T @ moment, outwards,
-        )  # fmt: skip
-
-
-def _frame_about(axis: np.ndarray) -> np.ndarray:
-    """Return a rotation (3, 3) whose third column is `axis` (3,)."""
-    across = np.linalg.svd(axis[None])[2][1]
-    return np.column_stack((across, np.cross(axis, across), axis))
+        slides, place = bool(np.any(along)), model.jointPlacements[number]
+        turn, way = place.rotation.copy(), place.translation.copy()
+        axis, mass = along if slides else about, float(data.mass[number])
+        yield TreeJoint(model.parents[number] - 1, turn, way, axis, slides, mass)

@@ -76,6 +76,8 @@ class UrdfConfig(JointConfig):
         arm = self.motors_apart(self._with_mechanics(elastic.compile()))
         root = spec.worldbody.first_body()
         root.add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
+        # In place of its own inertia, which does not matter; a full one, with products, would count beside this one.
+        root.fullinertia = (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
         root.mass, root.inertia, root.explicitinertial = 1.0, (1.0, 1.0, 1.0), True
         return arm, self._with_mechanics(spec.compile())
 

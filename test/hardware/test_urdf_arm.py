@@ -130,7 +130,13 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law_bar
     (ONE_LINK.replace('xyz="0 1 0"', 'xyz="0 0 0"').format(mass=1, kind="revolute"), "j", "axis of j = '0 0 0'"),
     (ONE_LINK.format(mass=1, kind="prismatic"), "j", "it has none"),
     (ONE_LINK.format(mass=1, kind="revolute"), "k", r"turning joints of the URDF \(j\)"),
-    (ONE_LINK.format(mass=0, kind="revolute"), "j", "above 0 kg"),
+    (ONE_LINK.format(mass=0, kind="revolute"), "j", "0.05 to 40 kg in all"),
+    (ONE_LINK.format(mass=-1, kind="revolute"), "j", "mass of the link link = -1.0: must be 0 kg or more"),
+    (ONE_LINK.format(mass="nan", kind="revolute"), "j", "mass of the link link = 'nan': must be finite numbers"),
+    (ONE_LINK.format(mass="1,2", kind="revolute"), "j", "mass of the link link = '1,2': must be finite numbers"),
+    (ONE_LINK.format(mass=" 1.2 ", kind="revolute"), "j", "it reads 0 kg"),  # as urdfdom drops the inertial
+    (ONE_LINK.format(mass=1e3, kind="revolute"), "j", "0.05 to 40 kg in all"),  # g
+    (ONE_LINK.format(mass=1e-3, kind="revolute"), "j", "0.05 to 40 kg in all"),  # t
     (ONE_LINK.replace('child link="link"', 'child link="x"').format(mass=1, kind="revolute"), "j", "Pinocchio reads"),
 ])  # fmt: skip
 def test_a_description_that_cannot_be_used_is_refused_with_the_reason(text, joint, problem):
