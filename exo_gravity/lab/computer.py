@@ -31,7 +31,7 @@ from exo_gravity.lab.adapters import of_opening
 from exo_gravity.lab.findings import Finding, Level, judged
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.node_checks import check_nodes
-from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_buses, check_names, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages
 from exo_gravity.lab.packages import MissingPackageError, check_packages
 
 LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
@@ -288,8 +288,6 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
 
 def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     """Return every finding; seconds: for which wake-ups are measured. Raises ParameterError."""
-    check_buses(nodes)
-    check_names(nodes)
     check_nodes(nodes)
     bridges = {node: node_values(nodes, node, CAN_BRIDGE) for node in stages(nodes)[0]}
     buses = list(of_buses(nodes, bridges, root))

@@ -87,7 +87,7 @@ def test_wrong_use_ends_with_2_and_a_sentence(tool, words, sentence, tmp_path, m
     assert f"{tool}: " in said.splitlines()[-1] and sorted(tmp_path.iterdir()) == before
 
 
-BRIDGE, COMPENSATOR = "/right/can_bridge", "/right/compensator"
+BRIDGE, COMPENSATOR, SIMULATOR = "/right/can_bridge", "/right/compensator", "/right/simulator"
 NODES = yaml.safe_load((CONFIG / "sim.yaml").read_text())
 CAN = NODES[BRIDGE]["ros__parameters"]["can"]
 BITRATES = {**CAN, "options": {**CAN["options"], "bitrate": [500_000, 1_000_000]}}
@@ -101,10 +101,14 @@ REFUSED_FILES: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
     "a tool": ({"/right/budget": {}}, "node name = '/right/budget'", EXECUTABLES),
     "two bridges on one bus": (
         {"/left/can_bridge": {"can": CAN, "can_id": [9, 8, 7, 5]}},
-        "/right/can_bridge can = {'can.channel': '239.74.163.2'",
-        "must be different from the bus of /left/can_bridge: one arm per bus",
+        "/left/can_bridge can = {'can.channel': '239.74.163.2'",
+        "must be different from the bus of /right/can_bridge: one arm per bus",
     ),
     "two orders of joints": ({BRIDGE: {"joint_names": JOINTS[::-1]}}, f"{BRIDGE} joint_names", f"of {COMPENSATOR}"),
+    "another order in the simulator": ({SIMULATOR: {"joint_names": JOINTS[::-1]}}, f"{BRIDGE} joint_names", SIMULATOR),
+    "a side that is not the namespace's": ({COMPENSATOR: {"side": "left"}}, f"{COMPENSATOR} side = 'left'", "be right"),
+    "a second imu": ({"/right/imu": {}}, "params = ['/imu', '/right/imu']", "one imu, which serves both arms"),
+    "an expression": ({BRIDGE: {"zero": [0.0, "pi/8", 0.0, 0.0]}}, f"{BRIDGE} zero = 'pi/8'", "must be a number"),
     "an option that not every motor has": (
         {BRIDGE: {"can": BITRATES}}, f"{BRIDGE} can.options.bitrate = [500000, 1000000]", "must be one value",
     ),

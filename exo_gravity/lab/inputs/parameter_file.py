@@ -17,6 +17,7 @@ from typing import Any
 import yaml
 
 from exo_gravity import packaged
+from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of
 from exo_gravity.core.params import joint_count
@@ -80,7 +81,20 @@ def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
     return found
 
 
-def check_buses(nodes: Nodes) -> None:
+def check_together(nodes: Nodes) -> None:
+    """Raise ParameterError for nodes that contradict each other: buses, names of joints, sides, a second IMU."""
+    _check_buses(nodes)
+    _check_names(nodes)
+    for node, given in nodes.items():
+        of_namespace, side = node.split("/")[-2], given.get("side")
+        if side in SIDES and of_namespace in SIDES and side != of_namespace:
+            raise ParameterError(f"{node} side", side, f"{of_namespace}, as its namespace says")
+    imus = [node for node in nodes if node.endswith("/imu")]
+    if len(imus) > 1:
+        raise ParameterError("params", imus, "a file with one imu, which serves both arms: all publish /imu/pitch_yaw")
+
+
+def _check_buses(nodes: Nodes) -> None:
     """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node in stages(nodes)[0]:
@@ -96,13 +110,14 @@ def check_buses(nodes: Nodes) -> None:
                 raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
 
 
-def check_names(nodes: Nodes) -> None:
-    """Raise ParameterError if bridge and compensator of an arm name its joints in different orders.
+def _check_names(nodes: Nodes) -> None:
+    """Raise ParameterError if the nodes of an arm name its joints in different orders.
 
     Efforts are looked up by name: the motors of two exchanged names would each get the torque of the other.
     """
     for node in stages(nodes)[0]:
-        compensator = f"{node.rpartition('/')[0]}/compensator"
-        own, others = (nodes.get(name, {}).get("joint_names") for name in (node, compensator))
-        if own and others and list(own) != list(others):
-            raise ParameterError(f"{node} joint_names", list(own), f"those of {compensator}, {list(others)}")
+        for executable in ("compensator", "simulator"):
+            other = f"{node.rpartition('/')[0]}/{executable}"
+            own, others = (nodes.get(name, {}).get("joint_names") for name in (node, other))
+            if own and others and list(own) != list(others):
+                raise ParameterError(f"{node} joint_names", list(own), f"those of {other}, {list(others)}")
