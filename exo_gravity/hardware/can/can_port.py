@@ -12,6 +12,7 @@ process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it doe
 """
 
 import contextlib
+import errno
 import select
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -51,6 +52,9 @@ def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.Bu
             bus.channel_info = f"{interface} {channel}"
         return bus
     except Exception as error:  # backends raise errors of every type
+        if isinstance(error, OSError) and error.errno == errno.EAFNOSUPPORT:
+            lacks = "this kernel has no SocketCAN: modprobe can can_raw; WSL2 and some containers lack it"
+            raise BusError(f"CAN bus {interface} {channel} cannot be opened: {lacks}") from error
         raise BusError(f"CAN bus {interface} {channel} {dict(options)} cannot be opened: {error}") from error
 
 

@@ -40,6 +40,7 @@ from exo_gravity.lab.bag.layout import Batch, records_at
 MAGIC = b"\x89MCAP0\r\n"
 ROS_1_MAGIC = b"#ROSBAG"
 ZSTD = b"\x28\xb5\x2f\xfd"  # with which zstd's data begin; CDR begins with 0
+WRITE_AHEAD = b"\x02\x02"  # at byte 18 of a database whose newest data are in a second file
 MESSAGE_OPCODE = int(Opcode.MESSAGE)  # a plain number is faster to compare than an enumeration
 RECORD = struct.Struct("<BQ")  # opcode, length of the content
 LAYOUT: Any = {
@@ -207,7 +208,8 @@ class Storage:
             try:
                 database, topics = _open_database(file, stack)
             except (sqlite3.Error, OSError) as error:
-                raise DataError(f"{file}: not a rosbag2 database ({_one_line(error)})") from None
+                why = _why_unread(file) or f"not a rosbag2 database ({_one_line(error)})"
+                raise DataError(f"{file}: {why}") from None
             self.topics.update(topics.values())
             chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
             query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({','.join('?' * len(chosen))})"
@@ -464,6 +466,18 @@ def _connected(uri: str, stack: ExitStack) -> tuple[sqlite3.Connection, dict[int
         raise
     stack.callback(database.close)
     return database, {key: (str(topic), str(kind)) for key, topic, kind in rows}
+
+
+def _why_unread(file: Path) -> str:
+    """Return what a database lacks that was copied by itself; '' if that does not show."""
+    with suppress(OSError), file.open("rb") as data:
+        header = data.read(100)
+        if not header:
+            return "the file is empty"
+        log = file.with_name(f"{file.name}-wal")  # sqlite itself may have made an empty one
+        if header[18:20] == WRITE_AHEAD and not (log.exists() and log.stat().st_size):
+            return f"its data are in its write-ahead log: copy {file.name}-wal, too"
+    return ""
 
 
 def _one_line(error: Exception) -> str:

@@ -248,10 +248,23 @@ def replaced(was: bytes, becomes: bytes) -> Callable[[Path], object]:
     return lambda file: file.write_bytes(file.read_bytes().replace(was, becomes))
 
 
+def without_its_log(file: Path) -> None:
+    """Copy a database that is being written, without the log beside it."""
+    copy = file.with_suffix(".copy")
+    with contextlib.closing(sqlite3.connect(copy)) as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("CREATE TABLE topics(id, name, type)")
+        database.commit()
+        file.write_bytes(copy.read_bytes())
+    copy.unlink()
+
+
 CUT = "the compressed file is cut or damaged"
 DAMAGE = {  # the form, what is done to its file, and what is said
     "CREATE": (FORMS[0], replaced(b"CREATE TABLE topics", b"CREA\xccE TABLE topics"), "not a rosbag2 database"),
     "BLOB": (FORMS[0], replaced(b"data BLOB NOT", b"data BLOB`NOT"), "not a rosbag2 database"),
+    "log": (FORMS[0], without_its_log, "its data are in its write-ahead log: copy .*-wal, too"),
+    "empty": (FORMS[0], lambda file: file.write_bytes(b""), "the file is empty"),
     "texts": (FORMS[0], with_topics_as_texts, f"the recording is damaged: parts left out: {len(CONTENT)}"),
     "half": (FORMS[4], lambda file: made.cut(file, 0.5), CUT),
     "head": (FORMS[4], lambda file: file.write_bytes(bytes(4) + file.read_bytes()[4:]), CUT),
