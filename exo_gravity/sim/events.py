@@ -19,7 +19,7 @@ RAMP_STEPS = 20  # in which an IMU's error grows, or a motor warms
 WARMING = 4.0  # s
 
 
-def during(rig: Rig, duration: float, begin: Callable[[], object], end: Callable[[], object]) -> None:
+def during(rig: Rig, duration: float, begin: Callable[[], None], end: Callable[[], None]) -> None:
     """Call `begin` now and `end` in `duration` s, never if that is infinite."""
     begin()
     if math.isfinite(duration):

@@ -9,7 +9,7 @@ import resource
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from ..support.load import start_frames, start_spin
 from .fault_case import Action
 from .rig import Rig
 
-Steps = list[dict[str, Any]]
+Steps = Sequence[Mapping[str, Any]]
 
 START_LIMIT = 15.0  # s for a process that must refuse its parameters
 FILE_SIZE_LIMIT = 50_000  # bytes

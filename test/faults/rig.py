@@ -89,10 +89,10 @@ class Rig:
         """Rate and time-outs of the nodes."""
         return REAL if self.shipped_timeouts else SIMULATED
 
-    def write_script(self, name: str, steps: list[dict[str, Any]]) -> Path:
+    def write_script(self, name: str, steps: Sequence[Mapping[str, Any]]) -> Path:
         """Write a trial script and return its path."""
         path = self.folder / f"{name}.yaml"
-        path.write_text(yaml.safe_dump({"name": name, "steps": steps}))
+        path.write_text(yaml.safe_dump({"name": name, "steps": [*map(dict, steps)]}))
         return path
 
     def _device_nodes(self) -> LaunchedNodes:

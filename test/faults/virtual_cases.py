@@ -178,7 +178,12 @@ def only_the_assistance_ends(records: np.ndarray, until: float = GONE_FOR) -> st
 
 def outer_loop(**changes: Any) -> Action:
     """Change what an outer loop does."""
-    return lambda rig: [setattr(rig.outer_loop, name, value) for name, value in changes.items()] and None
+
+    def act(rig: Any) -> None:
+        for name, value in changes.items():
+            setattr(rig.outer_loop, name, value)
+
+    return act
 
 
 def outer_loop_case(name: str, inject: Action, reason: str, **options: Any) -> FaultCase:

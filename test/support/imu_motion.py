@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -62,7 +64,8 @@ class Motion:
 
     def at(self, samples: np.ndarray | slice) -> Motion:
         """Return some of the samples, or some of them more than once."""
-        arrays = {name: value[samples] for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+        values = vars(self).items()
+        arrays: dict[str, Any] = {name: value[samples] for name, value in values if isinstance(value, np.ndarray)}
         return replace(self, **arrays)
 
 
@@ -189,6 +192,10 @@ def there_and_back(at: float, over: float, change: np.ndarray, hold: float) -> l
     return [Part(at, over, change), Part(at + over + hold, over, -change)]
 
 
+def swinging(swing: str, at: float, over: float, size: float) -> list[Part]:
+    return [Part(at, 6.0 + 4.0 * size, swing=swing)]
+
+
 # What people do from `at` s on, in `over` s; size: -1 to 1.
 DOINGS: dict[str, Callable[[float, float, float], list[Part]]] = {
     "bow": lambda at, over, size: there_and_back(at, over, (0.7 + 0.5 * size) * PITCH, max(0.0, 3.0 * size)),
@@ -198,8 +205,7 @@ DOINGS: dict[str, Callable[[float, float, float], list[Part]]] = {
                                    Part(at + 1.0, 0.1, swing="impact"), Part(at + 1.1, 0.8, -0.6 * PITCH)],
     "jump": lambda at, over, size: [Part(at, 0.6, 0.6 * PITCH), Part(at + 0.4, 0.6, 0.4 * UP + 0.3 * AHEAD),
                                     Part(at + 0.6, 0.6, -0.6 * PITCH)],
-    **{swing: lambda at, over, size, swing=swing: [Part(at, 6.0 + 4.0 * size, swing=swing)]
-       for swing in ("walk", "clap", "nod")},
+    **{swing: partial(swinging, swing) for swing in ("walk", "clap", "nod")},
 }  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core import ArmModel
 
 PARTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
+NAMES = tuple(f"right_{part}" for part in PARTS)
 POSE = (0.2, 0.9, 0.7, 0.6)  # rad
 ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 PERIOD = 0.005  # s
@@ -28,7 +29,7 @@ class StillArm:
     def __init__(
         self,
         node: Node,
-        names: Sequence[str] = tuple(f"right_{part}" for part in PARTS),
+        names: Sequence[str] = NAMES,
         pose: Sequence[float] = POSE,
     ) -> None:
         self.effort: Sequence[float] = ()
