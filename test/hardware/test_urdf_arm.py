@@ -18,7 +18,6 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
-from exo_gravity.hardware import urdf_tree
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
@@ -160,8 +159,7 @@ def branched() -> UrdfArm:
 
 
 @pytest.mark.parametrize("count", [1, 3, 7, 0], ids=lambda count: f"{count} joints" if count else "branches")
-def test_many_poses_at_once_have_the_torques_that_pinocchio_computes_for_each(count, monkeypatch):
-    monkeypatch.setattr(urdf_tree, "BLOCK", 150)
+def test_many_poses_at_once_have_the_torques_and_moments_that_each_has_alone(count):
     random = np.random.default_rng(5)
     arm = worn(count, random) if count else branched()
     theta = random.uniform(-3.0, 3.0, (POSES, len(arm.names)))

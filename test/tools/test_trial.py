@@ -428,7 +428,7 @@ CLIPS = {  # the file, the speed, the graphics libraries, the packages that are 
     "no folder": ("missing/clip.gif", 1.0, {"EGL"}, (), "a file in a folder that exists"),
     "no speed": ("clip.gif", 0.0, {"EGL"}, (), "a number from 0.1 to 100"),
     "a speed that is none": ("clip.gif", float("nan"), {"EGL"}, (), "a number from 0.1 to 100"),
-    "no encoder": ("clip.gif", 1.0, {"EGL"}, ("no_such_encoder",), r"no_such_encoder .*\.\[video\]"),
+    "no encoder": ("clip.gif", 1.0, {"EGL"}, ("no_such_encoder",), r"no_such_encoder is not installed: .*sim"),
     "no graphics": ("clip.gif", 1.0, set(), (), "apt install libegl1"),
     "other graphics": ("clip.gif", 1.0, {"OSMesa"}, (), "apt install libegl1"),
 }
