@@ -1,6 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every node shares, over real DDS in this process: subscriptions outside the executor, the parameters of other
-nodes, standard services and requests that wait, the clock, signals, discovery, and numbers on /diagnostics.
+"""What every node shares, over real DDS in this process.
+
+Subscriptions outside the executor, the parameters of other nodes, standard services and requests that wait, the clock,
+signals, discovery, and numbers on /diagnostics.
 """
 
 from __future__ import annotations

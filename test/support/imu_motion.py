@@ -100,7 +100,7 @@ def follow(motion: Motion) -> Outcome:
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles (n,) in degrees between unit vectors (n, 3)."""
+    """Return how far unit vectors (n, 3) are apart, (n,) in degrees."""
     return np.degrees(2.0 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
