@@ -377,15 +377,14 @@ def read_inertials(root: Element, model: Pinocchio) -> dict[str, Inertial]:
     Raises ParameterError for a mass that is negative or no number, and where Pinocchio's model has another one.
     """
     inertials = {link.get("name", ""): _inertial(link) for link in root.iter("link")}
-    carrier = {child: joint for joint, _, child in _joints(root)}
-    before = {child: parent for _, parent, child in _joints(root)}
+    before = {child: (joint, parent) for joint, parent, child in _joints(root)}
     groups: dict[str, list[str]] = {}  # links by the joint that moves them
     for link in inertials:
-        at = link
-        while at in before and carrier[at] not in model.names:
-            at = before[at]
-        if at in before:
-            groups.setdefault(carrier[at], []).append(link)
+        joint, at = before.get(link, ("", ""))
+        while joint and joint not in model.names:  # a fixed one
+            joint, at = before.get(at, ("", ""))
+        if joint:
+            groups.setdefault(joint, []).append(link)
     for joint, links in groups.items():
         stated, read = sum(inertials[link].mass for link in links), model.inertias[model.getJointId(joint)].mass
         if not math.isclose(stated, read, rel_tol=1e-6, abs_tol=1e-9):

@@ -193,6 +193,15 @@ class SimulatedDevice:
             if not outbox:
                 on_idle(last)
 
+    def command_of(self, message: can.Message) -> Frame | None:
+        """Return the frame of a message, None for one that is no command.
+
+        No command are an error frame, CAN FD that the boards do not know, and a reply, which begins with its own ID.
+        """
+        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+        is_unknown = message.is_error_frame or (message.is_fd and not any(self.is_fd))
+        return None if is_unknown or list(message.data[:1]) == [frame_id] else (frame_id, bytes(message.data))
+
     def _receive(self, bus: can.BusABC, timeout: float) -> tuple[Frame | None, float]:
         """Return the next command, or None, and its age in s. A remote frame is returned without data."""
         try:
@@ -202,12 +211,10 @@ class SimulatedDevice:
             if error.__cause__ is None or isinstance(error.__cause__, OSError):
                 raise BusError(f"receiving on {bus.channel_info} failed: {error}") from error
             return None, 0.0
-        if message is None or message.is_error_frame or (message.is_fd and not any(self.is_fd)):
+        frame = self.command_of(message) if message else None
+        if message is None or frame is None or frame[0] not in self._joints_of_id:
             return None, 0.0
-        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        if frame_id not in self._joints_of_id or list(message.data[:1]) == [frame_id]:
-            return None, 0.0
-        return (frame_id, bytes(message.data)), max(0.0, time.time() - message.timestamp)
+        return frame, max(0.0, time.time() - message.timestamp)
 
     def _steady(self, duration: float) -> bool:
         """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""

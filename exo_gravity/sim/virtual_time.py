@@ -19,7 +19,7 @@ from typing import Protocol
 import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 
-from exo_gravity.core.motors.frames import EXTENDED, Frame
+from exo_gravity.core.motors.frames import Frame
 from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.sim.arbitration import Arbitration
 from exo_gravity.sim.device import SimulatedDevice
@@ -172,13 +172,11 @@ class Played:
 
     def deliver(self, message: can.Message) -> None:
         """Let the device receive a frame, and send its reply."""
-        if message.is_error_frame or (message.is_fd and not any(self._device.is_fd)):
+        command = self._device.command_of(message)
+        if command is None:
             return
-        frame_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        if list(message.data[:1]) == [frame_id]:
-            return  # another device's reply: as in `SimulatedDevice.run`, no command
         self.catch_up()
-        for joint, reply in self._device.replies(frame_id, bytes(message.data)):
+        for joint, reply in self._device.replies(*command):
             delay = self._random.uniform(*self._device.motors[joint].firmware.reply_delay)
             self._wire.clock.later(delay, partial(self._send, joint, reply))
 

@@ -68,11 +68,11 @@ def _follow_gravity(node: Node, get_loop: Callable[[], ControlLoop | None], is_m
     how far the trunk is from upright counts.
     """
     side = node.get_namespace().rpartition("/")[2]
-    if side not in SIDES and not is_monitored:
-        side = SIDES[0]
     if side not in SIDES:
-        expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
-        raise ParameterError("largest_moment", "given", expected)
+        if is_monitored:
+            expected = f"0, or the node in a namespace that ends with {' or '.join(SIDES)}"
+            raise ParameterError("largest_moment", "given", expected)
+        side = SIDES[0]
     tilt = TiltInput(side, TILT_TIMEOUT)
 
     def pass_on(now: float) -> None:
