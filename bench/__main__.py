@@ -1,8 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m bench [--quick] [--only PARTS] [--output build/bench.json]: print one table and write it as JSON.
 
-PARTS are some of law,loop,recordings,starts. It takes 20 minutes on two quiet cores. A disturbed run is repeated
-once, and then says so.
+PARTS are some of law,loop,recordings,starts. It takes 20 minutes on two cores.
 """
 
 from __future__ import annotations

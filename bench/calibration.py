@@ -76,6 +76,7 @@ SINKING, LONGEST = 5.0, 420.0  # s for which the arm sinks to where it hangs; of
 RELAXATION, AT_REST, STEPS = 0.1, 1e-6, 600  # rad: links find their rest behind elastic joints step by step
 LITTLE = 0.02  # Nm, below which a link hangs within its play
 ARM = configured_arm(packaged_config("sim.yaml"))
+MODEL = PapersMoments(DEFAULT_LINKS, keeps_tilt=True)
 ASSUMED = tuple(JointMotor(MOTORS[kind], n) for n, kind in enumerate(USUAL_MOTORS, 1))
 
 
@@ -160,7 +161,7 @@ class Device:
         device.pitch, device.roll = stand
         device.advance(SINKING)
         limits, tilt = Limits(ARM.joint_names, max_effort=MAX_EFFORT, sign_check_torque=0.0), Tilt.of("right", *stand)
-        guess = guess_for(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), tilt, load, earlier)
+        guess = guess_for(MODEL, tilt, load, earlier)
         tour = Tour(limits, guess, Itinerary(limits, SCALE_POSES, DURATION), RATE, load)
         played = VirtualArm(
             device, TourController(tour, limits, tilt, lambda: safety.state is State.ACTIVE), ASSUMED, limits, RATE

@@ -40,29 +40,18 @@ START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
 OURS = ("nodes", "one process")  # the kinds that run the package's nodes
 TICKS = os.sysconf("SC_CLK_TCK")
-CORES = 2  # on which everything runs that belongs to a loop, so that loops of every kind have the same
-QUIET = 0.01  # share of these cores that a hypervisor may give to others in a run that is treated as quiet
-QUIET_OTHERS = 0.1  # the same for other programs: Linux counts that time in ticks
 
 
 @dataclass(frozen=True)
 class LoopRun:
     """One run.
 
-    arms: the timing of each. cpu: share of a core by process. stolen, others: share of the bench's cores that the
-    hypervisor and other programs took. start: s from launch to carried.
+    arms: the timing of each. cpu: share of a core by process. start: s from launch to carried.
     """
 
     arms: list[LoopTiming]
     cpu: dict[str, float]
-    stolen: float
-    others: float
     start: float
-
-    @property
-    def is_disturbed(self) -> bool:
-        """Whether more was taken than a quiet machine takes."""
-        return self.stolen > QUIET or self.others > QUIET_OTHERS
 
 
 def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
@@ -70,7 +59,7 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
 
     file: of the arms, one of POSES. Raises RuntimeError if the arm is not carried to the end.
     """
-    with tempfile.TemporaryDirectory() as folder_name, pinned(), contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder_name, contextlib.ExitStack() as stack:
         folder = Path(folder_name)
         params, simulators = write_parameters(folder, rate, file, seconds)
         namespaces = [node.removesuffix("/simulator") for node in load(simulators)]
@@ -93,13 +82,13 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
         log.wait_for("wearer: move (0", len(namespaces), START_LIMIT, launcher.dead)
         start = log.time_of_first("active") - begin
         time.sleep(SETTLING)
-        window, cpu, taken = _measure(pids, seconds)
+        window, cpu = _measure(pids, seconds)
         _check_run(launcher, log)
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
         timings = [_timing(arm, recording, window, rate) for arm, recording in zip(arms, recordings, strict=True)]
-        return LoopRun(timings, cpu, *taken, start)
+        return LoopRun(timings, cpu, start)
 
 
 def _timing(arm: DirectArm, recording: Path, window: tuple[float, float], rate: float) -> LoopTiming:
@@ -141,38 +130,12 @@ def _check_run(launcher: Launcher, log: NodeLog) -> None:
         raise RuntimeError(f"the arm was let down during the run: {line}")
 
 
-def _measure(pids: dict[str, int], seconds: float) -> tuple[tuple[float, float], dict[str, float], tuple[float, float]]:
-    """Let `seconds` pass; return when that was, each process's share of a core, and what was taken."""
+def _measure(pids: dict[str, int], seconds: float) -> tuple[tuple[float, float], dict[str, float]]:
+    """Let `seconds` pass; return when that was, and each process's share of a core."""
     before, begin = {name: cpu_time(pid) for name, pid in pids.items()}, time.time()
-    (stolen, used), ours = _core_times(), own_time()
     time.sleep(seconds)
     end = time.time()
-    shares = {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
-    (stolen_later, used_later), total = _core_times(), (end - begin) * len(os.sched_getaffinity(0))
-    others = max(0.0, used_later - used - (own_time() - ours))
-    return (begin, end), shares, ((stolen_later - stolen) / total, others / total)
-
-
-@contextlib.contextmanager
-def pinned() -> Iterator[None]:
-    """Keep this thread, and the processes that it starts in the context, on `CORES` cores.
-
-    Where there are more, they are not two threads of one core, and not the first, which serves most interrupts.
-    """
-    permitted = os.sched_getaffinity(0)
-    by_core = {_siblings(cpu): cpu for cpu in sorted(permitted)}
-    chosen = sorted(by_core.values() if len(by_core) >= CORES else permitted)[-CORES:]
-    os.sched_setaffinity(0, chosen)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, permitted)
-
-
-def _siblings(cpu: int) -> str:
-    """Return the hardware threads of a CPU's core."""
-    path = Path(f"/sys/devices/system/cpu/cpu{cpu}/topology/thread_siblings_list")
-    return path.read_text() if path.exists() else str(cpu)
+    return (begin, end), {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
 
 
 def _peer_commands(kind: str, params: Path, namespace: str, rate: float) -> list[tuple[str, ...]]:
@@ -204,27 +167,3 @@ def cpu_time(pid: int) -> float:
     """Return the processor time in s that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
-
-
-def own_time() -> float:
-    """Return the processor time in s of this process and of all that descend from it."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):  # it has ended
-            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
-    ours = {os.getpid()}
-    while more := {pid for pid, parent in parents.items() if parent in ours} - ours:
-        ours |= more
-    total = 0.0
-    for pid in ours:
-        with contextlib.suppress(OSError):
-            total += cpu_time(pid)
-    return total
-
-
-def _core_times() -> tuple[float, float]:
-    """Return the processor time in s of this thread's cores that a hypervisor took, and that all programs used."""
-    cores = {f"cpu{core}" for core in os.sched_getaffinity(0)}
-    rows = (line.split() for line in Path("/proc/stat").read_text().splitlines())
-    times = [[int(field) / TICKS for field in row[1:9]] for row in rows if row[0] in cores]
-    return sum(row[7] for row in times), sum(sum(row[:3]) for row in times)

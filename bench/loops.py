@@ -1,5 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The rows of the loop: every rate, against the same law without ROS and on bare rclpy."""
+"""The rows of the loop: every rate, against the same law without ROS and on bare rclpy.
+
+The kinds of loop take turns, so that other load on the machine affects all of them alike; a row compares run by run.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from exo_gravity.core.safety.gate import START_GATE
 from exo_gravity.core.safety.guidance import GUIDANCE
 
-from .loop import BOTH_ARMS, ONE_ARM, QUIET, QUIET_OTHERS, SEVEN_JOINTS, LoopRun, run_loop
+from .loop import BOTH_ARMS, ONE_ARM, SEVEN_JOINTS, LoopRun, run_loop
 from .table import Row
 from .timing import percentile
 
@@ -21,111 +24,95 @@ RATES = (
 )
 QUICK_RATES = (RATES[1], RATES[3])
 KINDS = ("nodes", "one process", "python", "rclpy")
-PEERS = ("python", "Python without ROS"), ("rclpy", "bare rclpy")
-ATTEMPTS = 2
-PARTS = 5  # of a run; the lowest and the highest of their figures are the spread
+PEERS = {"python": "Python without ROS", "rclpy": "bare rclpy"}
+TURNS, SECONDS, QUICK_SECONDS = 3, 10.0, 5.0
 
-Runs = dict[str, LoopRun]  # by kind
+Turn = dict[str, LoopRun]  # a run of each kind that carried the arm
+Figure = Callable[[LoopRun], float]
 Progress = Callable[[str], None]
 
 
 def measure_loops(quick: bool, progress: Progress) -> Iterator[Row]:
     """Yield the rows of every rate, then of the start."""
-    starts = []
+    starts: list[float] = []
     for arms, file, rate in QUICK_RATES if quick else RATES:
-        runs: Runs = {}
-        for kind in KINDS:
-            progress(f"loop, {arms}, {rate} Hz: {kind}")
-            if run := quietest_run(kind, rate, file, 5.0 if quick else 20.0, progress):
-                runs[kind] = run
-        name = f"loop, {arms}, {rate} Hz"
-        yield from rows_of(name, rate, runs, "nodes")
-        yield from rows_of(f"{name}, one process", rate, runs, "one process")
-        if "nodes" in runs:
-            starts.append(runs["nodes"].start)
+        name, turns = f"loop, {arms}, {rate} Hz", []
+        for number in range(1 if quick else TURNS):
+            progress(f"{name}, turn {number + 1}")
+            turns.append(run_turn(rate, file, QUICK_SECONDS if quick else SECONDS, progress))
+        yield from rows_of(name, rate, turns, "nodes")
+        yield from rows_of(f"{name}, one process", rate, turns, "one process")
+        starts += [turn["nodes"].start for turn in turns if "nodes" in turn]
     if starts:
-        median = float(np.median(starts))
         least = START_GATE.calm + GUIDANCE.time + GUIDANCE.watch
-        yield Row("start, launch to active: the checks and the begin of the torque", median, least, "s", _range(starts))
+        what = "start, launch to active: the checks and the begin of the torque"
+        yield Row.of_values(what, starts, [least] * len(starts), "s")
 
 
-def quietest_run(kind: str, rate: int, file: str, seconds: float, progress: Progress) -> LoopRun | None:
-    """Return the run from which least was taken, of up to `ATTEMPTS`; None if none carried the arm."""
-    best = None
-    for _ in range(ATTEMPTS):
+def run_turn(rate: int, file: str, seconds: float, progress: Progress) -> Turn:
+    """Run every kind of loop once; one that does not carry the arm is left out."""
+    turn: Turn = {}
+    for kind in KINDS:
         try:
-            run = run_loop(kind, rate, file, seconds)
+            turn[kind] = run_loop(kind, rate, file, seconds)
         except RuntimeError as error:
-            progress(f"  {error}")
-            continue
-        best = run if best is None or run.stolen + run.others < best.stolen + best.others else best
-        if not best.is_disturbed:
-            break
-        progress(f"  disturbed: the hypervisor took {run.stolen:.1%} of the cores, other programs {run.others:.1%}")
-    return best
+            progress(f"  {kind}: {error}")
+    return turn
 
 
-def rows_of(name: str, rate: int, runs: Runs, kind: str) -> Iterator[Row]:
+def rows_of(name: str, rate: int, turns: Sequence[Turn], kind: str) -> Iterator[Row]:
     """Yield the table's rows of the loop `name` at `rate` (Hz): runs of `kind` next to those of its peers."""
-    period, allowed = 1e3 / rate, 1.0 if rate == 1000 else 0.1
-    if kind not in runs:
-        disturbed = any(run.is_disturbed for run in runs.values())
-        yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%", disturbed=disturbed)
+    allowed = 1.0 if rate == 1000 else 0.1  # % of the cycles
+    ran = [turn for turn in turns if kind in turn]
+    if not ran:
+        yield Row(f"{name}, missed (it did not run): limit", 100.0, allowed, "%")
         return
-    ours = runs[kind]
 
-    def row(what: str, figure: float, other: float, unit: str, spread: str = "", of: str = kind) -> Row:
-        """Return a row whose second figure is one of the kind `of`."""
-        return Row(f"{name}, {what}", figure, other, unit, spread, disturbed=ours.is_disturbed or runs[of].is_disturbed)
+    def limited(what: str, figure: Figure, limit: float, unit: str) -> Row:
+        return Row.of_values(f"{name}, {what}", [figure(turn[kind]) for turn in ran], [limit] * len(ran), unit)
 
-    others = (*PEERS, ("nodes", "two processes")) if kind == "one process" else PEERS
-    peers = [(peer_kind, peer) for peer_kind, peer in others if peer_kind in runs]
+    def compared(what: str, figure: Figure, unit: str, of: str, theirs: Figure | None = None) -> Iterator[Row]:
+        both = [turn for turn in ran if of in turn]
+        if both:
+            peer = [(theirs or figure)(turn[of]) for turn in both]
+            yield Row.of_values(f"{name}, {what}", [figure(turn[kind]) for turn in both], peer, unit)
+
+    peers = PEERS | ({"nodes": "two processes"} if kind == "one process" else {})
     for share in (50, 99, 99.9):
-        figure, spread = _latency(ours, share)
-        for of, peer in peers:
-            yield row(f"p{share:g}: {peer}", figure, _latency(runs[of], share)[0], "ms", spread, of)
-        if share == 99:
-            yield row("p99: one period", figure, period, "ms", spread)
-    spacing = np.concatenate([arm.spacing for arm in ours.arms]) * 1e3
+        for of, peer in peers.items():
+            yield from compared(f"p{share:g}: {peer}", latency(share), "ms", of)
+    yield limited("p99: one period", latency(99), 1e3 / rate, "ms")
     for share in (99, 99.9):
-        yield row(f"spacing p{share:g}: one period", percentile(spacing, share), period, "ms")
+        yield limited(f"spacing p{share:g}: one period", spacing(share), 1e3 / rate, "ms")
     for what in ("missed", "late", "incomplete", "lost"):
-        percents = _percents(ours, what)
-        mean, spread = float(np.mean(percents)), _range(percents)
-        yield row(f"{what}: limit", mean, allowed, "%", spread)
-        for of, peer in peers:
-            yield row(f"{what}: {peer}", mean, float(np.mean(_percents(runs[of], what))), "%", spread, of)
-    yield row("taken by the hypervisor: quiet", 100.0 * ours.stolen, 100.0 * QUIET, "%")
-    yield row("taken by other programs: quiet", 100.0 * ours.others, 100.0 * QUIET_OTHERS, "%")
+        yield limited(f"{what}: limit", percent(what), allowed, "%")
+        for of, peer in peers.items():
+            yield from compared(f"{what}: {peer}", percent(what), "%", of)
     bridge = ("bridge", "compensator") if kind == "one process" else ("bridge",)
     counterparts = {"can_bridge": bridge, "compensator": ("compensator",)}
-    for node in sorted({full_name.rpartition("/")[2] for full_name in ours.cpu}):
-        shares = _cpu_shares(ours, node)
-        total, spread = sum(shares), _range(shares)
-        if node in counterparts and "rclpy" in runs:
-            bare = sum(sum(_cpu_shares(runs["rclpy"], part)) for part in counterparts[node])
-            yield row(f"CPU of {node}: bare rclpy", total, bare, "%", spread, "rclpy")
+    for node in sorted({full_name.rpartition("/")[2] for full_name in ran[0][kind].cpu}):
+        if node in counterparts:
+            theirs = cpu(*counterparts[node])
+            yield from compared(f"CPU of {node}: bare rclpy", cpu(node), "%", "rclpy", theirs)
         else:
-            yield row(f"CPU of {node}: a core", total, 100.0, "%", spread)
+            yield limited(f"CPU of {node}: a core", cpu(node), 100.0, "%")
 
 
-def _cpu_shares(run: LoopRun, node: str) -> list[float]:
-    """Return the share of a core in percent of each process of this node, for one arm or two."""
-    return [100.0 * share for full_name, share in run.cpu.items() if full_name.rpartition("/")[2] == node]
+def latency(share: float) -> Figure:
+    """Return the figure: the percentile in ms over all arms."""
+    return lambda run: percentile(np.concatenate([arm.latency for arm in run.arms]), share) * 1e3
 
 
-def _percents(run: LoopRun, what: str) -> list[float]:
-    """Return the share of each arm's cycles in percent that were `what`: missed, late, incomplete or lost."""
-    return [100.0 * getattr(arm, what) / arm.cycles for arm in run.arms]
+def spacing(share: float) -> Figure:
+    """Return the figure: the percentile in ms over all arms."""
+    return lambda run: percentile(np.concatenate([arm.spacing for arm in run.arms]), share) * 1e3
 
 
-def _latency(run: LoopRun, share: float) -> tuple[float, str]:
-    """Return the percentile in ms over all arms, and its range over parts of the run."""
-    parts = [
-        percentile(part, share) * 1e3 for arm in run.arms for part in np.array_split(arm.latency, PARTS) if len(part)
-    ]
-    return percentile(np.concatenate([arm.latency for arm in run.arms]), share) * 1e3, _range(parts)
+def percent(what: str) -> Figure:
+    """Return the figure: the share of the cycles in percent that were `what`: missed, late, incomplete or lost."""
+    return lambda run: float(np.mean([100.0 * getattr(arm, what) / arm.cycles for arm in run.arms]))
 
 
-def _range(values: Sequence[float]) -> str:
-    return f"{min(values):.3g} to {max(values):.3g}" if len(values) > 1 else ""
+def cpu(*parts: str) -> Figure:
+    """Return the figure: percent of a core of the processes with these names, of one arm or two."""
+    return lambda run: 100.0 * sum(share for name, share in run.cpu.items() if name.rpartition("/")[2] in parts)

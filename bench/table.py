@@ -7,7 +7,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -16,10 +16,7 @@ from rich.table import Table
 
 @dataclass(frozen=True)
 class Row:
-    """One comparison. name: what is measured, and against what. ours, peer: in `unit`. spread: of our figure.
-
-    disturbed: whether other programs, or a hypervisor, took much of the processor from either.
-    """
+    """One comparison. name: what is measured, and against what. ours, peer: in `unit`. spread: of our figure."""
 
     name: str
     ours: float
@@ -27,7 +24,6 @@ class Row:
     unit: str
     spread: str = ""
     more_is_better: bool = False
-    disturbed: bool = False
 
     @property
     def ratio(self) -> float:
@@ -39,9 +35,9 @@ class Row:
         cls, name: str, ours: Sequence[float], peer: Sequence[float], unit: str, more_is_better: bool = False
     ) -> Row:
         """Return the row of runs that took turns: medians, and the spread of ours and of the ratio."""
-        ratios = [one / other for one, other in zip(ours, peer, strict=True)]
-        spread = f"{range_of(ours)}, x{range_of(ratios)}"
-        return cls(name, statistics.median(ours), statistics.median(peer), unit, spread, more_is_better)
+        row = cls(name, statistics.median(ours), statistics.median(peer), unit, "", more_is_better)
+        ratios = [cls(name, one, other, unit).ratio for one, other in zip(ours, peer, strict=True)]
+        return replace(row, spread=f"{range_of(ours)}, x{range_of(ratios)}")
 
     @classmethod
     def of_times(cls, name: str, ours: Sequence[float], peer: Sequence[float]) -> Row:
@@ -97,7 +93,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
     for column in table.columns[1:4] + table.columns[5:6]:
         column.justify = "right"
     for row in rows:
-        mark = f"x{', more is better' * row.more_is_better}{', disturbed' * row.disturbed}"
+        mark = f"x{', more is better' * row.more_is_better}"
         table.add_row(row.name, f"{row.ours:.4g}", row.spread, f"{row.peer:.4g}", row.unit, f"{row.ratio:.3g}", mark)
     console.print(table)
 
@@ -105,6 +101,6 @@ def show(rows: Sequence[Row], console: Console) -> None:
 def save(rows: Sequence[Row], path: Path) -> None:
     """Write the rows as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    names = "name", "ours", "peer", "unit", "ratio", "disturbed"
+    names = "name", "ours", "peer", "unit", "ratio"
     content = [{name: getattr(row, name) for name in names} for row in rows]
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

@@ -29,7 +29,7 @@ def judged(seed: int) -> Trial | str:
     """Play and judge one wearer; return the sentence that says why there was no calibration."""
     try:
         return judge(play(draw(seed)))
-    except DataError as error:
+    except (DataError, RuntimeError) as error:
         return str(error)
 
 
