@@ -37,7 +37,7 @@ class Row:
         """Return the row of runs that took turns: medians, and the spread of ours and of the ratio."""
         row = cls(name, statistics.median(ours), statistics.median(peer), unit, "", more_is_better)
         ratios = [cls(name, one, other, unit).ratio for one, other in zip(ours, peer, strict=True)]
-        return replace(row, spread=f"{range_of(ours)}, x{range_of(ratios)}")
+        return row if len(ours) == 1 else replace(row, spread=f"{range_of(ours)}, x{range_of(ratios)}")
 
     @classmethod
     def of_times(cls, name: str, ours: Sequence[float], peer: Sequence[float]) -> Row:
