@@ -96,18 +96,20 @@ def draw(seed: int) -> Worn:
     left = -bare.identified.tilt  # the IMU was mounted well, and is corrected by this
     body_mass = float(rng.uniform(*BODY_MASS))
     load = Wearer(body_mass).on_links(LENGTH)
-    worn = true.arm(
+    config = ArmConfig(
+        **true.mechanics,
         wearer_mass=load.mass * rng.uniform(1.0 - MASS_ERROR, 1.0 + MASS_ERROR, 4),
         wearer_cog=np.clip(load.cog + rng.uniform(-COG_ERROR, COG_ERROR, 4) * (load.mass > 0), 0.0, LENGTH),
         stribeck_friction=rng.uniform(0.0, STRIBECK, 4),
     )
+    worn = SimulatedArm(config)
     worn.move_base([STANDARD_GRAVITY * component for component in UPRIGHT])
     values: dict[str, Any] = {change.name: change.value for change in bare.changes}
     motors = tuple(
         replace(motor, torque_scale=scale) for motor, scale in zip(ASSUMED, values.pop("torque_scale"), strict=True)
     )
     strength = np.divide([m.torque_scale for m in true.motors], [m.torque_scale for m in motors])
-    friction = np.array([worn.config.coulomb_friction, worn.config.viscous_friction])
+    friction = np.array([config.coulomb_friction, config.viscous_friction])
     relaxed = tuple(
         Observation(
             theta,
@@ -128,7 +130,7 @@ def draw(seed: int) -> Worn:
         max_effort=[min(MOST, motor.peak_effort) for motor in motors],
         terms=TermSettings(friction=Friction(0.0, *assumed)),
     )
-    return Worn(seed, side, worn.config, true.motors, settings, motors, left)
+    return Worn(seed, side, config, true.motors, settings, motors, left)
 
 
 def turned(vector: Vector, turn: np.ndarray) -> np.ndarray:
