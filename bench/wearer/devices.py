@@ -96,12 +96,13 @@ def draw(seed: int) -> Worn:
     left = -bare.identified.tilt  # the IMU was mounted well, and is corrected by this
     body_mass = float(rng.uniform(*BODY_MASS))
     load = Wearer(body_mass).on_links(LENGTH)
-    config = ArmConfig(
+    mechanics: dict[str, Any] = {
         **true.mechanics,
-        wearer_mass=load.mass * rng.uniform(1.0 - MASS_ERROR, 1.0 + MASS_ERROR, 4),
-        wearer_cog=np.clip(load.cog + rng.uniform(-COG_ERROR, COG_ERROR, 4) * (load.mass > 0), 0.0, LENGTH),
-        stribeck_friction=rng.uniform(0.0, STRIBECK, 4),
-    )
+        "wearer_mass": load.mass * rng.uniform(1.0 - MASS_ERROR, 1.0 + MASS_ERROR, 4),
+        "wearer_cog": np.clip(load.cog + rng.uniform(-COG_ERROR, COG_ERROR, 4) * (load.mass > 0), 0.0, LENGTH),
+        "stribeck_friction": rng.uniform(0.0, STRIBECK, 4),
+    }
+    config = ArmConfig(**mechanics)
     worn = SimulatedArm(config)
     worn.move_base([STANDARD_GRAVITY * component for component in UPRIGHT])
     values: dict[str, Any] = {change.name: change.value for change in bare.changes}
