@@ -27,6 +27,7 @@ GONE: dict[str, Callable[[list[Any]], dict[str, Any]]] = {
     "friction.identified": lambda value: {"friction.coulomb": value[:4], "friction.viscous": value[4:]},
     "limits.range": lambda value: {"limits.lower": value[0::2], "limits.upper": value[1::2]},
     "inertial.shoulder_from_imu": lambda value: {"inertial": any(value), "shoulder_from_imu": value},
+    **dict.fromkeys(("serial.port", "serial.baud"), lambda value: {"source": "topic"}),  # its ROS driver reads it
 }
 
 

@@ -280,7 +280,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
             if values["can.interface"] == "socketcan":
                 frames = round((bus.replying + bus.reporting) * limits.reply_timeout * rate)
                 yield from of_interface(channel, root, bus.bitrate, frames)
-    ports = (str(given.get(key, "")) for given in nodes.values() for key in ("can.channel", "serial.port"))
+    ports = (str(given.get("can.channel", "")) for given in nodes.values())
     for port in sorted({port.strip() for names in ports for port in names.split(",")}):
         if port.startswith("/dev/"):
             yield of_port(port, root)

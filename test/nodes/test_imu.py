@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import subprocess
 import sys
-from types import SimpleNamespace
+import time
 
 import numpy as np
 import pytest
@@ -29,8 +28,7 @@ from exo_gravity.nodes.imu import ImuNode as ImuShell
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.sim.virtual_time import VirtualClock
 
-from ..support.fake_imu.chips import G as CHIP_G
-from ..support.fake_imu.serial import FakeSerialSensor, rvc_packet
+from ..support.fake_chips import FAKES, FakeI2c
 from ..support.imu_motion import bowing_and_walking
 from ..support.node_thread import own_node
 from ..support.waiting import PATIENCE, wait_until
@@ -47,36 +45,12 @@ NODE = [sys.executable, "-c", "from exo_gravity.nodes.imu import main; main()", 
 # An IMU that the node reads itself. How a device is opened again: hardware/test_imu_sources.py
 
 
-@pytest.fixture
-def sensor(tmp_path):
-    """A BNO085 that is plugged in, on a pseudo-terminal."""
-    sensor = FakeSerialSensor(tmp_path / "imu")
-    yield sensor
-    sensor.unplug()
-
-
-def test_each_sample_goes_to_the_callback_and_to_the_topic_once_in_order_and_states_what_is_not_measured(sensor):
-    published, received, time = [], [], VirtualClock()
-    now = SimpleNamespace(now=lambda: Time(nanoseconds=round(time.monotonic() * 1e9)))
-    node = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=published.append), get_clock=lambda: now)
-    values = {"source": "bno085", "rate": 100.0, "serial.port": str(sensor.port), "serial.baud": 115200}
-    device = ImuDevice(node, values, "/imu/data_raw", lambda *sample: received.append(sample), time)
-    for number in range(20):
-        time.sleep(0.01)
-        sensor.deliver(rvc_packet(number, (90, 0, 0), (0, 0, 1000)))
-        device.poll()
-    messages, numbers = zip(*received, strict=True)
-    assert [info["publication_sequence_number"] for info in numbers] == list(range(1, 21))
-    assert published == list(messages)
-    age = now.now().nanoseconds - to_nanoseconds(messages[-1].header.stamp)
-    assert age == pytest.approx(0.5e9 * 0.01, rel=0.01)
-    assert messages[-1].angular_velocity_covariance[0] == -1.0 and messages[-1].orientation_covariance[0] == 0.0
-    assert messages[-1].linear_acceleration.z == pytest.approx(CHIP_G)
-    assert messages[-1].orientation.z == pytest.approx(0.5**0.5)
-
-
-def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_reports_its_absence(sensor):
-    arguments = ("source:=bno085", f"serial.port:={sensor.port}", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
+def test_the_node_publishes_the_tilt_of_a_chip_that_it_reads_itself_and_reports_its_absence(monkeypatch):
+    chip = FAKES["mpu6050"](time.time)
+    bus, roll = FakeI2c(chip), math.radians(20.0)
+    chip.acceleration = lambda _: (0.0, math.sin(roll), math.cos(roll))
+    monkeypatch.setattr("adafruit_extended_bus.ExtendedI2C", lambda number, frequency: bus)
+    arguments = ("source:=mpu6050", "rotation_trunk_from_imu:=[0.0, 0.0, 0.0, 1.0]")
     rclpy.init(args=["--ros-args", *(part for argument in arguments for part in ("-p", argument))])
     node, listener, executor = ImuShell(), rclpy.create_node("imu_listener"), SingleThreadedExecutor()
     tilts, reports = [], [DiagnosticStatus()]
@@ -84,28 +58,20 @@ def test_the_node_publishes_the_tilt_of_a_sensor_that_it_reads_itself_and_report
         executor.add_node(each)
     listener.create_subscription(Vector3Stamped, "/imu/pitch_yaw", tilts.append, 50)
     listener.create_subscription(DiagnosticArray, "/diagnostics", lambda message: reports.extend(message.status), 50)
-    counters, is_read = itertools.count(), True
-
-    def send():
-        if is_read:  # with noise, as every real one has
-            number = next(counters)
-            sensor.send(rvc_packet(number, (0, 20, 0), (0, 342, 940 + number % 3)))
-
-    listener.create_timer(0.01, send)
 
     def wait(condition):
         wait_until(condition, lambda: executor.spin_once(timeout_sec=0.002), seen=lambda: reports[-1])
 
     try:
         wait(lambda: tilts)
-        assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((math.radians(20), 0.0), abs=1e-3)
+        assert (tilts[-1].vector.x, tilts[-1].vector.y) == pytest.approx((roll, 0.0), abs=2e-3)
         wait(lambda: reports[-1].message == "publishing")
-        is_read = False
-        sensor.unplug()
-        wait(lambda: f"BNO085 on {sensor.port}: cannot be" in reports[-1].message)
+        bus.plugged = False
+        wait(lambda: "mpu6050 at 0x68 on /dev/i2c-1: cannot be opened" in reports[-1].message)
         assert reports[-1].level == DiagnosticStatus.ERROR
-        sensor.plug()
-        is_read, seen = True, len(reports)
+        chip.reset()
+        bus.plugged = bus.is_open = True
+        seen = len(reports)
         wait(
             lambda: any(
                 pair.key == "opened" and int(pair.value) >= 2 for each in reports[seen:] for pair in each.values
@@ -142,12 +108,14 @@ def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node(monke
     clock, received = VirtualClock(), []
     with own_node("listener") as (node, _):
         values = {"source": "level", "rate": 100.0}
-        device = ImuDevice(node, values, "/imu/data_raw", lambda message, _: received.append(message), clock)
+        device = ImuDevice(node, values, "/imu/data_raw", lambda *sample: received.append(sample), clock)
         for _ in range(3):
             clock.sleep(0.01)
             device.poll()
-    assert [message.linear_acceleration.z for message in received] == pytest.approx([9.81] * 3)
-    assert received[0].orientation_covariance[0] == -1.0  # not reported
+    messages, numbers = zip(*received, strict=True)
+    assert [info["publication_sequence_number"] for info in numbers] == [1, 2, 3]
+    assert [message.linear_acceleration.z for message in messages] == pytest.approx([9.81] * 3)
+    assert messages[0].orientation_covariance[0] == -1.0  # not reported
     assert device.values["device"] == "level IMU at 100 Hz"
     source = device.reopening.source
     device.reopening.close()

@@ -5,15 +5,13 @@ from exo_gravity.core.params import Param
 from exo_gravity.core.trunk import imu_checks
 
 # fmt: off
-IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox", "witmotion", "bno085")
+IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox")
 IMU = (
-    Param("source", "topic", "a driver's topic, a chip on I2C, or a sensor on a serial port", fixed=True,
+    Param("source", "topic", "a driver's topic, or a chip on I2C", fixed=True,
           choices=IMU_SOURCES),
     Param("input_topic", "/imu/data_raw", "the driver's topic, a sensor_msgs/Imu", fixed=True),
     Param("i2c.bus", 1, "number n of the bus /dev/i2c-n", (0, 255), fixed=True),
     Param("i2c.address", 0, "address of the chip; 0: the usual one of its boards", (0, 0x77), fixed=True),
-    Param("serial.port", "", "the sensor's port, best a name in /dev/serial/by-id", fixed=True),
-    Param("serial.baud", 115200, "the sensor's baud rate", (4800, 921600), fixed=True),
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "its mounting, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True, vector=True),

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from exo_gravity.hardware.imu_sources.chips import CHIPS, PolledChip
-from exo_gravity.hardware.imu_sources.serial_sensors import Bno085, WitMotion
 from exo_gravity.hardware.imu_sources.source import ImuSource, Reopening, StampClock
 
 __all__ = ["SOURCES", "ImuSource", "Reopening", "open_source"]
@@ -13,8 +12,6 @@ __all__ = ["SOURCES", "ImuSource", "Reopening", "open_source"]
 #: By the value of the parameter `source`: what opens the IMU, given the parameter values and the clock of the stamps.
 SOURCES: dict[str, Callable[[Mapping[str, Any], StampClock], ImuSource]] = {
     **dict.fromkeys(CHIPS, PolledChip),
-    "witmotion": WitMotion,
-    "bno085": Bno085,
 }
 
 
