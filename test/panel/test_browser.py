@@ -396,6 +396,8 @@ def test_the_page_says_which_arm_is_simulated_as_the_devices_say(page, stage):
     assert not page.is_visible(of_arm(".home"))
     stage.arms.reports["left"] = {"source": "real"}
     wait_until(page, lambda: page.inner_text("#source") == "Real arm")
+    stage.server.stop()
+    wait_for_text(page, of_arm(".remedy"), "Hold the arm", "launcher's window")
 
 
 # 6. Control and connection
@@ -426,7 +428,8 @@ def test_the_second_page_watches_lets_down_and_takes_control_also_after_a_reload
     stage.server.stop()
     wait_for_state(second, "unseen")
     wait_for_text(second, "#alarm", "cannot see the arms")
-    wait_for_text(second, of_arm(".sentence"), "cannot see the arm")
+    wait_for_text(second, of_arm(".sentence"), "cannot see the arm", "Its last report, at ", ": Carrying.")
+    wait_for_text(second, of_arm(".remedy"), "starts again within a minute")
     assert second.locator(of_arm("tbody tr")).count() == 0
     second.keyboard.press("Space")
     wait_for_text(second, "#alarm", "NOT confirmed")

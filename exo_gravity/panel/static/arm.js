@@ -37,6 +37,7 @@ export class ArmCard {
     this.moved = -Infinity; // ms, when its user moved the slider or the support was sent
     this.speed = this.power = 0; // means of the joints' largest speed in rad/s, and of the motors' power in W
     this.went = -Infinity; // ms, when the arm last moved
+    this.last = null; // the last state that its bridge reported, and when
     this.action = ""; // the button that is seen
     this.appeared = -Infinity; // ms, since when
     this.find(".enable").addEventListener("click", () => actions.enable(this));
@@ -165,9 +166,10 @@ export class ArmCard {
     const name = bridge ? bridge.state || "disabled" : alive ? "silent" : "unseen";
     const moving = name === "active" ? this.motion(state) : "";
     if (state.simulator) this.source = "simulated";
-    else if (this.source !== "simulated") this.source = bridge?.source ?? this.setup?.source ?? "unknown";
+    else if (alive && this.source !== "simulated") this.source = bridge?.source ?? this.setup?.source ?? "unknown";
+    if (bridge) this.last = { name, time: new Date() };
     this.showState(name, moving);
-    const told = tell(this.name, name, state, moving, this.source === "simulated");
+    const told = tell(this.name, name, state, moving, this.source === "simulated", this.last);
     write(this.find(".sentence"), told.why);
     this.find(".remedy").hidden = !told.todo;
     write(this.find(".remedy"), told.todo);

@@ -35,11 +35,16 @@ export function jointText(arm, name) {
 
 // Returns {why, todo, action, engineer}: texts, the name of the button, and whether an engineer must see the arm first.
 //
-// name: the state that is shown. state: of the arm. moving: what it does in place of resting, '' for nothing.
-export function tell(arm, name, state, moving, isSimulated) {
+// name: the state that is shown. state: of the arm. moving: what it does in place of resting, '' for nothing. last: the
+// last state that its bridge reported, and when; null before the first one.
+export function tell(arm, name, state, moving, isSimulated, last) {
   const { bridge } = state;
   const action = actionOf(name, bridge);
-  if (name === "silent" || name === "unseen") return { why: t(`sentence.${name}`), todo: t(`do.${name}`), action };
+  if (name === "silent" || name === "unseen") {
+    const time = last?.time.toLocaleTimeString(document.documentElement.lang);
+    const known = last ? t("last_report", time, has(`state.${last.name}`) ? t(`state.${last.name}`) : last.name) : "";
+    return { why: join([t(`sentence.${name}`), known]), todo: t(isSimulated ? "do.simulation_gone" : `do.${name}`), action };
+  }
   const fault = faultOf(bridge, state, isSimulated);
   const unreached = bridge.motors === "unreached";
   const first = unreached ? [t("unreached")] : [];
