@@ -39,11 +39,6 @@ class Row:
         ratios = [cls(name, one, other, unit).ratio for one, other in zip(ours, peer, strict=True)]
         return row if len(ours) == 1 else replace(row, spread=f"{range_of(ours)}, x{range_of(ratios)}")
 
-    @classmethod
-    def of_times(cls, name: str, ours: Sequence[float], peer: Sequence[float]) -> Row:
-        """Return the row of runs in s that took turns."""
-        return cls.of_values(name, ours, peer, "s")
-
 
 @dataclass(frozen=True)
 class Timing:
