@@ -1,11 +1,34 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which computers ROS 2 communicates with: this one alone, unless a person chose otherwise."""
+"""What ROS 2 reads from the environment: which computers it communicates with, and what would end every node."""
 
 import os
 from pathlib import Path
 
+from exo_gravity.core.errors import ParameterError
+
 RANGE, ROS_RANGE = "EXO_GRAVITY_DISCOVERY_RANGE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+HIGHEST_DOMAIN = 232  # beyond, DDS has no ports
+MIDDLEWARE = "rmw_fastrtps_cpp"  # under which the nodes were tried
+
+
+def check_environment() -> None:
+    """Check the environment for what ends every node at its start. Raises ParameterError that names the variable."""
+    get = os.environ.get
+    domain = get("ROS_DOMAIN_ID") or "0"
+    if not (domain.isdecimal() and int(domain) <= HIGHEST_DOMAIN):
+        expected = f"a whole number from 0 to {HIGHEST_DOMAIN}, the same in every terminal"
+        raise ParameterError("ROS_DOMAIN_ID", domain, expected)
+    middleware = get("RMW_IMPLEMENTATION") or MIDDLEWARE
+    libraries = (Path(prefix, "lib", f"lib{middleware}.so") for prefix in get("AMENT_PREFIX_PATH", "").split(":"))
+    if middleware != MIDDLEWARE and not any(library.exists() for library in libraries):
+        raise ParameterError("RMW_IMPLEMENTATION", middleware, f"installed; unset it for {MIDDLEWARE}")
+    log = Path(get("ROS_LOG_DIR") or Path(get("ROS_HOME") or "~/.ros", "log")).expanduser()
+    try:
+        log.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        expected = f"a folder that can be made ({error.strerror}): export ROS_LOG_DIR=/tmp/ros_log"
+        raise ParameterError("ROS's folder of logs", str(log), expected) from None
 
 
 def keep_to_this_machine() -> None:

@@ -26,7 +26,7 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, limits_of
 from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour, request_real_time
-from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
+from exo_gravity.hardware.network import MIDDLEWARE, check_environment, keep_to_this_machine, open_to_others
 from exo_gravity.lab.adapters import of_opening
 from exo_gravity.lab.findings import Finding, Level, judged
 from exo_gravity.lab.inputs.arms import node_values
@@ -36,7 +36,6 @@ from exo_gravity.lab.packages import MissingPackageError, check_packages
 
 LATE = 0.001  # share of cycles that may be late by half a period, as in docs/performance.md
 SLOW_WAKE = 0.1  # of a period, for which a CPU may wake from its deepest idle state
-MIDDLEWARE = "rmw_fastrtps_cpp"  # the one that the package was tried with, and Jazzy's default
 SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")  # a look at these takes microseconds
 CPUS, CLOCKS = "sys/devices/system/cpu", "sys/devices/system/clocksource/clocksource0"
 GROUP = "239.255.0.1"  # of the multicast datagram
@@ -288,6 +287,7 @@ def of_buses(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]], root: Path)
 
 def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     """Return every finding; seconds: for which wake-ups are measured. Raises ParameterError."""
+    check_environment()
     check_nodes(nodes)
     bridges = {node: node_values(nodes, node, CAN_BRIDGE) for node in stages(nodes)[0]}
     buses = list(of_buses(nodes, bridges, root))

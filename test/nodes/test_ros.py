@@ -11,6 +11,7 @@ import itertools
 import math
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -47,6 +48,8 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 from type_description_interfaces.srv import GetTypeDescription
 
+from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.hardware import network
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
@@ -58,7 +61,7 @@ from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros import run as running
 from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, prepare_transitions
 from exo_gravity.nodes.ros.messages import milliseconds, row
-from exo_gravity.nodes.ros.parameters import RESPONSE_TIMEOUT, NodeParameters, accept_changes
+from exo_gravity.nodes.ros.parameters import RESPONSE_TIMEOUT, NodeParameters, accept_changes, declare
 from exo_gravity.nodes.ros.run import WAITS_FOR_BRIDGES, handle_signals
 from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, NEWEST_ONLY, PolledSubscription, Publishers
 
@@ -399,6 +402,18 @@ def test_a_value_that_the_check_cannot_use_is_refused_and_leaves_the_node_and_it
     refused, done = results
     assert not refused.successful and refused.reason == "some: cannot be used: OverflowError: too large for a float"
     assert done.successful and applied == [{"some": 2}]
+
+
+def test_a_node_that_its_parameter_file_does_not_name_is_refused_with_those_that_it_names(monkeypatch, tmp_path):
+    path = tmp_path / "left.yaml"
+    path.write_text("/left/compensator: {ros__parameters: {side: left}}")
+    monkeypatch.setattr(sys, "argv", ["compensator", "--ros-args", "--params-file", str(path)])
+    said = "must be a file with the key /right/compensator: it has /left/compensator"
+    with own_node("compensator") as (node, _), pytest.raises(ParameterError, match=said):
+        declare(node, COMPENSATOR)
+    monkeypatch.setenv("EXO_GRAVITY_SUPERVISED", "1")  # the launcher has compared both
+    with own_node("compensator") as (node, _):
+        assert declare(node, COMPENSATOR)["side"] == "right"
 
 
 @pytest.mark.parametrize("data", [True, False])

@@ -151,6 +151,26 @@ def test_the_middleware_and_who_may_command_the_arm(middleware: str, reach: str,
     assert max(row.level for row in settings.of_middleware(middleware, reach, opening)) is level
 
 
+@pytest.mark.parametrize("tool", ["doctor", "launcher"])
+@pytest.mark.parametrize(
+    ("variable", "value", "said"),
+    [
+        ("ROS_DOMAIN_ID", "300", "ROS_DOMAIN_ID = '300': must be a whole number from 0 to 232"),
+        ("ROS_DOMAIN_ID", "lab", "ROS_DOMAIN_ID = 'lab': must be a whole number from 0 to 232"),
+        ("HOME", "/proc/nohome", "'/proc/nohome/.ros/log': must be a folder that can be made"),
+        ("RMW_IMPLEMENTATION", "rmw_none_cpp", "RMW_IMPLEMENTATION = 'rmw_none_cpp': must be installed"),
+    ],
+)
+def test_an_environment_that_would_end_every_node_is_refused_before_one_starts(
+    run_tool, monkeypatch, tool, variable, value, said
+):
+    for name in ("ROS_LOG_DIR", "ROS_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(variable, value)
+    code, _, err = run_tool(tool)
+    assert code == 2 and said in err
+
+
 def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
     assert settings.of_multicast(True).level is Level.FINE
     monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
@@ -233,13 +253,13 @@ def test_the_code_is_0_where_all_is_well_1_with_a_warning_and_2_with_a_fault_eac
     assert code == 2 and "No one may wear an arm" in text
 
 
-def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(run, computer):
-    of_imu = partial(run, node="/imu", source="witmotion", serial={"port": "/dev/serial/by-id/usb-IMU"})
-    code, text = of_imu()
-    assert code == 1 and "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/latency_timer" in text
+def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(computer):
+    port = settings.of_port("/dev/serial/by-id/usb-IMU", computer)
+    assert port.level is Level.WARNING
+    assert "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/latency_timer" in port.remedy
     (computer / "dev/ttyUSB3").unlink()
-    code, text = of_imu()
-    assert code == 2 and "no such port" in text
+    port = settings.of_port("/dev/serial/by-id/usb-IMU", computer)
+    assert port.level is Level.FAULT and port.found == "no such port"
 
 
 BUS = {"interface": "udp_multicast", "channel": "239.74.163.2"}

@@ -275,6 +275,8 @@ def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buse
         expected = f"at most {REPLY_SHARE * status_rate:g} Hz: each cycle waits for a status frame of a V3 board"
         raise ParameterError("rate", rate, f"{expected}, which sends {status_rate:g} a second")
     peak = [motor.peak_effort for motor in motors]
+    if not all(limits.max_effort):
+        raise ParameterError("max_effort", list(limits.max_effort), "above 0 Nm: else nothing carries the arm")
     if any(effort > most + 1e-9 for effort, most in zip(limits.max_effort, peak, strict=True)):
         shown = [round(effort, 2) for effort in peak]
         raise ParameterError("max_effort", list(limits.max_effort), f"at most the motors' peak torque, {shown} Nm")

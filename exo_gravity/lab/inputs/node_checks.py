@@ -18,6 +18,7 @@ from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.model_file import read_model
+from exo_gravity.hardware.network import check_environment
 from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
@@ -58,12 +59,13 @@ def check_nodes(nodes: Nodes) -> None:
 
 
 def check_start(nodes: Nodes) -> None:
-    """Check what would keep one of `nodes` from its start: a parameter, or a running can_bridge that holds its bus.
+    """Check what would keep one of `nodes` from its start: a parameter, ROS's environment, or a can_bridge on its bus.
 
     A second can_bridge would refuse to start. But its compensator would already have sent efforts, and two that send to
     one arm let it down. Raises ParameterError, BusError.
     """
     check_nodes(nodes)
+    check_environment()
     for node in stages(nodes)[0]:
         values, options = node_values(nodes, node, CAN_BRIDGE), can_options(nodes[node])
         for channel, (_, own) in buses_of(values["can.channel"], options, len(values["joint_names"])).items():

@@ -2,10 +2,14 @@
 """A node's own parameters, declared from a table of `core`, and those of another node, read over its services."""
 
 import math
+import os
+import sys
 import time
 from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
+import yaml
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.node import Node
@@ -14,7 +18,7 @@ from rclpy.task import Future
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
-from exo_gravity.core.params import Param, table_for, values_of
+from exo_gravity.core.params import ROS_PARAMETERS, Param, table_for, values_of
 from exo_gravity.nodes.ros.inner import intercept_changes
 
 T = TypeVar("T")
@@ -28,9 +32,11 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
     node: created with `automatically_declare_parameters_from_overrides=True`.
     free_prefix: names that start with it are left as given; '' for none.
 
-    Raises ParameterError for an impossible value, and for a name that is not in the table.
+    Raises ParameterError for an impossible value, for a name that is not in the table, and for a file without the node.
     """
     given = given_to(node)
+    if table and not given.keys() - set(ROS_PARAMETERS):
+        _check_file(node.get_fully_qualified_name())
     table = table_for(table, given)
     values = values_of(table, given, free_prefix)
     for param in table:
@@ -53,6 +59,14 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
 
     intercept_changes(node, refusal, is_same)
     return values
+
+
+def _check_file(name: str) -> None:
+    """Raise ParameterError if the node `name`, which got no parameters, was started by a person with a file of them."""
+    if "--params-file" in sys.argv and not os.environ.get("EXO_GRAVITY_SUPERVISED"):
+        path = sys.argv[sys.argv.index("--params-file") + 1]
+        keys = ", ".join(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+        raise ParameterError("--params-file", path, f"a file with the key {name}: it has {keys}")
 
 
 def given_to(node: Node) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ClockState
 from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
+from exo_gravity.hardware.network import check_environment, keep_to_this_machine, kept_to_this_machine
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import ERROR, OK, Diagnostics
 
@@ -64,6 +64,7 @@ def run(make_node: Callable[[], Node], priority: int = 0) -> int:
     with contextlib.suppress(OSError):
         Path("/proc/self/comm").write_text(executable)  # for ps, top and pgrep
     try:
+        check_environment()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except (ExoGravityError, RuntimeError) as error:  # RuntimeError: rcl could not read its own arguments
