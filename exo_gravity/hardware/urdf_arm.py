@@ -112,7 +112,10 @@ class UrdfArm(UrdfShape):
         self._identity = text, names
         self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
-        self._own_mass = max(self._tree.masses[self._numbers].tolist())
+        # All that the joints move: each of several chains counts once, by its first joint.
+        joints, supports = {*self._joints}, self._model.supports
+        first = [joint - 1 for joint in joints if not joints & {*supports[joint]} - {joint}]
+        self._own_mass = float(np.sum(self._tree.masses[first]))
         check_size(self._moves, self._own_mass, self.length)
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)

@@ -15,7 +15,7 @@ import numpy as np
 
 from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.wearer import PAPER_LINKS, Wearer
+from exo_gravity.core.arm.wearer import PAPER_LINKS, LinkLoad, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
 from exo_gravity.core.safety.motion_monitor import GRAVITY
@@ -71,17 +71,23 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(configured: AnyArm, wearer: Wearer, support: float, max_tilt: float, payload: float) -> ArmBudget:
+def arm_budget(
+    configured: AnyArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float
+) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
-    max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the robot.
+    wearer: None if nobody wears it. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the
+    robot.
     """
     values, motors = configured.compensator, configured.can_bridge["motor"]
     names = configured.joint_names if configured.by_urdf else JOINTS
     bounds = workspace(configured.low, configured.high, max_tilt)
     with named(f"{configured.namespace}/compensator "):
         robot = configured.robot.with_payload(payload, values["payload.cog"])
-        load = wearer.on_links(configured.robot.length, values.get("wearer.links", PAPER_LINKS))
+        links, count = values.get("wearer.links", PAPER_LINKS), len(configured.joint_names)
+        load = LinkLoad(np.zeros(count), np.zeros(count))
+        if wearer and any(links):
+            load = wearer.on_links(configured.robot.length, links)
         torques = motor_torques(configured.can_bridge)
         joints = budget(robot, load, joint_spring_of(values), support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
@@ -118,7 +124,7 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
     fits = largest_support(arm.joints)
     if fits is None:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
-    else:
+    elif arm.support:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     if arm.by_urdf:
         yield from _skeleton_lines(arm, names)

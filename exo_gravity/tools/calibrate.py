@@ -92,6 +92,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     option("--hand", default="", metavar="LINK", help="link of the URDF that holds a load")
     option("--side", choices=SIDES, default="right", help="which arm (default: %(default)s)")
     option("--channel", default="can0", metavar="BUS", help="SocketCAN interface (default: %(default)s)")
+    option("--fd", action="store_true", help="the bus is CAN FD")
+    option("--simulate", action="store_true", help="with a simulated device, on a simulated bus: to try it")
     option("--output", required=True, type=Path, metavar="NEW.yaml", help="new file to write")
     return parser.parse_args(args)
 
@@ -155,7 +157,8 @@ def _write_new(options: argparse.Namespace) -> int:
     """Write the first file of an arm; return the exit code."""
     from exo_gravity.lab.calibration.new import MEASURE, NewArm, write_new
 
-    said = (getattr(options, name) for name in ("urdf", "motors", "ids", "joints", "hand", "side", "channel"))
+    names = ("urdf", "motors", "ids", "joints", "hand", "side", "channel", "fd", "simulate")
+    said = (getattr(options, name) for name in names)
     for note in write_new(NewArm(*said), options.output):
         print(note)
     print(f"Written: {options.output}; {MEASURE} in it marks what is still to be measured")

@@ -112,6 +112,8 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law_bar
             expected = gravity_torque(exact, theta, Tilt.of_gravity(side, gravity).direction)
             assert np.allclose(torque_of(described, theta, gravity), expected, rtol=0.0, atol=1e-9)
         assert described.total_mass == pytest.approx(exact.total_mass)
+    sides = [name.replace(side, other) for other in ("left", "right") for name in own.joint_names]
+    assert UrdfArm(urdf_of(params), sides).total_mass == pytest.approx(2.0 * own.robot.total_mass)  # two chains
     assert arm.length == pytest.approx(own.robot.length.tolist())
     none = (0.0,) * 4
     assert held.with_payload(0.0).with_wearer(none, none) == arm.with_payload(0.0).with_wearer(none, none)

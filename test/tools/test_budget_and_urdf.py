@@ -71,6 +71,18 @@ def test_full_zero_g_of_75_kg_is_reported_as_beyond_the_papers_motors_and_by_how
     assert both.text.count("joint                 motor") == 1
 
 
+@pytest.mark.usefixtures("plain")
+@pytest.mark.parametrize(("words", "links"), [((), [2, 3]), (("--body-mass", 70), [0, 0])])
+def test_an_arm_that_nobody_wears_has_the_figures_of_the_arm_alone(budget, words, links):
+    ended = budget(*words, file="three_joints.yaml", changes={COMPENSATOR: {"wearer": {"links": links}}})
+    assert ended.code == 0 and "largest_moment: [" in ended.text
+    alone = budget("--body-mass", 70, "--support", 0, file="three_joints.yaml")
+    rows = [[line for line in one.text.splitlines() if "AK" in line] for one in (ended, alone)]
+    assert len(rows[0]) == 3
+    assert [row.split()[5] for row in rows[0]] == [row.split()[5] for row in rows[1]]  # needs
+    assert words or "The arm alone, which nobody wears, is within rated torque" in ended.text
+
+
 def test_a_load_in_the_hand_is_part_of_the_torques_and_of_the_moments_and_every_joint_gets_a_figure(budget, tmp_path):
     words = ("--body-mass", 40, "--support", 0.5)
     bare, loaded = budget(*words).text, budget(*words, "--payload", 1.5).text

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import re
+import shutil
 import signal
 import threading
 from dataclasses import replace
@@ -21,7 +22,6 @@ from html import escape
 
 import numpy as np
 import pytest
-import yaml
 from rich.console import Console
 
 from exo_gravity.core.arm.arm import ArmModel
@@ -36,7 +36,6 @@ from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
 from exo_gravity.lab.inputs.arms import carried_arm, configured_arm, configured_arms
 from exo_gravity.lab.inputs.parameter_file import can_options, load
-from exo_gravity.lab.inputs.ros_yaml import dumped
 from exo_gravity.lab.moments import load_moments, regressor
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.sim.script import TrialScript
@@ -58,25 +57,48 @@ def new(run_tool, tmp_path):
     return lambda *words: run_tool("calibrate", "new", *ARM, *words, "--output", tmp_path / "arm.yaml")
 
 
-def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors_and_carries_the_simulated_arm(
-    tmp_path, new
-):
-    ended, output = new("--channel", "can1"), tmp_path / "arm.yaml"
+def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp_path, new):
+    ended, output = new("--channel", "can1", "--fd"), tmp_path / "arm.yaml"
     assert ended.code == 0 and "MEASURE in it marks" in ended.out
+    assert "by its URDF the arm hangs at abduction 1, flexion 0, elbow 0 degrees" in ended.out
     arm = carried_arm(load(output), "/right")
-    assert arm.limits.position_max == (2.0, 2.4, 2.4) and arm.limits.max_effort == (9.0, 9.0, 3.0)
+    assert arm.limits.position_max == (1.9, 2.3, 2.3) and arm.limits.max_effort == (9.0, 9.0, 3.0)
     assert arm.can_bridge["can.channel"] == "can1" and not arm.can_bridge["autostart"]
+    assert can_options(load(output)["/right/can_bridge"]) == {"fd": True}
     assert max(map(abs, arm.settings.torque(arm.limits.home, Tilt.of("right"))[0])) < 0.01
-    content, shipped = (yaml.safe_load(file.read_text()) for file in (output, CONFIG / "three_joints.yaml"))
-    bridge = content["/right/can_bridge"]["ros__parameters"]
-    bridge["sign_check_torque"] = 0.0
-    motors = {"can": {**bridge["can"]}, "direction": [1, 1, 1], "zero": [0.0, 0.0, 0.0], "trial_delay": 3.0}
-    simulator = {"ros__parameters": {**shipped["/right/simulator"]["ros__parameters"], **motors}}
-    output.write_text(dumped({**content, "/right/simulator": simulator}))
-    script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.6, 0.5, 0.8], "over": 3.0}, {"hold": 3.0}]})
-    (trial,) = simulated_trials(output, script)
+
+
+def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(tmp_path, run_tool, monkeypatch):
+    shutil.copy(CONFIG / "arms" / "elbow.urdf", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    arm = ("--urdf", "elbow.urdf", "--motors", "AK80-64", "--ids", 1)
+    assert run_tool("calibrate", "new", *arm, "--simulate", "--output", "arm.yaml").code == 0
+    monkeypatch.chdir("/")
+    script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.8], "over": 3.0}, {"hold": 3.0}]})
+    (trial,) = simulated_trials(tmp_path / "arm.yaml", script)
     recording = trial.run()
     assert not trial.trouble and recording.position.max() > 0.7
+
+
+TABLE = """<robot name="table"><link name="base"/>
+<joint name="lift" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 1 0"/>
+<limit lower="{}" upper="{}" effort="9" velocity="5"/></joint>
+<link name="arm"><inertial><origin xyz="{} 0 {}"/><mass value="1.2"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+HANG = {  # the joint's limits, where its link's mass lies at 0 in x and z; what is said, and where home is
+    "falls from 0": (("-0.3", "3.0", "0.1819", "0.0832"), "the arm hangs at lift 115 degrees", 2.0),
+    "hangs at 0": (("-1.0", "1.0", "0", "-0.2"), "the arm hangs at lift 0 degrees", 0.0),
+    "stands upright at 0": (("-0.5", "1.2", "0", "0.2"), "cannot hang within its limits: lift would rest", 1.1),
+}
+
+
+@pytest.mark.parametrize(("arm", "said", "home"), HANG.values(), ids=HANG)
+def test_home_is_where_gravity_brings_the_arm_and_an_arm_that_cannot_hang_is_told(arm, said, home, tmp_path, run_tool):
+    urdf, output = tmp_path / "arm.urdf", tmp_path / "arm.yaml"
+    urdf.write_text(TABLE.format(*arm))
+    ended = run_tool("calibrate", "new", "--urdf", urdf, "--motors", "AK80-9", "--ids", 1, "--output", output)
+    assert ended.code == 0 and said in ended.out
+    assert carried_arm(load(output), "/right").limits.home == pytest.approx((home,), abs=1e-3)
 
 
 UNFIT = {

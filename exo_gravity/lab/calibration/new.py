@@ -27,7 +27,12 @@ from exo_gravity.lab.inputs.ros_yaml import scalar
 
 LARGEST_ANGLE = 3.1  # rad, of a joint without limits
 POSES = 2000  # at random, for gravity's largest torque
-FALL, STEPS = 0.05, 4000  # rad per Nm and step, by which the arm is let fall; it hangs after so many
+STARTS, STEPS, ALONG = 12, 2000, 50  # poses from which the arm is let fall, steps of a fall, points of a way
+FALL = 0.5  # rad and step under gravity's largest torque
+SAME, STOPPED = 1e-6, 0.02  # Nm, differences of energy, and torques at rest, that count as none
+INSIDE = 0.1  # rad by which the limits are inside the URDF's: a start moves each joint a little
+COULOMB, VISCOUS = 0.1, 0.02  # Nm and Nm s/rad, friction of a simulated joint
+SIMULATED_BUS = "interface: udp_multicast, channel: 239.74.163.9, options: {port: 43119, hop_limit: 0"
 DAMIAO_TIMEOUT = 0.3  # s
 MEASURE = "MEASURE"
 PLAUSIBLE_ANGLE = 2.1 * math.pi  # rad; robots whose joints turn both ways have limits of ±2 pi
@@ -45,6 +50,22 @@ class NewArm:
     hand: str = ""  #: the link that holds a load, '' for none
     side: str = "right"
     channel: str = "can0"
+    fd: bool = False  #: whether the bus is CAN FD
+    simulate: bool = False  #: whether the file gets a simulated device, on a simulated bus
+
+    @property
+    def bus(self) -> str:
+        """The bus as YAML."""
+        fd = "fd: true" * self.fd
+        if self.simulate:
+            return f"{{{', '.join(filter(None, (SIMULATED_BUS, fd)))}}}}}"
+        options = f", options: {{{fd}}}" * self.fd
+        return f"{{interface: socketcan, channel: {_plain(self.channel)}{options}}}"
+
+    @property
+    def file(self) -> str:
+        """The URDF as nodes find it, wherever they are started."""
+        return self.urdf if self.urdf.startswith("package://") else str(Path(self.urdf).absolute())
 
     def __post_init__(self) -> None:
         for motor in self.motors:
@@ -58,6 +79,12 @@ class JointRange(NamedTuple):
     low: float
     high: float
     note: str = ""  #: what is doubtful in them, ''
+
+    @property
+    def inside(self) -> tuple[float, float]:
+        """The limits of the file."""
+        edge = min(INSIDE, 0.25 * (self.high - self.low))
+        return round(self.low + edge, 4), round(self.high - edge, 4)
 
 
 def turning_joints(text: str) -> dict[str, JointRange]:
@@ -91,13 +118,44 @@ def _edge(joint: str, limit: Element | None, end: str) -> float:
         raise ParameterError(f"limit {end} of {joint}", text, "a number of rad") from None
 
 
-def hanging(arm: UrdfArm, ranges: Sequence[JointRange]) -> np.ndarray:
-    """Return the angles (n,) in rad in which the upright arm comes to rest within its limits when it falls from 0."""
-    low, high = np.transpose([(edge.low, edge.high) for edge in ranges])
-    theta, upright = np.clip(np.zeros(len(low)), low, high), Tilt.of("left")
+def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the angles (n,) in rad in which the upright arm comes to rest within `low` and `high`, (n,) rad.
+
+    Of several such poses the lowest one; a joint that gravity does not turn is as near to 0 as it can be.
+    """
+    count, down = len(low), Tilt.of("left").direction
+    theta = np.random.default_rng(0).uniform(low, high, (STARTS, count))
+
+    def torques(poses: np.ndarray) -> np.ndarray:
+        return np.asarray(arm.torques(poses, np.tile(down, (len(poses), 1))))
+
+    def energy(pose: np.ndarray) -> float:
+        """Return the work of gravity's torque in J on the way from 0."""
+        return float(np.sum(torques(np.outer((np.arange(ALONG) + 0.5) / ALONG, pose)) @ pose) / ALONG)
+
+    step = FALL / max(SAME, np.abs(torques(theta)).max())
     for _ in range(STEPS):
-        theta = np.clip(theta - FALL * np.array(arm.torque(theta.tolist(), upright)), low, high)
-    return theta
+        theta = np.clip(theta - step * torques(theta), low, high)
+    best = min(theta, key=energy)
+    for joint in range(count):
+        simpler = best.copy()
+        simpler[joint] = np.clip(0.0, low[joint], high[joint])
+        if energy(simpler) < energy(best) + SAME:
+            best = simpler
+    return best
+
+
+def on_stops(arm: UrdfArm, names: Sequence[str], home: np.ndarray) -> list[str]:
+    """Return how the arm hangs, or which joints rest on their stops, in a sentence."""
+    angles = ", ".join(f"{name} {math.degrees(angle) + 0.0:.0f}" for name, angle in zip(names, home, strict=True))
+    torque = np.abs(arm.torque(home.tolist(), Tilt.of("left")))
+    stopped = [name for name, one in zip(names, torque, strict=True) if one > STOPPED]
+    if stopped:
+        return [
+            f"the arm cannot hang within its limits: {', '.join(stopped)} would rest on a stop, and no start begins "
+            f"there: mount it so that it hangs, or measure home with the arm in a stand that lets it hang"
+        ]
+    return [f"by its URDF the arm hangs at {angles} degrees, if the root link's z axis points up: compare"]
 
 
 def write_new(new: NewArm, output: Path) -> list[str]:
@@ -110,14 +168,14 @@ def write_new(new: NewArm, output: Path) -> list[str]:
         raise ParameterError("motors and ids", [*new.motors, *new.ids], expected)
     arm = UrdfArm(text, names, new.hand)
     ranges = [known[name] for name in names]
-    low, high = np.transpose([(edge.low, edge.high) for edge in ranges])
+    low, high = np.transpose([edge.inside for edge in ranges])
     poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
     upright = Tilt.of("left")
     needed = np.max(np.abs(arm.torques(poses, np.tile(upright.direction, (POSES, 1)))), axis=0)
     rated = [MOTORS[motor].rated_torque for motor in new.motors]
     efforts = [min(most, own or most) for most, own in zip(rated, arm.max_effort, strict=True)]
-    home = hanging(arm, ranges)
-    notes = [*arm.notes, *(edge.note for edge in ranges if edge.note)]
+    home = hanging(arm, low, high)
+    notes = [*arm.notes, *(edge.note for edge in ranges if edge.note), *on_stops(arm, names, home)]
     for name, effort, most in zip(names, efforts, needed.tolist(), strict=True):
         if most > effort:
             notes.append(f"{name}: gravity takes up to {most:.1f} Nm of it, max_effort is {effort:g} Nm")
@@ -139,7 +197,27 @@ def _file(
     home: Sequence[float],
 ) -> str:
     """Return the text of the parameter file."""
-    count = len(names)
+    count, simulator = len(names), ""
+    urdf = f"{{file: {json.dumps(new.file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
+    start = "autostart: false  # an operator arms it\n    rate: 250.0"
+    if new.simulate:
+        start = (
+            "autostart: true  # nobody wears a simulated arm\n    rate: 100.0\n    command_timeout: 0.1\n"
+            "    enable_timeout: 60.0\n    start_pose: hanging  # as the simulated arm does at the start"
+        )
+        simulator = f"""
+/{new.side}/simulator:
+  ros__parameters:
+    side: {new.side}
+    urdf: {urdf}
+    joint_names: {_row(names)}
+    can: {new.bus}
+    motor: {_row(new.motors)}
+    can_id: {_row(new.ids)}
+    direction: {_row([1] * count)}
+    zero: {_row([0.0] * count)}
+    friction: {{coulomb: {_row([COULOMB] * count)}, viscous: {_row([VISCOUS] * count)}}}  # Nm, Nm s/rad
+"""
     timeouts = [0.0 if MOTORS[motor].family == "ak" else DAMIAO_TIMEOUT for motor in new.motors]
     listed = _row(names)
     return f"""# Written by `calibrate new` from {" ".join(new.urdf.split())}.
@@ -148,29 +226,28 @@ def _file(
 /{new.side}/can_bridge:
   ros__parameters:
     joint_names: {listed}
-    autostart: false  # an operator arms it
-    rate: 250.0
-    can: {{interface: socketcan, channel: {_plain(new.channel)}}}
+    {start}
+    can: {new.bus}
     motor: {_row(new.motors)}
     can_id: {_row(new.ids)}
     direction: {_row([1] * count)}  # {MEASURE}: 1 or -1, so that a positive angle is that of the URDF
     zero: {_row([0.0] * count)}  # {MEASURE}: rad, the motor's angle where the joint's angle is 0
     torque_scale: {_row([1.0] * count)}  # {MEASURE}: real Nm per commanded Nm
     motor_timeout: {_row(timeouts)}  # s, as set in the motors
-    position_min: {_row([edge.low for edge in ranges])}  # rad, the URDF's
-    position_max: {_row([edge.high for edge in ranges])}
+    position_min: {_row([edge.inside[0] for edge in ranges])}  # rad, {INSIDE:g} inside the URDF's
+    position_max: {_row([edge.inside[1] for edge in ranges])}
     max_effort: {_row(efforts)}  # Nm; gravity of the arm alone, upright: up to {_row([round(x, 1) for x in needed])}
     home: {_row([round(angle, 3) for angle in home])}  # rad, where the arm hangs by its URDF
 
 /{new.side}/compensator:
   ros__parameters:
     law: urdf
-    urdf: {{file: {json.dumps(new.urdf, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}
+    urdf: {urdf}
     joint_names: {listed}
     use_imu: false  # true with an IMU on the trunk: docs/imu.md
     max_effort: {_row(efforts)}
     mode: one_g
-"""
+{simulator}"""
 
 
 def _row(values: Sequence[object]) -> str:
