@@ -71,9 +71,7 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(
-    configured: AnyArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float
-) -> ArmBudget:
+def arm_budget(configured: AnyArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
     wearer: None if nobody wears it. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the

@@ -80,11 +80,10 @@ class JointRange(NamedTuple):
     high: float
     note: str = ""  #: what is doubtful in them, ''
 
-    @property
-    def inside(self) -> tuple[float, float]:
-        """The limits of the file."""
-        edge = min(INSIDE, 0.25 * (self.high - self.low))
-        return round(self.low + edge, 4), round(self.high - edge, 4)
+    def inside(self, home: float) -> tuple[float, float]:
+        """Return the limits of the file: INSIDE these, but no closer than that to where the arm hangs, rad."""
+        low = max(self.low, min(self.low + INSIDE, home - INSIDE))
+        return round(low, 4), round(min(self.high, max(self.high - INSIDE, home + INSIDE)), 4)
 
 
 def turning_joints(text: str) -> dict[str, JointRange]:
@@ -168,7 +167,7 @@ def write_new(new: NewArm, output: Path) -> list[str]:
         raise ParameterError("motors and ids", [*new.motors, *new.ids], expected)
     arm = UrdfArm(text, names, new.hand)
     ranges = [known[name] for name in names]
-    low, high = np.transpose([edge.inside for edge in ranges])
+    low, high = np.transpose([(edge.low, edge.high) for edge in ranges])
     poses = np.random.default_rng(0).uniform(low, high, (POSES, len(names)))
     upright = Tilt.of("left")
     needed = np.max(np.abs(arm.torques(poses, np.tile(upright.direction, (POSES, 1)))), axis=0)
@@ -198,6 +197,7 @@ def _file(
 ) -> str:
     """Return the text of the parameter file."""
     count, simulator = len(names), ""
+    edges = [edge.inside(angle) for edge, angle in zip(ranges, home, strict=True)]
     urdf = f"{{file: {json.dumps(new.file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
     start = "autostart: false  # an operator arms it\n    rate: 250.0"
     if new.simulate:
@@ -234,8 +234,8 @@ def _file(
     zero: {_row([0.0] * count)}  # {MEASURE}: rad, the motor's angle where the joint's angle is 0
     torque_scale: {_row([1.0] * count)}  # {MEASURE}: real Nm per commanded Nm
     motor_timeout: {_row(timeouts)}  # s, as set in the motors
-    position_min: {_row([edge.inside[0] for edge in ranges])}  # rad, {INSIDE:g} inside the URDF's
-    position_max: {_row([edge.inside[1] for edge in ranges])}
+    position_min: {_row([low for low, _ in edges])}  # rad, {INSIDE:g} inside the URDF's where the arm hangs farther off
+    position_max: {_row([high for _, high in edges])}
     max_effort: {_row(efforts)}  # Nm; gravity of the arm alone, upright: up to {_row([round(x, 1) for x in needed])}
     home: {_row([round(angle, 3) for angle in home])}  # rad, where the arm hangs by its URDF
 
