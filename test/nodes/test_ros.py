@@ -59,7 +59,7 @@ from exo_gravity.nodes.can_bridge.operation import BridgeServices
 from exo_gravity.nodes.ros import inner
 from exo_gravity.nodes.ros import parameters as parameters_module
 from exo_gravity.nodes.ros import run as running
-from exo_gravity.nodes.ros.inner import ExecutorInbox, NodeExecutor, Until, prepare_transitions
+from exo_gravity.nodes.ros.inner import NodeExecutor, Until, prepare_transitions
 from exo_gravity.nodes.ros.messages import milliseconds, row
 from exo_gravity.nodes.ros.parameters import RESPONSE_TIMEOUT, NodeParameters, accept_changes, declare
 from exo_gravity.nodes.ros.run import WAITS_FOR_BRIDGES, handle_signals
@@ -214,29 +214,6 @@ def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of
 def test_a_middleware_that_does_not_number_messages_is_refused_with_one_that_does():
     with pytest.raises(RuntimeError, match="rmw_fastrtps_cpp"):
         Publishers().note({"publication_sequence_number": None})
-
-
-def test_messages_pass_through_the_executor_where_rclpy_has_no_wait_set_for_one_topic(served):
-    topic, received = f"inbox_{next(NUMBERS)}", []
-    subscription = PolledSubscription(
-        served.node,
-        String,
-        topic,
-        lambda message, info: received.append((message.data, info["publication_sequence_number"])),
-        QUEUE,
-        open_inbox=ExecutorInbox,
-    )
-    publisher = served.client.create_publisher(String, topic, 8)
-    wait_until(lambda: publisher.get_subscription_count() == 1)
-    for text in ("a", "b"):
-        publisher.publish(String(data=text))
-
-    def poll():
-        served.spin()
-        subscription.poll(0.01)
-
-    wait_until(lambda: len(received) == 2, poll)
-    assert received == [("a", 1), ("b", 2)]
 
 
 # The parameters of another node, as it comes and goes

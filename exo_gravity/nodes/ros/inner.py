@@ -1,10 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The inner parts of rclpy that the nodes use, in one file: they may change between distributions.
 
-Each has a fallback in rclpy's public interface, which does the same at a higher cost or says less:
+`WaitSet` and `take_message` are needed. The others have a fallback in rclpy's public interface, which says less:
 
     part                                    without it
-    `WaitSet`, `take_message`               `ExecutorInbox`: messages pass through the executor
     `_take_service`                         a request is as old as the executor stood still; an executor that awaits
                                             an answer does nothing else meanwhile
     `set_parameters_atomically`, replaced   a read-only parameter that is set to its own value is refused, by name;
@@ -15,12 +14,10 @@ So `guard` lets them answer a failure. An exception of this package still ends t
 """
 
 import inspect
-import threading
 import time
-from collections import deque
 from collections.abc import Callable, Coroutine, Generator
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetLoggerLevelsResult, SetParametersResult
@@ -38,20 +35,7 @@ from rclpy.service import Service
 STOOD_STILL = 1.0  # s between two looks at what is due, after which an executor has stood still
 QUEUED_TIME = 0.5  # s after that in which requests may have been queued meanwhile
 LONGEST_LOOK = 0.1  # s for which an executor waits
-NOT_THERE = (AttributeError, ImportError, TypeError)  # what a changed inner part raises
 PACKAGE = __name__.partition(".")[0]
-
-
-class Inbox(Protocol):
-    """Where messages of one topic wait. Each kind takes the node, type, topic, QoS, and whether bytes suffice."""
-
-    def wait(self, timeout: float) -> None:
-        """Wait up to `timeout` s for a message."""
-        ...
-
-    def take(self) -> tuple[Any, dict[str, Any]] | None:
-        """Return the oldest message and rclpy's information on it, None if there is none."""
-        ...
 
 
 class OutsideExecutor(ReentrantCallbackGroup):
@@ -62,8 +46,8 @@ class OutsideExecutor(ReentrantCallbackGroup):
         return False
 
 
-class DirectInbox:
-    """Messages that wait in the middleware, with a wait set for this topic alone."""
+class Inbox:
+    """Messages that wait in the middleware, with a wait set for this topic alone. raw: whether bytes suffice."""
 
     def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, raw: bool) -> None:
         self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
@@ -84,41 +68,6 @@ class DirectInbox:
         """Return the oldest message and rclpy's information on it, None if there is none."""
         taken: tuple[Any, dict[str, Any]] | None = self._take(self._subscription.msg_type, self._subscription.raw)
         return taken
-
-
-class ExecutorInbox:
-    """Messages that the node's executor delivers: it must spin."""
-
-    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, raw: bool) -> None:
-        self._queue: deque[tuple[Any, dict[str, Any]]] = deque(maxlen=qos.depth)
-        self._arrival = threading.Condition()
-        node.create_subscription(
-            msgtype, topic, self._on_message, qos, callback_group=ReentrantCallbackGroup(), raw=raw
-        )
-
-    def wait(self, timeout: float) -> None:
-        """Wait up to `timeout` s for a message."""
-        with self._arrival:
-            self._arrival.wait_for(lambda: self._queue, timeout)
-
-    def take(self) -> tuple[Any, dict[str, Any]] | None:
-        """Return the oldest message and rclpy's information on it, None if there is none."""
-        with self._arrival:
-            return self._queue.popleft() if self._queue else None
-
-    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
-        with self._arrival:
-            self._queue.append((message, info))
-            self._arrival.notify()
-
-
-def open_inbox(node: Node, msgtype: type, topic: str, qos: QoSProfile, raw: bool) -> Inbox:
-    """Return an inbox outside of the executor, or one through it if this rclpy does not allow that."""
-    try:
-        return DirectInbox(node, msgtype, topic, qos, raw)
-    except NOT_THERE as error:
-        node.get_logger().warning(f"{topic}: taken through the executor, which costs more ({error})", once=True)
-        return ExecutorInbox(node, msgtype, topic, qos, raw)
 
 
 class Until:

@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.arm.rotation import unit_quaternion, up_in_body
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import NO_ROTATION, NOT_REPORTED, TiltInput
-from exo_gravity.nodes.ros.inner import Inbox, open_inbox
+from exo_gravity.nodes.ros.inner import Inbox
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -78,7 +78,6 @@ class PolledSubscription(PeriodicThread):
 
     pause: s for which the thread sleeps after each poll; of what arrives meanwhile it gets the last `qos.depth`.
     raw: whether the callback gets the messages as bytes.
-    open_inbox: what the messages wait in.
     """
 
     def __init__(
@@ -90,11 +89,10 @@ class PolledSubscription(PeriodicThread):
         qos: QoSProfile = NEWEST_ONLY,
         pause: float = POLL_PAUSE,
         raw: bool = False,
-        open_inbox: Callable[[Node, type, str, QoSProfile, bool], Inbox] = open_inbox,
     ) -> None:
         super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
         self._callback, self._depth = callback, qos.depth
-        self._inbox = open_inbox(node, msgtype, topic, qos, raw)
+        self._inbox = Inbox(node, msgtype, topic, qos, raw)
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
