@@ -444,6 +444,12 @@ def test_a_frame_is_what_a_motor_would_take_it_for(frame_id, data, expected):
     assert DAMIAO_MIT.classify(frame_id, data, REPLY_IDS) == expected
 
 
+def test_a_damiao_error_is_named_as_in_the_manual():
+    named = [DAMIAO_MIT.error_text(code).split(":")[0] for code in range(8, 16)]
+    assert named == ["over-voltage", "under-voltage", "over-current", "MOSFET over-temperature",
+                     "coil over-temperature", "communication lost", "overload", "unknown"]  # fmt: skip
+
+
 def damiao_parameters(**given):
     usual = {"motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"], "motor_timeout": [0.2] * 4}
     return values_of(CAN_BRIDGE, {"can.interface": "socketcan", "can.channel": "can0", **usual, **given})
