@@ -48,7 +48,7 @@ def read_urdf(path: str) -> str:
     try:
         return _located(path).read_text(encoding="utf-8-sig")  # some editors of Windows begin a file with a mark
     except (OSError, UnicodeDecodeError) as error:
-        raise ParameterError("urdf.file", path, f"a URDF file ({error})") from None
+        raise ParameterError("urdf.file", path, f"a URDF file in UTF-8 ({error})") from None
 
 
 def _located(path: str) -> Path:

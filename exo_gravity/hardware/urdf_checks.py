@@ -9,6 +9,7 @@ refused, or must come with the joint states; the rest is named in `notes`.
 
 import copy
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,11 @@ TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous join
 SHAPES = ("visual", "collision")
 LARGEST = 1e3  # rad or m, of a limit that is none
 TINY = 1e-12  # Nm
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)  # as urdfdom, Pinocchio and MuJoCo all read it
+# Attributes of a joint, or of what a link's inertial has, with one number each; xyz and rpy have three.
+SINGLE = (
+    "value", "ixx", "iyy", "izz", "ixy", "ixz", "iyz", "lower", "upper", "effort", "velocity", "multiplier", "offset",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,10 @@ class Other(NamedTuple):
 
 
 def robot_of(text: str) -> Element:
-    """Return the `robot` element of a URDF. Raises ParameterError for other texts, and where xacro has not run."""
+    """Return the `robot` element of a URDF.
+
+    Raises ParameterError for other texts, where xacro has not run, and for a text in place of a number.
+    """
     try:
         robot = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -76,6 +85,13 @@ def robot_of(text: str) -> Element:
         raise ParameterError("urdf", f"<{robot.tag}>", "a URDF, whose outermost element is `robot` without a namespace")
     if left := next((element.tag for element in robot.iter() if "xacro" in element.tag.partition("}")[0]), ""):
         raise ParameterError("urdf", left, "a URDF without xacro elements: run xacro first")
+    for owner in (*robot.findall("link"), *robot.findall("joint")):
+        for part in (*owner, *owner.findall("inertial/*")):
+            for name, text in part.attrib.items():
+                words, count = text.split(), 3 if name in ("xyz", "rpy") else int(name in SINGLE)
+                if count and not (len(words) == count and all(map(NUMBER.fullmatch, words))):
+                    what = f"{part.tag} {name} of the {owner.tag} {owner.get('name')}"
+                    raise ParameterError(what, text, f"{'3 finite numbers' * (count > 1) or 'a finite number'}, as 1.2")
     return robot
 
 
@@ -102,7 +118,7 @@ class UrdfJoints:
         try:
             self.model = pin.buildModelFromXML(text)
         except (RuntimeError, ValueError) as error:
-            expected = f"a URDF that Pinocchio reads ({error})"
+            expected = f"a URDF that Pinocchio reads: the lines above say more ({error})"
             raise ParameterError("urdf", f"{text[:60].strip()} ...", expected) from None
         self.inertials = read_inertials(self.root, self.model)  #: of each link, by its name
         self._pin = pin
@@ -461,17 +477,10 @@ def _inertial(link: Element) -> Inertial:
     parts = {} if inertial is None else {part.tag: part.attrib for part in inertial}
 
     def numbers(tag: str, *names: str) -> tuple[float, ...]:
-        texts = [word for name in names for word in parts.get(tag, {}).get(name, "0").split()]
-        try:
-            values = tuple(map(float, texts))
-        except ValueError:
-            values = (math.nan,)
-        if not all(map(math.isfinite, values)):
-            raise ParameterError(f"{tag} of the link {link.get('name')}", " ".join(texts), "finite numbers, as 1.2")
-        return values
+        return tuple(float(word) for name in names for word in parts.get(tag, {}).get(name, "0").split())
 
     mass = numbers("mass", "value")[0]
     if mass < 0.0:
         raise ParameterError(f"mass of the link {link.get('name')}", mass, "0 kg or more")
-    cog = numbers("origin", "xyz") if parts.get("origin", {}).get("xyz") else (0.0, 0.0, 0.0)
+    cog = numbers("origin", "xyz") if "xyz" in parts.get("origin", {}) else (0.0, 0.0, 0.0)
     return Inertial(mass, cog, numbers("inertia", "ixx", "iyy", "izz", "ixy", "ixz", "iyz"))

@@ -30,7 +30,7 @@ from subprocess import PIPE, STDOUT
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
-from exo_gravity.lab.inputs.parameter_file import Nodes, check_together, load, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, load, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
 from exo_gravity.lab.packages import check_packages
 
@@ -153,7 +153,6 @@ def planned(
     only, more: as in `Launcher`. Raises ParameterError, MissingPackageError.
     """
     nodes = {**{node: {} for node in more}, **load(params)}
-    check_together(nodes)
     nodes |= {node: {} for node in wearers(nodes)}
     names = chosen(nodes, only)
     for node in names:

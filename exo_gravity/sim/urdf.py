@@ -20,10 +20,10 @@ from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import for_joints
+from exo_gravity.hardware.urdf_checks import SHAPES, robot_of
 from exo_gravity.sim.arm import FRICTION, STEP, STOP, JointConfig
 from exo_gravity.sim.trunk_motion import TrunkState
 
-SHAPES = ("visual", "collision")
 # Links without mass, which MuJoCo refuses to move, get the least; inertias that no body can have are corrected.
 COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-14", "boundinertia": "1e-14"}
 POINT = (1e-7, 1e-7, 1e-7)  # kg m^2, the inertia of a point of mass
@@ -107,15 +107,15 @@ class UrdfConfig(JointConfig):
     @cached_property
     def _spec(self) -> mujoco.MjSpec:
         """The arm as MuJoCo reads it, without the joints that are fixed."""
+        robot = robot_of(self.text)
         try:
-            robot = ElementTree.fromstring(self.text)
             for link in robot.findall("link"):
                 for shape in [child for child in link if child.tag in SHAPES]:
                     link.remove(shape)
             ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler", COMPILER)
             spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
             spec.compile()
-        except (ElementTree.ParseError, ValueError) as error:
+        except ValueError as error:
             what = f"a URDF that MuJoCo reads ({error})"
             raise ParameterError("urdf.file", f"{self.text[:60].strip()} ...", what) from None
         chain = [joint.name for joint in spec.joints]

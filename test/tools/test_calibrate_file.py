@@ -129,7 +129,7 @@ CHANGED = {  # of the elbow's description: what is written instead, the exit cod
         "-10 to 150 rad, are cut to ±3.1: are they in deg",
     ),
     "no room": ({LOWER: 'lower="0"', UPPER: 'upper="0"'}, 0, "elbow: its limits, 0 to 0 rad, leave no room"),
-    "a formula": ({LOWER: 'lower="-pi/2"'}, 2, "limit lower of elbow = '-pi/2': must be a number of rad"),
+    "a formula": ({LOWER: 'lower="-pi/2"'}, 2, "limit lower of the joint elbow = '-pi/2': must be a finite number"),
     "the wrong way": ({LOWER: 'lower="3"'}, 2, "limits of elbow = [3.0, 2.4]"),
     "cut": ({"</robot>": ""}, 2, "must be well-formed XML"),
     "no joint that turns": ({"revolute": "prismatic"}, 2, "the joints (none of the URDF turns)"),

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -96,7 +95,7 @@ def turning_joints(text: str) -> dict[str, JointRange]:
         if joint.get("type") not in ("revolute", "continuous") or joint.find("mimic") is not None:
             continue
         name, note, limit = joint.get("name", ""), "", joint.find("limit")
-        low, high = (_edge(name, limit, end) for end in ("lower", "upper"))
+        low, high = (math.nan if limit is None else float(limit.get(end, "nan")) for end in ("lower", "upper"))
         is_endless = joint.get("type") == "continuous"
         if is_endless or not low < high:
             if low == high and not is_endless:
@@ -106,15 +105,6 @@ def turning_joints(text: str) -> dict[str, JointRange]:
             note = f"{name}: its limits, {low:g} to {high:g} rad, are cut to ±{LARGEST_ANGLE:g}: are they in degrees?"
         found[name] = JointRange(max(low, -LARGEST_ANGLE), min(high, LARGEST_ANGLE), note)
     return found
-
-
-def _edge(joint: str, limit: Element | None, end: str) -> float:
-    """Return one end of a joint's limits in rad, NaN where it has none. Raises ParameterError if it is no number."""
-    text = "" if limit is None else limit.get(end, "")
-    try:
-        return float(text) if text else math.nan
-    except ValueError:
-        raise ParameterError(f"limit {end} of {joint}", text, "a number of rad") from None
 
 
 def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:

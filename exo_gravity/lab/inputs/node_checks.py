@@ -23,15 +23,14 @@ from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
 from exo_gravity.lab.inputs.arms import node_values, read_arm
-from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, check_together, stages
+from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages
 
 
 def check_nodes(nodes: Nodes) -> None:
-    """Check that nodes fit together, and the parameters of each of an arm and of the IMU as the node does at its start.
+    """Check the parameters of each node of an arm and of the IMU as the node does at its start.
 
     The URDF of `law: urdf` is left to the node if it comes from a topic. Raises ParameterError.
     """
-    check_together(nodes)
     for node, given in nodes.items():
         namespace, _, name = node.rpartition("/")
         if name == "can_bridge":

@@ -40,14 +40,16 @@ def load(path: str | Path) -> Nodes:
     """Return {node name: {dotted parameter name: value}} of a parameter file, as the nodes read it.
 
     Raises ParameterError, which names the file, the line or the entry, if the file is missing, not YAML, or of another
-    form, or if ROS would read it in a way that nobody means (ros_yaml.py).
+    form, if ROS would read it in a way that nobody means (ros_yaml.py), or if its nodes contradict each other.
     """
     try:
-        return ros_yaml.read(Path(path).read_text(encoding="utf-8"), str(path))
+        nodes = ros_yaml.read(Path(path).read_text(encoding="utf-8"), str(path))
     except OSError as error:
         raise ParameterError("params", str(path), f"a readable file ({error.strerror})") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ParameterError("params", str(path), f"YAML ({' '.join(str(error).split())})") from None
+    _check_together(nodes)
+    return nodes
 
 
 @lru_cache(RECORDED_TEXTS)
@@ -81,7 +83,7 @@ def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
     return found
 
 
-def check_together(nodes: Nodes) -> None:
+def _check_together(nodes: Nodes) -> None:
     """Raise ParameterError for nodes that contradict each other: buses, names of joints, sides, a second IMU."""
     _check_buses(nodes)
     _check_names(nodes)

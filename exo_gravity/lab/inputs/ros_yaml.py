@@ -159,7 +159,7 @@ class _Reader:
                 # ROS's own parser refuses such a list without naming it.
                 text = next((item for item in items if isinstance(item, str)), "")
                 if text and {int, float} & {type(item) for item in items}:
-                    raise ParameterError(name, text, f"a number, as the others: the text is not one (line {line})")
+                    raise ParameterError(name, text, f"a number, like the others: it is a text (line {line})")
                 raise ParameterError(name, items, f"a list of one type: 1.0, not 1, next to 2.5 (line {line})")
             return items
         return self._scalar(name)
