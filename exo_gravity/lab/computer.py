@@ -22,7 +22,7 @@ import numpy as np
 
 from exo_gravity.core.errors import named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
-from exo_gravity.core.safety.limits import CAN_BRIDGE, LOOP, limits_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.hardware.can.adapter import serials_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour, request_real_time
@@ -293,7 +293,7 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
     buses = list(of_buses(nodes, bridges, root))
     settings = list(bridges.values()) or [{param.name: param.default for param in CAN_BRIDGE}]
     period, priority = 1.0 / max(s["rate"] for s in settings), max(s["thread_priority"] for s in settings)
-    timeout = min(LOOP.frozen, *(s["command_timeout"] for s in settings))
+    timeout = min(s[name] for s in settings for name in ("command_timeout", "frozen_timeout"))
     wakeups = measured(period, seconds, priority)
     late = of_wakeups(wakeups, period, timeout)
     keep_to_this_machine()

@@ -28,6 +28,7 @@ from pathlib import Path
 from subprocess import PIPE, STDOUT
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import Nodes, load, stages
@@ -199,6 +200,8 @@ class Launcher:
     ) -> None:
         nodes, names, asking = planned(params, only, more)
         check({node: nodes[node] for node in names})
+        buses = [nodes[bridge].get("can.interface") for bridge in stages(names)[0]]
+        self.is_simulated = {*buses} <= {*SIMULATED_BUSES} and buses != []  #: whether no bridge can reach a real arm
         self._namespace, self._log_level = namespace, log_level
         #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
         self.params = _copy(

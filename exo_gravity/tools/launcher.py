@@ -4,6 +4,8 @@
 A file with a parameter that a node of an arm or the IMU would refuse is refused before any starts, and one whose arm a
 running can_bridge may carry.
 
+A simulation that dies is started again, up to three times in ten minutes; a real arm never is.
+
 With --one-process, can_bridge and compensator of an arm share a process, which counts as that of can_bridge.
 
 Exit code 0: stopped by Ctrl-C, SIGTERM or a closed terminal. 1: a node ended, or motors may still be powered. 2: wrong
@@ -11,7 +13,10 @@ use or wrong file.
 """
 
 import argparse
+import math
 import sys
+import time
+from collections import deque
 from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
@@ -21,7 +26,7 @@ from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.processes import Launcher, asking_on_terminal, node_modules, stop_on_signals
+from exo_gravity.lab.processes import ENDED_WELL, Launcher, asking_on_terminal, node_modules, stop_on_signals
 from exo_gravity.tools.cli import print_any_character
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -67,6 +72,12 @@ def main(args: Sequence[str] | None = None) -> None:
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)
         with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
+            dead = launcher.run(stopping)
+        restarts = deque([-math.inf] * 3, maxlen=3)  # monotonic s
+        while dead and launcher.is_simulated and dead[1] not in ENDED_WELL and time.monotonic() - restarts[0] > 600.0:
+            restarts.append(time.monotonic())
+            print_line("launcher", f"{dead[0].lstrip('/')} ended with exit code {dead[1]}: the simulation starts again")
+            launcher = Launcher(*nodes, check=check_start)
             dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

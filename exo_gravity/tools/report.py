@@ -2,7 +2,8 @@
 """report BAG: what a recorded trial showed, as a table, CSV files, figures and one HTML page.
 
 Several recordings, or a folder of them, become one table and page, a row for each trial, and cohort.csv, a row for each
-joint. They are read by a process for each core or, with --scheduler, by the workers of a Dask cluster.
+joint; without --csv, --figures and --video. They are read by a process for each core or, with --scheduler, by the
+workers of a Dask cluster.
 
 With --repair it instead writes a complete copy of a recording that was cut short, for `ros2 bag` and other tools.
 
@@ -18,6 +19,7 @@ from functools import partial
 from glob import glob
 from pathlib import Path
 
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.report import video
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria
 from exo_gravity.tools.cli import exit_code, extras, non_negative, positive
@@ -112,6 +114,9 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
 
     found = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
     recordings = [*{one.resolve(): one for one in found}.values()]  # one that is named twice is one trial
+    if options.csv or options.figures or options.video:
+        expected = "reported one by one, without --scheduler, for --csv, --figures and --video"
+        raise ParameterError("recordings", len(recordings), expected)
     for recording in recordings:
         check_name(recording)
     output.mkdir(parents=True, exist_ok=True)

@@ -169,7 +169,13 @@ def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
     assert limits_of(values).home_tolerance == (0.34,) * 4
 
 
-@pytest.mark.parametrize(("rate", "timeout"), [(500.0, 0.05), (250.0, 0.05), (100.0, 0.07), (50.0, 0.1)])
-def test_a_motor_is_silent_after_50_ms_or_7_cycles_up_to_100_ms(rate, timeout):
-    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "rate": rate})
+@pytest.mark.parametrize(
+    ("rate", "frozen", "timeout"),
+    [(500.0, 0.08, 0.05), (250.0, 0.08, 0.05), (100.0, 0.2, 0.07), (50.0, 0.08, 0.1), (100.0, 2.0, 2.0)],
+)
+def test_a_motor_is_silent_after_50_ms_or_7_cycles_up_to_100_ms_or_as_long_as_a_simulated_bridge_may_freeze(
+    rate, frozen, timeout
+):
+    given = {"can.interface": "virtual", "can.channel": "arm", "rate": rate, "frozen_timeout": frozen}
+    values = values_of(CAN_BRIDGE, given)
     assert limits_of(values).reply_timeout == pytest.approx(timeout)

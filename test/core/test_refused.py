@@ -210,6 +210,7 @@ def elbow(without: str = "", **given: Any) -> tuple[JointMotor, ...]:
     return bridge({name: value for name, value in one.items() if name != without}, **given)
 
 
+SOCKETCAN = {"can__interface": "socketcan", "can__channel": "vcan0"}
 PEAK = r"max_effort = .*: must be at most the motors' peak torque, \[{}"
 BRIDGE = [
     row(bridge, r"max_efort = \[3.0, 9.0, 3.0, 3.0\]: must be one of", max_efort=[3.0, 9.0, 3.0, 3.0]),
@@ -221,11 +222,14 @@ BRIDGE = [
     row(bridge, PEAK.format("5.0, 18.0, 9.0"), max_effort=[6.0, 9.0, 3.0, 3.0], torque_range=[5.0, 18.0, 15.0, 15.0]),
     row(bridge, "max_effort = .*: must be above 0 Nm", max_effort=[3.0, 0.0, 3.0, 3.0]),
     row(bridge, "rate = 39.0: must be at least 40 Hz: command_timeout = 0.05 s must span 2 periods", rate=39.0),
-    row(bridge, "25 Hz: the watchdog's time-out = 0.08 s must span 2 periods", rate=20.0, command_timeout=0.1),
+    row(bridge, "25 Hz: frozen_timeout = 0.08 s must span 2 periods", rate=20.0, command_timeout=0.1),
+    row(bridge, "command_timeout = 0.2: must be at most 0.1 s on a real bus", **SOCKETCAN, command_timeout=0.2),
+    row(bridge, "frozen_timeout = 0.3: must be at most 0.2 s on a real bus", **SOCKETCAN, frozen_timeout=0.3),
     row(limited, "^max_effort", max_effort=(3.0, 9.0, 3.0)),
     row(limited, "^position_max", position_max=ZERO),
     row(limited, "^driven_speed", driven_speed=INF),
-    row(limited, "^command_timeout", command_timeout=5.0),
+    row(limited, "^command_timeout", command_timeout=5.1),
+    row(limited, "^frozen_timeout", frozen_timeout=0.04),
     row(limited, "^sign_check_torque", sign_check_torque=NAN),
     row(limited, "^joint_names", joint_names=("a", "a", "b", "c")),
     *(

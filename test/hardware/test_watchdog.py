@@ -14,12 +14,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.limits import LOOP
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.ownership.bus_lock import ArmLock, ArmNotes, BusLock, DriveNotes, bridge_of
 from exo_gravity.hardware.ownership.owned_bus import HEARTBEAT, OwnedBus, Silence, Watchdog
@@ -117,6 +118,14 @@ def dies_first(happens: Callable[[Bridge], None]) -> Ending:
     return end
 
 
+def freezes_patiently(bridge: Bridge) -> float:
+    limits = replace(bridge.rig.arm.limits, frozen_timeout=2.0)
+    bridge.pipe.messages[:] = [replace(bridge.rig.arm, limits=limits)]
+    began = bridge.at(1.0, bridge.freeze)
+    bridge.at(2.9, lambda: bridge.killed and pytest.fail("1.9 s are no reason yet"))
+    return began
+
+
 def hand_over(bridge: Bridge) -> None:
     bridge.pipe.messages.append("a test")
 
@@ -125,7 +134,9 @@ def hand_over(bridge: Bridge) -> None:
 ENDINGS: dict[str, tuple[Ending, str, float | None]] = {
     "died": (lambda bridge: bridge.at(1.0, bridge.die), "has died", None),
     "frozen": (
-        lambda bridge: bridge.at(1.0, bridge.freeze), "was frozen for 80 ms and has been killed", LOOP.frozen + 0.02),
+        lambda bridge: bridge.at(1.0, bridge.freeze), "was frozen for 80 ms and has been killed",
+        Limits.frozen_timeout + 0.02),
+    "frozen, on a simulated bus with patience": (freezes_patiently, "was frozen for 2000 ms and has been killed", 2.1),
     "handed over": (
         lambda bridge: bridge.at(1.0, lambda: hand_over(bridge)),
         "handed the arm over and has been killed (a test)", 1e-6),
@@ -212,7 +223,7 @@ def test_a_bridge_that_dies_before_its_arm_is_known_leaves_motors_that_may_be_po
 def test_a_bridge_lives_on_after_the_whole_machine_has_stalled(bridge: Bridge) -> None:
     def stall() -> None:
         """Nothing runs for a while; then the watchdog runs first."""
-        bridge.clock.stall(5.0 * LOOP.frozen)
+        bridge.clock.stall(5.0 * Limits.frozen_timeout)
 
     for delay in (0.5, 1.0):
         bridge.at(delay, stall)

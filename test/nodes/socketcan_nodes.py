@@ -36,7 +36,7 @@ time.sleep = lambda duration: sleep(duration * {SLOWER})
 select.select = lambda r, w, x, timeout=None: wait(r, w, x, timeout and timeout * {SLOWER})
 """
 CHANGES = {
-    "can_bridge": {"rate": 50.0, "command_timeout": 0.1, "sign_check_torque": 0.0},
+    "can_bridge": {"rate": 50.0, "command_timeout": 0.1, "frozen_timeout": 0.08, "sign_check_torque": 0.0},
     "compensator": {"use_imu": False},
     "simulator": {"imu": {"rate": 10.0}, "trunk": {"pitch": 0.0, "roll": 0.0}},
 }

@@ -31,7 +31,7 @@ NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then start
 FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
 SIMULATED: dict[str, Parameters] = {
-    "can_bridge": {"rate": 100.0, "command_timeout": 0.1},
+    "can_bridge": {"rate": 100.0, "command_timeout": 0.1, "frozen_timeout": 0.08},
     "compensator": {"tilt_timeout": 0.5},
 }
 # The same at half the rates: all nodes and the test take about half of a core.
@@ -42,7 +42,7 @@ CALM: dict[str, Parameters] = {
     "simulator": {"imu.rate": 50.0},
 }
 REAL: dict[str, Parameters] = {
-    "can_bridge": {"rate": 250.0, "command_timeout": 0.05},
+    "can_bridge": {"rate": 250.0, "command_timeout": 0.05, "frozen_timeout": 0.08},
     "compensator": {"tilt_timeout": 0.08},
 }
 

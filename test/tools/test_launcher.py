@@ -166,6 +166,24 @@ def test_a_process_that_waits_for_the_others_begins_at_a_line_and_when_its_launc
         assert ended.stdout == "begun\n"
 
 
+@pytest.mark.parametrize(
+    ("file", "code", "runs"), [("sim.yaml", -9, 4), ("sim.yaml", 2, 1), ("exo.yaml", -9, 1)], ids=str
+)
+def test_a_simulation_that_dies_starts_again_three_times_and_a_real_arm_never(monkeypatch, run_tool, file, code, runs):
+    ran: list[Launcher] = []
+
+    def run(self: Launcher, _stopping: object) -> tuple[str, int]:
+        ran.append(self)
+        self.stop()
+        return "/right/can_bridge", code
+
+    monkeypatch.setattr(Launcher, "run", run)
+    monkeypatch.setattr(launcher, "check_start", lambda nodes: None)  # whoever holds the bus
+    ended = run_tool("launcher", "--params", CONFIG / file)
+    assert ended.code == 1 and len(ran) == runs
+    assert ended.out.count("right/can_bridge ended with exit code -9: the simulation starts again") == runs - 1
+
+
 NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]
 
 

@@ -18,6 +18,7 @@ from exo_gravity.core.motors.joint_motor import (
     MAX_STATUS_RATE,
     MOTOR_PARAMETERS,
     REPLY_SHARE,
+    SIMULATED_BUSES,
     JointMotor,
     JointSample,
     Traffic,
@@ -70,15 +71,10 @@ class ReadingLimits:
     reply_timeout: float = 0.05  #: s, and `missed` commands at least; an ordinary computer is late by 0.02 s
 
 
-@dataclass(frozen=True)
-class LoopTiming:
-    """What a control loop must keep to."""
-
-    frozen: float = 0.08  #: s without a drive, while the watchdog itself runs, after which the watchdog takes over
-    periods: int = 2  #: of control that must fit into each time-out, so that one late cycle is not a fault
-
-
-WALL, HEAT, READING, LOOP = SoftWall(), Derating(), ReadingLimits(), LoopTiming()
+WALL, HEAT, READING = SoftWall(), Derating(), ReadingLimits()
+# s, on a real bus. On a simulated one a busy computer is waited for: nobody is in that arm.
+LONGEST = {"command_timeout": 0.1, "frozen_timeout": 0.2}
+PERIODS = 2  # of control that must fit into each time-out, so that one late cycle is not a fault
 
 
 def _direction(what: str) -> Any:
@@ -111,7 +107,17 @@ class Limits:
         "rad/s",
         expert=True,
     )
-    command_timeout: float = owned(0.05, "age of effort commands that trips a fault", (0.01, 0.1), "s")
+    command_timeout: float = owned(
+        0.05, "age of effort commands that trips a fault; on a real bus at most 0.1", (0.01, 5.0), "s"
+    )
+    frozen_timeout: float = owned(
+        0.08,
+        "time without a control cycle after which the watchdog takes over; on a real bus at most 0.2; a longer one is "
+        "also that of replies",
+        (0.05, 5.0),
+        "s",
+        expert=True,
+    )
     #: s without a reply that makes a motor silent; `limits_of` derives it from the rate
     reply_timeout: float = READING.reply_timeout
     start_pose: str = owned(
@@ -257,6 +263,11 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     given["max_command"] = tuple(max(MAX_COMMAND, MAX_OF_PEAK * MOTORS[name].peak_torque) for name in values["motor"])
     shortest = READING.reply_timeout
     given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
+    for name in LONGEST:
+        if given[name] > LONGEST[name] and values["can.interface"] not in SIMULATED_BUSES:
+            raise ParameterError(name, given[name], f"at most {LONGEST[name]:g} s on a real bus")
+    if given["frozen_timeout"] > LONGEST["frozen_timeout"]:
+        given["reply_timeout"] = given["frozen_timeout"]
     return Limits(tuple(values["joint_names"]), **given)
 
 
@@ -265,10 +276,10 @@ def check_bridge(rate: float, motors: Sequence[JointMotor], limits: Limits, buse
 
     buses: the traffic on each of its buses. Raises ParameterError that names both values.
     """
-    timeouts = {"command_timeout": limits.command_timeout, "the watchdog's time-out": LOOP.frozen}
+    timeouts = {name: getattr(limits, name) for name in ("command_timeout", "frozen_timeout")}
     name, shortest = min(timeouts.items(), key=lambda item: item[1])
-    if rate * shortest < LOOP.periods - 1e-9:
-        expected = f"at least {LOOP.periods / shortest:g} Hz: {name} = {shortest:g} s must span {LOOP.periods} periods"
+    if rate * shortest < PERIODS - 1e-9:
+        expected = f"at least {PERIODS / shortest:g} Hz: {name} = {shortest:g} s must span {PERIODS} periods"
         raise ParameterError("rate", rate, expected)
     status_rate = min([bus.status_rate for bus in buses], default=MAX_STATUS_RATE)
     if rate > REPLY_SHARE * status_rate + 1e-9 and not all(motor.wire_format.replies for motor in motors):

@@ -135,6 +135,7 @@ class Watchdog:
         self._notes = lock.notes
         self._now = lock.notes.clock.monotonic
         self._start = self._now()
+        self._timeout = max(HEARTBEAT.timeout, arm.limits.frozen_timeout)
         self._silence = Silence(self._start, HEARTBEAT.longest_look)
         receiver, self._sender = Pipe(duplex=False)
         pages, locks = [own.descriptor for own in lock.of_joints], [own.socket.fileno() for own in lock.locks]
@@ -162,7 +163,7 @@ class Watchdog:
         now, heartbeat = self._now(), self._notes.heartbeat
         if heartbeat == 0.0:
             return now - self._start < HEARTBEAT.start
-        return self._silence.look(now, heartbeat) < HEARTBEAT.timeout
+        return self._silence.look(now, heartbeat) < self._timeout
 
     def hand_over(self, reason: str) -> bool:
         """Request the watchdog to kill this process and let the arm down; return whether it is alive."""

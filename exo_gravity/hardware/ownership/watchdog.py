@@ -3,7 +3,7 @@
 
 It shares the notes of each bus with the bridge, and a pipe, which breaks when the bridge dies for any reason. It
 inherits the lock of each bus. If the motors were on, it continues from the last noted drive. A bridge that is alive but
-has noted nothing for `LOOP.frozen` is killed first: two processes must never command one motor. Once a motor has not
+has noted nothing for `frozen_timeout` is killed first: two processes must never command one motor. Once a motor has not
 replied for seconds and all others are down, the next bridge may ask for the bus: then the watchdog ends, and its notes
 stay.
 
@@ -28,7 +28,7 @@ from queue import SimpleQueue
 
 import can
 
-from exo_gravity.core.safety.limits import LOOP
+from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
@@ -75,9 +75,10 @@ def guard(
                 for page in notes.noted:
                     page.heartbeat = now
             inhibit(is_powered)
-            if silence.look(now, noted, is_powered) > LOOP.frozen:
+            patience = (arm.limits if arm else Limits).frozen_timeout
+            if silence.look(now, noted, is_powered) > patience:
                 kill()  # it sends nothing from here on, even if it takes long to die
-                why = f"was frozen for {LOOP.frozen * 1000:.0f} ms and has been killed"
+                why = f"was frozen for {patience * 1000:.0f} ms and has been killed"
                 break
     if not notes.drive.powered:
         return 0

@@ -106,6 +106,7 @@ class OfflineTrial:
                 if should_stop(now) and not self.trouble:
                     self._abort(now, "stopped by the operator")
             self._follow_script(now)
+        carrier.bus.stop()
         if safety.refusal:
             self._abort(now, f"the arm was never carried: {safety.refusal}")
         if safety.fault:

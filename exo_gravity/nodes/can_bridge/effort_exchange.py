@@ -27,7 +27,7 @@ from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import SHORT_QUEUE, PolledSubscription, Publishers
 
-REMEMBERED = 256  # stamps of joint states: more than command_timeout covers at any rate
+REMEMBERED = 256  # stamps of joint states: more than command_timeout covers on a real bus
 Answer = Callable[[JointState], JointState | None]  # efforts for a joint state, of a compensator in this process
 
 
