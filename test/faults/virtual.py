@@ -29,7 +29,7 @@ from .fault_case import AFTER_EXIT, BEFORE, CARRYING, DESCENT, OBSERVATION, Acti
 
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 TIMEOUTS: Mapping[str, Mapping[str, Any]] = {  # those of a real device
-    "can_bridge": {"command_timeout": 0.05, "enable_timeout": 10.0, "sign_check_torque": 0.0},
+    "can_bridge": {"command_timeout": 0.05, "frozen_timeout": 0.08, "enable_timeout": 10.0, "sign_check_torque": 0.0},
     "compensator": {"tilt_timeout": 0.08},
 }
 STEADY = 1.25  # s after a move in which the arm comes to rest

@@ -277,7 +277,7 @@ INTERFACES = {  # the case, changes of `can`, what is found, and what is to be d
 @pytest.mark.parametrize(("can", "found", "remedy"), INTERFACES.values(), ids=INTERFACES)
 def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, can, found, remedy):
     options = {"port": next(PORTS), "hop_limit": 0} if can["interface"] == BUS["interface"] else {}
-    code, text = run("sim.yaml", can={"options": options, **can})
+    code, text = run("sim.yaml", can={"options": options, **can}, command_timeout=0.1, frozen_timeout=0.1)
     row, advice = next(pair for pair in pairwise(text.splitlines()) if ": opens" in pair[0])
     assert code == 2 and row.startswith("fault") and found in row and remedy in advice
 

@@ -117,7 +117,7 @@ REFUSED_FILES: dict[str, tuple[dict[str, dict[str, Any]], str, str]] = {
         "at most 100 entries; it has 50,000",
     ),
     "a mass": ({COMPENSATOR: {"robot": {"mass": [585.0] * 4}}}, f"{COMPENSATOR} ", "robot.mass = [585.0"),
-    "a rate": ({BRIDGE: {"rate": 20.0}}, f"{BRIDGE} ", "rate = 20.0: must be at least"),
+    "a rate": ({BRIDGE: {"rate": 20.0, "frozen_timeout": 0.08}}, f"{BRIDGE} ", "rate = 20.0: must be at least"),
     "a slow bus": ({BRIDGE: {"rate": 400.0, "can": SLOW}}, f"{BRIDGE} ", "Hz, the capacity of the CAN bus"),
     "a torque": ({BRIDGE: {"max_effort": [18.0] * 4}}, f"{BRIDGE} ", "at most the motors' peak torque"),
     "a mounting": ({"/imu": {"rotation_trunk_from_imu": [0.0] * 4}}, "/imu ", "must be a unit quaternion"),
