@@ -193,7 +193,8 @@ def _file(
     if new.simulate:
         start = (
             "autostart: true  # nobody wears a simulated arm\n    rate: 100.0\n    command_timeout: 2.0\n"
-            "    frozen_timeout: 2.0\n    enable_timeout: 60.0\n    start_pose: hanging  # as the simulated arm does at the start"
+            "    frozen_timeout: 2.0\n    enable_timeout: 60.0\n"
+            "    start_pose: hanging  # as the simulated arm does at the start"
         )
         simulator = f"""
 /{new.side}/simulator:
