@@ -81,6 +81,9 @@ def test_an_arm_that_nobody_wears_has_the_figures_of_the_arm_alone(budget, words
     assert len(rows[0]) == 3
     assert [row.split()[5] for row in rows[0]] == [row.split()[5] for row in rows[1]]  # needs
     assert words or "The arm alone, which nobody wears, is within rated torque" in ended.text
+    unfit = budget("--body-mass", 70, file="three_joints.yaml", changes={COMPENSATOR: {"wearer": {"links": [3, 4]}}})
+    assert unfit.code == 2 and "compensator wearer.links = [3, 4]: must be 2 different links from 1 to 3" in unfit.text
+    assert "body mass 0: no wearer" in unfit.text
 
 
 def test_a_load_in_the_hand_is_part_of_the_torques_and_of_the_moments_and_every_joint_gets_a_figure(budget, tmp_path):

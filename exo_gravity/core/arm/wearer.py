@@ -129,7 +129,9 @@ class Wearer:
         length, count = [*map(float, link_length)], len(link_length)
         load = LinkLoad(np.zeros(count), np.zeros(count))
         if len(links) != 2 or not all(0 <= link <= count for link in links) or links[0] == links[1]:
-            raise ParameterError("links", list(links), f"2 different links from 1 to {count}, or 0 for none")
+            raise ParameterError(
+                "wearer.links", [*links], f"2 different links from 1 to {count}, or 0; body mass 0: no wearer"
+            )
         first, second = links
         if first:
             _place(load, length, first, second - 1 if second > first else count, "the upper arm", upper_arm)
@@ -158,7 +160,7 @@ def _place(
         centre, link = centre - length[link - 1], link + 1
     if centre > length[link - 1]:
         beyond = f"the centre of gravity of {what} is at {part[1]:.3f} m, beyond link {link}"
-        raise ParameterError("link_length", list(length), f"long enough for the wearer: {beyond}")
+        raise ParameterError("link_length", [*length], f"long enough for the wearer: {beyond}; body mass 0: no wearer")
     moment = load.mass[link - 1] * load.cog[link - 1] + mass * centre
     load.mass[link - 1] += mass
     load.cog[link - 1] = moment / load.mass[link - 1]

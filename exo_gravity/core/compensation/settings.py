@@ -437,5 +437,6 @@ def wearer_of(
         return values["wearer.mass"], values["wearer.cog"]
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
     with named("wearer."):
-        load = Wearer(**person).on_links(values["link_length"] if length is None else length, links)
+        wearer = Wearer(**person)
+    load = wearer.on_links(values["link_length"] if length is None else length, links)
     return load.mass.tolist(), load.cog.tolist()

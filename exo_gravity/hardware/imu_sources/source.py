@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from exo_gravity.core.errors import DeviceError
 from exo_gravity.core.trunk.imu_checks import ImuSample
 
-RADIANS_PER_DEGREE = math.pi / 180.0
-
 StampClock = Callable[[], float]  # s; the clock of the stamps
 Axes = tuple[float, float, float]
 

@@ -142,7 +142,8 @@ def on_stops(arm: UrdfArm, names: Sequence[str], home: np.ndarray) -> list[str]:
     if stopped:
         return [
             f"the arm cannot hang within its limits: {', '.join(stopped)} would rest on a stop, and no start begins "
-            f"there: mount it so that it hangs, or measure home with the arm in a stand that lets it hang"
+            f"there: mount it so that it hangs, or measure home with the arm in a stand that lets it hang. "
+            "In the URDF the root link's z axis points up"
         ]
     return [f"by its URDF the arm hangs at {angles} degrees, if the root link's z axis points up: compare"]
 
