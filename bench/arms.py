@@ -16,7 +16,7 @@ from exo_gravity.core.arm.wearer import LinkLoad, Wearer
 from exo_gravity.core.motors.ak import V3_RANGES
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits, limits_of
-from exo_gravity.lab.inputs.arms import CarriedArm, carried_arm, node_values
+from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load, packaged_config
 from exo_gravity.sim import SimulatedArm, SimulatedMotor
 from exo_gravity.sim.motors import class_of
@@ -60,9 +60,9 @@ class PlayedArm:
         return load(packaged_config(self.file))
 
     @cached_property
-    def carried(self) -> CarriedArm:
+    def carried(self) -> ConfiguredArm:
         """What carries it."""
-        return carried_arm(self.nodes, "/right")
+        return read_arm(self.nodes, "/right")
 
     @property
     def motors(self) -> tuple[JointMotor, ...]:

@@ -15,7 +15,7 @@ from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 REPLIES = 2  # to a frame that switches a motor on; the first one may be late, and answer the frame before
@@ -30,7 +30,7 @@ class DirectArm:
 
     def __init__(self, params: str | Path, namespace: str) -> None:
         nodes = load(params)
-        arm = carried_arm(nodes, namespace)
+        arm = read_arm(nodes, namespace)
         self.joint_names = arm.limits.joint_names
         self.motors = arm.motors
         self.no_torque = (0.0,) * len(arm.motors)

@@ -15,7 +15,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
@@ -97,7 +97,7 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     """
     import pinocchio as pin
 
-    arm = cast(UrdfArm, carried_arm(load(packaged_config(file)), "/right").settings.robot)
+    arm = cast(UrdfArm, read_arm(load(packaged_config(file)), "/right").settings.robot)
     text = read_urdf(load(packaged_config(file))["/right/compensator"]["urdf.file"])
     model = pin.buildModelFromXML(text)
     model.gravity.linear = np.array((0.0, 0.0, -arm.gravity))

@@ -120,7 +120,7 @@ def traced_cycle() -> Trace:
     arm = read_arm(load(packaged_config("sim.yaml")), "/right")
     device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(motor) for motor in arm.motors])
     limits = Limits(arm.joint_names, sign_check_torque=0.0)
-    controller, wire, trace = DirectController(Compensator(arm.settings()), limits), TracedWire(), Trace()
+    controller, wire, trace = DirectController(Compensator(arm.settings), limits), TracedWire(), Trace()
     virtual = VirtualArm(device, controller, arm.motors, limits, RATE, wire)
     virtual.add_imu(resting(0.0, 0.0), controller.compensator, 1.0 / RATE)
     virtual.enable()

@@ -17,7 +17,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
+from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import OURS
 from exo_gravity.core.motors.frames import MotorSpec, WireFormat
@@ -35,7 +35,7 @@ POLICY = DOCS.parent / "config" / "sros2" / "policy.py"  # a test compares it wi
 TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
 COMMAND = "python docs/tables.py"
-OF_URDF = urdf_table({"joint_names": ["joint"], "command_interface": "joint_state"})
+OF_URDF = compensator_table({"law": "urdf", "joint_names": ["joint"], "command_interface": "joint_state"})
 OF_PAPER = [param.for_joints(1) for param in COMPENSATOR]
 PARAMETERS = {
     "can_bridge": CAN_BRIDGE,

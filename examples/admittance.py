@@ -38,7 +38,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import COVER, for_joints
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.observer.momentum import MomentumObserver
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor, VirtualWearer
@@ -246,7 +246,7 @@ def main(words):
         simulate(*words)
         return
     path, namespace = words
-    arm = carried_arm(load(path), namespace)
+    arm = read_arm(load(path), namespace)
     rclpy.init()
     rclpy.spin(AdmittanceNode(namespace, arm.limits.joint_names, arm.settings))
 

@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio
 
@@ -164,7 +164,7 @@ class Environment:
 
 @pytest.mark.thorough
 def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_torque_is_known():
-    carried = carried_arm(load(packaged_config("three_joints.yaml")), "/right")
+    carried = read_arm(load(packaged_config("three_joints.yaml")), "/right")
     names = carried.limits.joint_names
     parts = {
         "joint_states": JointState(name=names[::-1], position=[0.1] * 3, velocity=[0.0] * 3),

@@ -36,7 +36,7 @@ from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.ownership.bus_lock import BusLock
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 from exo_gravity.sim.controllers import SampleController
 
@@ -329,7 +329,7 @@ def record(results: Sequence[BenchStep], arm: str, source: Source) -> dict[str, 
     return {"arm": arm, "date": date, "source": source.value, "passed": passed, "steps": steps}
 
 
-def accept_arm(params: Path, output: Path, arm: AnyArm, weight: Weight, person: Any) -> bool:
+def accept_arm(params: Path, output: Path, arm: ConfiguredArm, weight: Weight, person: Any) -> bool:
     """Run the acceptance on the bus of `arm`, and write its record; return whether it passed.
 
     Raises BusError, and ParameterError if the weight cannot hang there.

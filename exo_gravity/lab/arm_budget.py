@@ -29,7 +29,7 @@ from exo_gravity.lab.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +71,9 @@ class ArmBudget:
         return any(joint.torque > joint.rated for joint in self.joints)
 
 
-def arm_budget(configured: AnyArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float) -> ArmBudget:
+def arm_budget(
+    configured: ConfiguredArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float
+) -> ArmBudget:
     """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
 
     wearer: None if nobody wears it. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the

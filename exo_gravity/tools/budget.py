@@ -16,7 +16,7 @@ from exo_gravity.core.arm.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
 from exo_gravity.lab.arm_budget import ArmBudget, arm_budget, joint_figure, table_lines, verdict
 from exo_gravity.lab.budget import USUAL_TILT
-from exo_gravity.lab.inputs.arms import any_arms
+from exo_gravity.lab.inputs.arms import configured_arms
 from exo_gravity.lab.report.html import png_of
 from exo_gravity.tools.cli import exit_code
 
@@ -46,7 +46,7 @@ def _run(options: argparse.Namespace) -> int:
     wearer = Wearer(mass, options.sex, options.table, options.lengths) if mass else None
     support = one_float("support", options.support if wearer else 0.0, 0.0, 1.0)
     tilt = math.radians(one_float("max_tilt", options.max_tilt, 0.0, 90.0, "deg"))
-    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in any_arms(options.params)]
+    arms = [arm_budget(arm, wearer, support, tilt, options.payload) for arm in configured_arms(options.params)]
     folder, written = Path(options.output), []
     folder.mkdir(parents=True, exist_ok=True)
     for arm in arms:

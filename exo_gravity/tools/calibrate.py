@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from exo_gravity import require_ros
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import ExoGravityError, ParameterError
-from exo_gravity.lab.inputs.arms import any_arm
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.tools.cli import extras
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace) -> int:
             raise ParameterError("bag", str(path), "a recording that exists")
     person = Person()
     options.wait = person.wait
-    arm = None if command == "imu" else any_arm(options.params, options.side)
+    arm = None if command == "imu" else configured_arm(options.params, options.side)
     if options.bag is None and command != "motors":
         require_ros("calibrate")
     module = import_module(f"exo_gravity.lab.calibration.{COMMANDS[command][0]}")
@@ -169,5 +169,5 @@ def _accept(options: argparse.Namespace, person: "Person") -> int:
     """Run the bench acceptance; return the exit code."""
     from exo_gravity.lab.acceptance import Weight, accept_arm
 
-    arm, weight = any_arm(options.params, options.side), Weight(options.mass, options.lever)
+    arm, weight = configured_arm(options.params, options.side), Weight(options.mass, options.lever)
     return 0 if accept_arm(options.params, options.output, arm, weight, person) else 1

@@ -13,14 +13,14 @@ from pathlib import Path
 
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import named
-from exo_gravity.lab.inputs.arms import any_arm, any_arms
+from exo_gravity.lab.inputs.arms import configured_arm, configured_arms
 from exo_gravity.lab.view.urdf import described, urdf
 from exo_gravity.tools.cli import exit_code
 
 
 def urdf_of(params: str | Path, side: str = "", meshes: str = "") -> str:
     """Return the URDF of the arms in a parameter file, or of the arm on one `side`. Raises ParameterError."""
-    arms = [any_arm(params, side)] if side else any_arms(params)
+    arms = [configured_arm(params, side)] if side else configured_arms(params)
     with named(f"{arms[0].namespace}/compensator " if len(arms) == 1 else f"{params} "):
         return urdf([described(arm.compensator, arm.can_bridge) for arm in arms], meshes)
 

@@ -14,7 +14,7 @@ from scipy.optimize import root
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
+from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.observer.momentum import MomentumObserver
@@ -50,9 +50,9 @@ def test_law_and_springs_hold_mujocos_arm_of_any_number_of_joints(count: int) ->
     rng = np.random.default_rng(count)
     stiffness, rest = rng.uniform(0.05, 0.3, count).tolist(), rng.uniform(-1.0, 1.0, count).tolist()
     text, names = random_chain(count, count)
-    given = {"joint_names": names, "use_imu": False, "max_effort": [50.0] * count,
+    given = {"law": "urdf", "joint_names": names, "use_imu": False, "max_effort": [50.0] * count,
              "joint_spring.stiffness": stiffness, "joint_spring.rest": rest}  # fmt: skip
-    settings = urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
+    settings = settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
     arm = SimulatedArm(UrdfConfig(text=text, joint_names=names, spring_stiffness=stiffness, spring_rest=rest))
     upright, poses = Tilt.of_gravity("left", (0.0, 0.0, -1.0)), rng.uniform(-2.0, 2.0, (10, count))
     assert_held(settings, arm, upright, (0.0, 0.0, -STANDARD_GRAVITY), poses)
@@ -131,8 +131,14 @@ def test_the_law_holds_an_elastic_arm_from_a_urdf(count: int) -> None:
             position_min=(-3.14,) * count, position_max=(3.14,) * count,
         )
     )  # fmt: skip
-    given = {"joint_names": names, "use_imu": False, "max_effort": [50.0] * count, "joint_stiffness": stiffness}
-    settings = urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
+    given = {
+        "law": "urdf",
+        "joint_names": names,
+        "use_imu": False,
+        "max_effort": [50.0] * count,
+        "joint_stiffness": stiffness,
+    }
+    settings = settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
     arm.move_base((0.0, 0.0, -STANDARD_GRAVITY))
     poses = np.random.default_rng(count).uniform(-1.5, 1.5, (10, count))
     before, after = errors(settings, arm, Tilt.of_gravity("left", (0.0, 0.0, -1.0)), poses)

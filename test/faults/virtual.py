@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import Lease
-from exo_gravity.lab.inputs.arms import carried_arm, node_values
+from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.events import ACTS, HOLD
@@ -98,7 +98,7 @@ class StruckArm(Rig):
 
     def __init__(self, arm: Arm) -> None:
         self.arm, self.struck, self.nodes = arm, arm.struck, arm.nodes()
-        carried = carried_arm(self.nodes, "/right")
+        carried = read_arm(self.nodes, "/right")
         device = device_from(self.nodes)
         super().__init__(device, carried.settings, carried.motors, carried.limits, arm.rate)
         self.names = carried.limits.joint_names
@@ -127,7 +127,7 @@ class StruckArm(Rig):
     def set_parameters(self, values: Parameters) -> None:
         """Set parameters of the compensator together, as the operator would."""
         self.nodes["/right/compensator"] |= values
-        self.settings = carried_arm(self.nodes, "/right").settings
+        self.settings = read_arm(self.nodes, "/right").settings
         self.compensator.apply(self.settings)
 
     def bring_to(self, stage: str) -> None:

@@ -16,7 +16,7 @@ from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.inputs.arms import carried_arm, node_values
+from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
@@ -184,7 +184,7 @@ class ShippedArm(JudgedArm):
 
     def __init__(self, name: str, rate: float, kinds: dict[int, type[SimulatedMotor]] | None = None) -> None:
         nodes = load(packaged_config(f"{name}.yaml"))
-        arm = carried_arm(nodes, "/right")
+        arm = read_arm(nodes, "/right")
         given = device_of(node_values(nodes, "/right/simulator", simulator_table(nodes["/right/simulator"])))
         kinds = kinds or {}
         motors = [kinds[n](motor.joint) if n in kinds else motor for n, motor in enumerate(given.motors)]

@@ -19,7 +19,7 @@ import pytest
 
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.settings import Settings, urdf_settings_of, urdf_table
+from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.families import MOTORS
@@ -54,9 +54,9 @@ FREE = 2.5  # rad from zero, so that the stops are far
 UPRIGHT, TILTED = TrunkState(), TrunkState(0.4, -0.3)
 
 
-def settings_of(text: str, names: Sequence[str], **given: object) -> Settings:
-    given = {"joint_names": list(names), "use_imu": False, **given}
-    return urdf_settings_of(values_of(urdf_table(given), given), UrdfArm(text, names, "hand"))
+def settings_for(text: str, names: Sequence[str], **given: object) -> Settings:
+    given = {"law": "urdf", "joint_names": list(names), "use_imu": False, **given}
+    return settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
 
 
 @functools.cache
@@ -105,7 +105,7 @@ class CarriedChain(JudgedArm):
             max_effort=(SPEC.peak_torque,) * count,
             home=tuple(self.home),
         )
-        settings = settings_of(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
+        settings = settings_for(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
         self.answers: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
         super().__init__(device, settings, joints, limits, RATE)
         self.controller.change = self._note
@@ -135,7 +135,7 @@ def test_the_efforts_are_gravitys_torque_times_the_gain(count: int, seed: int) -
     text, names = random_chain(count, seed=100 * count + seed)
     oracle, random = MujocoArm(text, names), np.random.default_rng(seed)
     gain = random.uniform(0.5, 1.5, count)
-    settings = settings_of(text, names, max_effort=[1000.0] * count, max_effort_rate=1000.0, gain=gain.tolist())
+    settings = settings_for(text, names, max_effort=[1000.0] * count, max_effort_rate=1000.0, gain=gain.tolist())
     for n in range(10):
         theta = random.uniform(-3.0, 3.0, count)
         effort = Compensator(settings, names).step(float(n), theta.tolist(), [0.0] * count).effort
@@ -174,7 +174,7 @@ def test_a_wearer_and_a_load_are_carried_on_any_links_under_any_tilt(held: dict[
     arm = UrdfArm(text, names, "hand")
     mass, cog = [0.0, 1.1, 0.0, 0.7, 0.3], [0.0, 0.5 * arm.length[1], 0.0, 0.9 * arm.length[3], 0.2 * arm.length[4]]
     worn = {"wearer.mass": mass, "wearer.cog": cog, "mode": "zero_g", "support": 0.6}
-    settings = settings_of(text, names, max_effort=[1000.0] * count, **worn, **held)
+    settings = settings_for(text, names, max_effort=[1000.0] * count, **worn, **held)
     config = UrdfConfig(
         text=text, joint_names=names, hand="hand", wearer_mass=[0.6 * m for m in mass], wearer_cog=cog, gravity=9.80665
     )
@@ -255,9 +255,9 @@ def test_the_exact_momentum_balance_holds() -> None:
 )
 def test_what_an_arm_without_a_hand_cannot_hold_is_refused(given: dict[str, object], problem: str) -> None:
     text, names = random_chain(2, seed=2)
-    values = {"joint_names": names, "use_imu": False, "max_effort": [30.0, 30.0], **given}
+    values = {"law": "urdf", "joint_names": names, "use_imu": False, "max_effort": [30.0, 30.0], **given}
     with pytest.raises(ParameterError, match=problem):
-        urdf_settings_of(values_of(urdf_table(values), values), UrdfArm(text, names))
+        settings_of(values_of(compensator_table(values), values), UrdfArm(text, names))
 
 
 # Torque that gravity cannot account for.

@@ -16,7 +16,7 @@ import rtbdata
 
 from exo_gravity.core import STANDARD_GRAVITY, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import urdf_settings_of, urdf_table
+from exo_gravity.core.compensation.settings import compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm
@@ -370,7 +370,7 @@ def test_an_effort_limit_that_no_joint_of_such_an_arm_has_is_not_used(effort: fl
     arm = UrdfArm(chain(*THREE[:3], joint(1), joint(2, effort=effort), joint(3)), ["j1", "j2", "j3"])
     assert arm.max_effort == (30.0, 0.0, 30.0)
     assert arm.notes[0].startswith(f"the effort limit of j2, {effort:g} Nm, is not used: gravity needs up to")
-    given = {"joint_names": ["j1", "j2", "j3"], "max_effort": [0.0, 20.0, 0.0], "use_imu": False}
-    assert urdf_settings_of(values_of(urdf_table(given), given), arm).max_effort == (30.0, 20.0, 30.0)
+    given = {"law": "urdf", "joint_names": ["j1", "j2", "j3"], "max_effort": [0.0, 20.0, 0.0], "use_imu": False}
+    assert settings_of(values_of(compensator_table(given), given), arm).max_effort == (30.0, 20.0, 30.0)
     with pytest.raises(ParameterError, match=r"max_effort of j2 = 0\.0: must be greater than 0"):
-        urdf_settings_of(values_of(urdf_table(given), given | {"max_effort": [0.0] * 3}), arm)
+        settings_of(values_of(compensator_table(given), given | {"max_effort": [0.0] * 3}), arm)

@@ -16,7 +16,7 @@ from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
 from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
 from exo_gravity.lab.calibration.tours import model_of
-from exo_gravity.lab.inputs.arms import any_arm, node_values
+from exo_gravity.lab.inputs.arms import configured_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -101,7 +101,7 @@ def played(
 def of_urdf(name: str, weight: Weight, scale: float = 1.0) -> list[BenchStep]:
     """Run the acceptance of an arm of config whose motors give `scale` of what they are commanded."""
     params = packaged_config(f"{name}.yaml")
-    arm, nodes = any_arm(params, "right"), load(params)
+    arm, nodes = configured_arm(params, "right"), load(params)
     none, simulator = [0.0] * (len(arm.motors) - 1), nodes["/right/simulator"]
     simulator |= {"wearer.mass": [*none, weight.mass], "wearer.cog": [*none, weight.lever]}
     simulator["torque_scale"] = [scale] * len(arm.motors)

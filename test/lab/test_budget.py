@@ -23,7 +23,7 @@ from exo_gravity.lab.budget import (
     torque_at,
     workspace,
 )
-from exo_gravity.lab.inputs.arms import any_arm
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 
 from ..support.thorough import quick
@@ -133,7 +133,7 @@ def test_a_torque_scale_below_1_and_a_warm_motor_reduce_its_torque_and_a_scale_a
 
 @pytest.mark.parametrize("name", quick(["elbow"], ["elbow", "seven_joints"]))
 def test_the_budget_of_an_arm_from_a_urdf_is_what_mujoco_needs_in_its_worst_pose(name: str) -> None:
-    arm, payload = any_arm(packaged_config(f"{name}.yaml"), "right"), 0.5 * (name == "elbow")
+    arm, payload = configured_arm(packaged_config(f"{name}.yaml"), "right"), 0.5 * (name == "elbow")
     found = arm_budget(arm, Wearer(75.0), 1.0, 0.0, payload)
     load = Wearer(75.0).on_links(arm.robot.length, arm.compensator["wearer.links"])
     text = packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")

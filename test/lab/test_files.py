@@ -19,7 +19,7 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, CONFIRM
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.lab.inputs.arms import carried_arm, configured_arms, read_arm
+from exo_gravity.lab.inputs.arms import configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.parallel import ENDED, Outcome, in_processes
 from exo_gravity.lab.source import of_all, source_of
@@ -66,7 +66,7 @@ def test_an_arm_that_ships_is_raised_by_its_wearer_and_stays(name: str) -> None:
     positions, commands = recording.position[during], recording.command[during]
     assert np.ptp(positions, axis=0).max() < HELD
     assert np.abs(positions[0] - POSES[name]).max() < 0.2
-    arm = carried_arm(load(params), "/right")
+    arm = read_arm(load(params), "/right")
     text = Path(packaged_config(f"arms/{name}.urdf")).read_text(encoding="utf-8")
     oracle = MujocoArm(text, arm.limits.joint_names)
     needed = oracle.torque(positions[-1], (0.0, 0.0, -9.80665))
@@ -88,7 +88,7 @@ def test_a_script_bends_the_elbow_and_one_for_another_number_of_joints_or_a_tool
     with pytest.raises(ParameterError, match=r"steps\[0\]\.move = .*: must be 3 numbers, one per joint"):
         simulated_trials(packaged_config("three_joints.yaml"), script_to([0.1, 0.2]))
     with pytest.raises(ParameterError, match="law = 'urdf': must be exact: this is for the paper's arm"):
-        read_arm(load(packaged_config("elbow.yaml")), "/right")
+        read_arm(load(packaged_config("elbow.yaml")), "/right").papers  # noqa: B018
 
 
 # What docs/topics.md promises: the files of a47959f4 work unchanged, except that a person confirms the pose
@@ -107,7 +107,7 @@ def test_every_node_takes_its_parameters_and_every_arm_is_made_of_them(file: str
     found = configured_arms(THEN / f"{file}.yaml")
     assert len(found) == arms
     for arm in found:
-        assert arm.settings().side == arm.side
+        assert arm.settings.side == arm.side
         assert arm.can_bridge["start_pose"] == CONFIRM  # the one thing that is new to them
 
 

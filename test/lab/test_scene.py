@@ -10,7 +10,7 @@ import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.inputs.arms import any_arm
+from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.view.scene import (
     AMBER,
@@ -108,7 +108,7 @@ def test_the_state_is_shown_by_colour_and_words(state, more, shown):
 
 
 def test_the_picture_of_a_seven_joint_arm_has_its_joints_where_mujoco_has_them() -> None:
-    arm = any_arm(packaged_config("seven_joints.yaml"), "right")
+    arm = configured_arm(packaged_config("seven_joints.yaml"), "right")
     picture, random = described(arm.compensator, arm.can_bridge), np.random.default_rng(0)
     text = packaged_config("arms/seven_joints.urdf").read_text(encoding="utf-8")
     given, _ = UrdfConfig(text=text, joint_names=arm.joint_names, hand="hand").models()

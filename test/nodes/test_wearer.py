@@ -24,7 +24,7 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.hardware.network import keep_to_this_machine
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.nodes.compensator.arm import declared
 from exo_gravity.nodes.ros.inner import NodeExecutor
@@ -241,7 +241,7 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(wea
     node = compensator(given)
     _, values, read, arm = declared(node)
     assert arm.fixed == (names[1],)
-    made = (read(values), wearer._read(values), carried_arm(files(given), "/right").settings)
+    made = (read(values), wearer._read(values), read_arm(files(given), "/right").settings)
     oracle = MujocoArm(text, listed)
     for theta in np.random.default_rng(0).uniform(-2.0, 2.0, (10, 2)):
         for settings in made:

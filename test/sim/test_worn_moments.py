@@ -32,7 +32,7 @@ ACROSS = (0.0, 2.0 * 0.01 - 1.6 * 0.04, 2.0 * 0.02, 1.6 * 0.03)
 TISSUE = Tissue(PERSON.wearer_stiffness, PERSON.wearer_rest)
 SETTINGS = Settings(
     "left", DEFAULT_LINKS, mode="zero_g", support=1.0, wearer_mass=PERSON.wearer_mass, wearer_cog=PERSON.wearer_cog,
-    wearer_first_moment=ALONG, wearer_off_axis=ACROSS, tissue=TISSUE, max_effort=(30.0,) * 4,
+    wearer_moments=(ALONG, ACROSS), tissue=TISSUE, max_effort=(30.0,) * 4,
 )  # fmt: skip
 POSES = np.random.default_rng(3).uniform((-0.5, 0.0, -0.5, 0.0), (0.9, 1.3, 1.2, 1.5), (20, 4)).tolist()
 
@@ -59,7 +59,7 @@ def test_zero_g_holds_segments_beside_their_links_and_springs_and_the_observer_s
 
 
 def test_a_new_wearer_is_a_guided_change_without_a_step():
-    other = replace(SETTINGS, wearer_first_moment=tuple(0.5 * m for m in ALONG), tissue=Tissue())
+    other = replace(SETTINGS, wearer_moments=(tuple(0.5 * m for m in ALONG), ACROSS), tissue=Tissue())
     compensator, pose, efforts = Compensator(replace(SETTINGS, use_imu=False)), (0.2, 0.9, 0.7, 0.6), []
     for n in range(1500):
         if n == 100:
@@ -107,9 +107,9 @@ def test_moments_in_place_of_masses_and_what_is_impossible_is_refused():
         settings_of({**values, "law": "paper_static"})
     with pytest.raises(ParameterError, match=r"wearer\.first_moment.* at most 10 kg, not 1[0-9]"):
         settings_of({**values, "wearer.first_moment": [0.2, 0.6, 2.0, 2.0]})
-    for name, wrong in (("first_moment", 4.1), ("first_moment", -0.1), ("off_axis", 0.6), ("off_axis", float("nan"))):
-        with pytest.raises(ParameterError, match=f"wearer.{name}"):
-            replace(SETTINGS, **{f"wearer_{name}": (0.0, 0.0, wrong, 0.1)})
+    for row, wrong in ((0, 4.1), (0, -0.1), (1, 0.6), (1, float("nan"))):
+        with pytest.raises(ParameterError, match=f"wearer.{('first_moment', 'off_axis')[row]}"):
+            replace(SETTINGS, wearer_moments=np.insert(np.zeros((1, 4)), row, (0.0, 0.0, wrong, 0.1), axis=0).tolist())
     for name, wrong in (("joint_stiffness", MAX_TISSUE + 0.1), ("joint_rest", 4.0)):
         with pytest.raises(ParameterError, match=name):
             Tissue(**{name: (0.0, 0.0, wrong, 0.0)})

@@ -34,7 +34,7 @@ from exo_gravity.lab.calibration import identification, live
 from exo_gravity.lab.calibration.moment_model import PapersMoments
 from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
-from exo_gravity.lab.inputs.arms import carried_arm, configured_arm, configured_arms
+from exo_gravity.lab.inputs.arms import configured_arm, configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 from exo_gravity.lab.moments import load_moments, regressor
 from exo_gravity.lab.trial.from_file import simulated_trials
@@ -61,7 +61,7 @@ def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp
     ended, output = new("--channel", "can1", "--fd"), tmp_path / "arm.yaml"
     assert ended.code == 0 and "MEASURE in it marks" in ended.out
     assert "by its URDF the arm hangs at abduction 1, flexion 0, elbow 0 degrees" in ended.out
-    arm = carried_arm(load(output), "/right")
+    arm = read_arm(load(output), "/right")
     assert arm.limits.position_max == (1.9, 2.3, 2.3) and arm.limits.position_min[2] == -0.1  # it hangs at 0
     assert arm.limits.max_effort == (9.0, 9.0, 3.0)
     assert arm.can_bridge["can.channel"] == "can1" and not arm.can_bridge["autostart"]
@@ -99,7 +99,7 @@ def test_home_is_where_gravity_brings_the_arm_and_an_arm_that_cannot_hang_is_tol
     urdf.write_text(TABLE.format(*arm))
     ended = run_tool("calibrate", "new", "--urdf", urdf, "--motors", "AK80-9", "--ids", 1, "--output", output)
     assert ended.code == 0 and said in ended.out
-    assert carried_arm(load(output), "/right").limits.home == pytest.approx((home,), abs=1e-3)
+    assert read_arm(load(output), "/right").limits.home == pytest.approx((home,), abs=1e-3)
 
 
 UNFIT = {
@@ -150,7 +150,7 @@ def test_a_doubtful_description_is_named_and_any_name_of_a_joint_is_written_as_i
     ended = run_tool("calibrate", "new", "--urdf", urdf, "--motors", "AK80-64", "--ids", 1, "--output", output)
     assert ended.code == code and said in ended.text and output.exists() == (code == 0)
     if said == "Written: ":
-        assert carried_arm(load(output), "/right").limits.joint_names == (changes['"elbow"'][1:-1],)
+        assert read_arm(load(output), "/right").limits.joint_names == (changes['"elbow"'][1:-1],)
 
 
 def test_every_turning_joint_that_follows_no_other_is_one_of_the_arms():

@@ -7,6 +7,7 @@ from exo_gravity.core.arm.arm_data import ArmData
 from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque, gravity_torque, moments_of
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.kinematics import LinkInertia, links_of, turning_torque
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector
 
 
@@ -48,7 +49,7 @@ class ArmModel(ArmData):
 
 
 def papers(arm: Arm) -> ArmModel:
-    """Return `arm` as the paper's arm, for what no other arm has. Raises TypeError if it is another one."""
+    """Return `arm` as the paper's arm, for what no other arm has. Raises ParameterError if it is another one."""
     if not isinstance(arm, ArmModel):
-        raise TypeError(f"this takes the paper's arm, got {type(arm).__name__}")
+        raise ParameterError("law", "urdf", "exact: this is for the paper's arm alone")
     return arm

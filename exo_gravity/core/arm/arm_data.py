@@ -165,17 +165,18 @@ class ArmData:
             worn = type(self)(self.length, np.minimum(combined, self.length), total, *scale, bare.off_axis)
         return worn.with_payload(self.payload[0], self.payload[1:])
 
-    def with_moments(self: Self, first_moment: Vector, off_axis: Vector, support: float = 1.0) -> Self:
+    def with_wearer_moments(self: Self, moments: Sequence[Vector], support: float = 1.0) -> Self:
         """Return this arm plus a share `support` (0..1) of a wearer's arm that is known by its moments.
 
-        first_moment, off_axis: what it adds to M1..M4 and to W, Z, Y3, Y4, (4,) kg m each. Raises ParameterError.
+        moments: what it adds to M1..M4 and to W, Z, Y3, Y4, (2, 4) kg m. Raises ParameterError.
         """
+        first_moment, off_axis = moments
         share = one_float("support", support, 0.0, 1.0)
         along = four_floats("wearer.first_moment", first_moment, 0.0, MAX_WORN_MOMENT, "kg m")
         across = four_floats("wearer.off_axis", off_axis, -MAX_WORN_BESIDE, MAX_WORN_BESIDE, "kg m")
         bare = self.with_payload(0.0)
-        moments = bare.first_moment + share * along, bare.off_axis + share * across
-        worn = type(self).from_moments(self.length, *moments, self.gain, self.gravity)
+        whole = bare.first_moment + share * along, bare.off_axis + share * across
+        worn = type(self).from_moments(self.length, *whole, self.gain, self.gravity)
         return worn.with_payload(self.payload[0], self.payload[1:])
 
 

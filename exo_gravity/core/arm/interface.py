@@ -137,3 +137,11 @@ class Arm(Protocol):
         mass, cog: of the wearer's segment on each link, (n,) kg, and (n,) m from the link's joint along the link.
         """
         ...
+
+    def with_wearer_moments(self, moments: Sequence[Vector], support: float = 1.0) -> Arm:
+        """Return this arm plus a share `support` (0..1) of what a wearer's arm adds to its moments, in kg m.
+
+        moments: of the paper's arm M1..M4 and W, Z, Y3, Y4, (2, 4); of another (n, 3), of each link along x, y, z of
+        its joint's frame. The inertia is that of the arm alone. Raises ParameterError.
+        """
+        ...

@@ -3,13 +3,13 @@
 
 import itertools
 import operator
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 from exo_gravity.core.arm.anfis import AnfisLaw
-from exo_gravity.core.arm.arm import ArmModel, papers
+from exo_gravity.core.arm.arm import ArmModel
 from exo_gravity.core.arm.arm_data import (
     MAX_GAIN,
     MAX_GRAVITY,
@@ -62,17 +62,8 @@ class UrdfModel(Arm, Protocol):
         """(n,) Nm, the joints' own limits; 0 if not known."""
         ...
 
-    @property
-    def length(self) -> tuple[float, ...]:
-        """(n,) m from each joint to the next one, and from the last one to the hand; 0 if there is none."""
-        ...
-
     def scaled(self, gain: Sequence[float], gravity: float) -> Arm:
         """Return this arm with other gains, (n,), and another gravity, m/s^2. Raises ParameterError."""
-        ...
-
-    def with_wearer_moments(self, moments: Sequence[Sequence[float]], support: float = 1.0) -> Arm:
-        """Return this arm plus a share `support` (0..1) of moments (n, 3) kg m of a wearer. Raises ParameterError."""
         ...
 
 
@@ -92,12 +83,8 @@ class Settings:
     raised_support: float = 0.0  #: to which it has risen on request (support.py)
     wearer_mass: Sequence[float] = ()  #: (n,) kg, the wearer's segment on each link; () for none
     wearer_cog: Sequence[float] = ()  #: (n,) m from joint n, its centre of gravity
-    #: (4,) kg m, what the wearer's arm adds to M1..M4 of the paper's arm, in place of these masses in all but the
-    #: inertia; () for none
-    wearer_first_moment: Sequence[float] = ()
-    wearer_off_axis: Sequence[float] = ()  #: (4,) kg m, the same of W, Z, Y3, Y4
-    #: (n, 3) kg m, what the wearer's arm adds to the first moment of each link of an arm from a URDF, along x, y, z of
-    #: its joint's frame, likewise; () for none
+    #: kg m, what the wearer's arm adds to the robot's moments (`Arm.with_wearer_moments`), in place of these masses in
+    #: all but the inertia; () for none
     wearer_moments: Sequence[Sequence[float]] = ()
     tissue: Tissue = field(default_factory=Tissue)  #: of the wearer's relaxed joints
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
@@ -148,8 +135,6 @@ class Settings:
                     check_owned(springs, len(self.robot.scale))
         if soft := [k for k in self.joint_stiffness if 0.0 < k < SOFTEST]:
             raise ParameterError("joint_stiffness", soft, f"0 for a rigid joint, or at least {SOFTEST:g} Nm/rad")
-        for name in ("wearer_first_moment", "wearer_off_axis"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
         self._carry(self.robot)
         object.__setattr__(self, "chosen", LAWS[self.law](self))
         object.__setattr__(self, "exact", ExactLaw(self.arm))
@@ -159,7 +144,7 @@ class Settings:
         loaded = robot.with_payload(self.payload_mass, self.payload_cog)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = self.worn(loaded, self.support_now)
-        if any(self.wearer_first_moment) and self.mode == "zero_g" and self.law not in ("exact", URDF_LAW):
+        if self.wearer_moments and self.mode == "zero_g" and self.law not in ("exact", URDF_LAW):
             raise ParameterError("law", self.law, "exact with wearer.first_moment: it needs mass and cog")
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
         given = loaded.given_mass
@@ -180,10 +165,8 @@ class Settings:
 
     def worn(self, arm: Arm, support: float = 1.0) -> Arm:
         """Return `arm` plus a share `support` (0..1) of the wearer's arm. Raises ParameterError."""
-        if any(self.wearer_first_moment):
-            return papers(arm).with_moments(self.wearer_first_moment, self.wearer_off_axis, support)
         if self.wearer_moments:
-            return cast(UrdfModel, arm).with_wearer_moments(self.wearer_moments, support)
+            return arm.with_wearer_moments(self.wearer_moments, support)
         return arm.with_wearer(self.wearer_mass, self.wearer_cog, support)
 
     @cached_property
@@ -314,14 +297,12 @@ PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.
 # fmt: on
 
 
-def compensator_table(given: Collection[str], table: Sequence[Param] = COMPENSATOR) -> tuple[Param, ...]:
-    """Return `table` and what is added to it where a file gives the names `given`."""
-    groups = [part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part)]
-    return (*table, *itertools.chain(*groups))
-
-
-def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
-    """Return the parameters of `compensator` for an arm from a URDF and the parameters `given`."""
+def compensator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
+    """Return the parameters of `compensator` for the paper's arm, or the one from a URDF, of `given` ones."""
+    optional = (part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part))
+    table = (*COMPENSATOR, *itertools.chain(*optional))
+    if given.get("law") != URDF_LAW:
+        return table
     count = joint_count(given)
     changes: dict[str, dict[str, Any]] = {
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
@@ -334,52 +315,28 @@ def urdf_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
         "payload.cog": {"description": "its centre of gravity in the frame of the link urdf.hand"},
         "use_imu": {"description": "false assumes that the root link's z axis points up"},
     }  # fmt: skip
-    shared = [replace(param, **changes.get(param.name, {})) for param in COMPENSATOR if param.name not in PAPER]
-    return tuple(table_for(compensator_table(given, (*shared, *URDF)), given))
+    shared = [replace(param, **changes.get(param.name, {})) for param in table if param.name not in PAPER]
+    return tuple(table_for((*shared, *URDF), given))
 
 
-def settings_of(values: Mapping[str, Any], read: Callable[[str], str] | None = None) -> Settings:
+def settings_of(
+    values: Mapping[str, Any], urdf: UrdfModel | None = None, read: Callable[[str], str] | None = None
+) -> Settings:
     """Return the settings that `compensator`'s parameter values describe, or raise ParameterError.
 
-    read: returns the text of the file `anfis_file`; without it the file is left out.
+    urdf: the arm, for `law: urdf`. read: returns the text of the file `anfis_file`; without it the file is left out.
     """
-    path = values["anfis_file"]
-    try:
-        anfis = AnfisLaw.load(read(path)) if path and read else None
-    except (OSError, UnicodeDecodeError, DataError) as error:
-        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
-    with named("robot."):
-        by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
-    along, across = (values.get(f"wearer.{name}", ()) for name in ("first_moment", "off_axis"))
-    worn = {"wearer_first_moment": along, "wearer_off_axis": across} if any(along) else {}
-    own = {"anfis": anfis, "robot_by_mass": by_mass, **worn}
-    return _settings_of(values, values["side"], robot_of(values), wearer_of(values), **own)
-
-
-def urdf_settings_of(values: Mapping[str, Any], robot: UrdfModel) -> Settings:
-    """Return the settings that parameter values describe for an arm from a URDF, or raise ParameterError."""
-    limits = []
-    for name, given, own in zip(values["joint_names"], values["max_effort"], robot.max_effort, strict=True):
-        if not (given or own):
-            raise ParameterError(
-                f"max_effort of {name}", given, "greater than 0, because the URDF has no usable effort limit"
-            )
-        limits.append(given or own)
-    values = {**values, "max_effort": tuple(limits)}
-    wearer = wearer_of(values, robot.length, values["wearer.links"])
-    moments = tuple(zip(*(values[name] for name in WORN_MOMENTS), strict=True))
-    worn = {"wearer_moments": moments} if any(map(any, moments)) else {}
-    return _settings_of(values, "left", robot.scaled(values["gain"], values["gravity"]), wearer, **worn)
-
-
-def _settings_of(
-    values: Mapping[str, Any], side: str, robot: Arm, wearer: tuple[Sequence[float], Sequence[float]], **own: Any
-) -> Settings:
-    mass, cog = wearer
+    robot: Arm
+    if urdf is None:
+        robot, own = _papers(values, read)
+    else:
+        robot, own = urdf.scaled(values["gain"], values["gravity"]), _of_urdf(values, urdf)
+    mass, cog = wearer_of(values, robot.length)
     errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
     sized: list[Any] = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
+    shared = {param.name: values[param.name] for param in params_of(Settings)}
     return Settings(
-        side=side,
+        side=values.get("side", SIDES[0]),  # a URDF's root link is not mirrored
         robot=robot,
         wearer_mass=mass,
         wearer_cog=cog,
@@ -390,9 +347,33 @@ def _settings_of(
         tissue=tissue_of(values),
         payload_mass=values["payload.mass"],
         payload_cog=tuple(values["payload.cog"]),
-        **{param.name: values[param.name] for param in params_of(Settings)},
-        **own,
+        **{**shared, **own},
     )
+
+
+def _papers(values: Mapping[str, Any], read: Callable[[str], str] | None) -> tuple[ArmModel, dict[str, Any]]:
+    """Return the paper's arm, and what only its settings have."""
+    path = values["anfis_file"]
+    try:
+        anfis = AnfisLaw.load(read(path)) if path and read else None
+    except (OSError, UnicodeDecodeError, DataError) as error:
+        raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+    with named("robot."):
+        by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
+    moments = tuple(values["wearer.first_moment"]), tuple(values["wearer.off_axis"])
+    worn = {"wearer_moments": moments} if any(moments[0]) else {}
+    return robot_of(values), {"anfis": anfis, "robot_by_mass": by_mass, **worn}
+
+
+def _of_urdf(values: Mapping[str, Any], urdf: UrdfModel) -> dict[str, Any]:
+    """Return what only the settings of an arm from a URDF have. Raises ParameterError where an effort has no limit."""
+    limits = tuple(given or own for given, own in zip(values["max_effort"], urdf.max_effort, strict=True))
+    for name, limit in zip(values["joint_names"], limits, strict=True):
+        if not limit:
+            expected = "greater than 0, because the URDF has no usable effort limit"
+            raise ParameterError(f"max_effort of {name}", limit, expected)
+    moments = tuple(zip(*(values[name] for name in WORN_MOMENTS), strict=True))
+    return {"max_effort": limits, **({"wearer_moments": moments} if any(map(any, moments)) else {})}
 
 
 def joint_spring_of(values: Mapping[str, Any]) -> JointSpring:
@@ -417,18 +398,16 @@ def tissue_of(values: Mapping[str, Any]) -> Tissue:
         return Tissue(*(values[f"wearer.{param.name}"] for param in params_of(Tissue)))
 
 
-def wearer_of(
-    values: Mapping[str, Any], length: Vector | None = None, links: Sequence[int] = PAPER_LINKS
-) -> tuple[Sequence[float], Sequence[float]]:
+def wearer_of(values: Mapping[str, Any], length: Vector) -> tuple[Sequence[float], Sequence[float]]:
     """Return mass and centre of gravity (n,) of the wearer on each link; explicit values override the table's.
 
     Where only the moments are given, those of typical masses: they are for the inertia alone.
 
-    length: of the links, (n,) m; None: `link_length`. links: as in `Wearer.on_links`.
+    length: of the links, (n,) m.
     """
     if not any(values["wearer.mass"]) and not values["wearer.body_mass"] and any(values.get("wearer.first_moment", ())):
         moments = values["wearer.first_moment"]
-        load = load_by_moments(values["link_length"], moments)
+        load = load_by_moments(length, moments)
         if load.mass.sum() > MAX_CARRIED:
             heaviest = f"that of an arm of at most {MAX_CARRIED:g} kg, not {load.mass.sum():.1f}"
             raise ParameterError("wearer.first_moment", moments, heaviest)
@@ -438,5 +417,5 @@ def wearer_of(
     person = {name: values[f"wearer.{name}"] for name in ("body_mass", "sex", "segment_length")}
     with named("wearer."):
         wearer = Wearer(**person)
-    load = wearer.on_links(values["link_length"] if length is None else length, links)
+    load = wearer.on_links(length, values.get("wearer.links", PAPER_LINKS))
     return load.mass.tolist(), load.cog.tolist()

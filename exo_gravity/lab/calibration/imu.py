@@ -35,7 +35,7 @@ from exo_gravity.lab.calibration.identification import Identified
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.inputs.arms import AnyArm, node_values
+from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import Launcher
 
@@ -100,7 +100,7 @@ class Mounting(NamedTuple):
     bows: int  #: how many
 
 
-def calibrate_imu(options: argparse.Namespace, arm: AnyArm | None, say: Say) -> CalibrationResult:
+def calibrate_imu(options: argparse.Namespace, arm: ConfiguredArm | None, say: Say) -> CalibrationResult:
     """Calibrate the IMU of the file options.params from options.bag, or live.
 
     The file's `/imu` names the topic. options.rests: a recording of six rests, None for none. options.wait: waits for

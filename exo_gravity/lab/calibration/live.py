@@ -23,12 +23,11 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE, OF_BRIDGE, of_urdf
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
@@ -95,7 +94,7 @@ class LiveTour:
 
 
 def tour_parameters(
-    params: Path, arm: AnyArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
+    params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Return the nodes of a file in which `calibrator` replaces the compensator of `arm`, each with its parameters.
 
@@ -120,7 +119,7 @@ def tour_parameters(
         own = np.array(compensator["max_effort"])
         values["max_effort"] = np.where(own > 0.0, np.minimum(own, strongest), strongest).tolist()
     else:
-        expected = (moments_of(papers(arm.robot)) if moments is None else moments).tolist()
+        expected = (moments_of(arm.papers) if moments is None else moments).tolist()
         values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
         values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
         values |= {"first_moment": expected[:4], "off_axis": expected[4:]}

@@ -22,7 +22,7 @@ from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, OPTIONS, JointMotor,
 from exo_gravity.lab.calibration.bus_scan import SPEC, ArmScan, BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 Clock = Callable[[], float]
@@ -68,7 +68,7 @@ class StillArm:
 HAND, STILL = HandMotion(), StillArm()
 
 
-def calibrate_motors(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_motors(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Calibrate the motors of `arm`. options.wait: a `Wait`; options.pose: (n,) deg, the arm's pose for `zero`.
 
     Without a pose the arm hangs, at the angles `home`. Raises BusError if the bus cannot be used, ParameterError if the
@@ -101,7 +101,7 @@ class MotorSearch:
     """
 
     def __init__(
-        self, bus: ArmScan | BusScan, arm: AnyArm, wait: Wait, say: Say, clock: Clock = time.monotonic
+        self, bus: ArmScan | BusScan, arm: ConfiguredArm, wait: Wait, say: Say, clock: Clock = time.monotonic
     ) -> None:
         self.found: dict[int, tuple[str, int]] = {}
         self._bus, self._arm = bus, arm

@@ -20,7 +20,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.hardware.urdf_checks import robot_of
-from exo_gravity.lab.inputs.arms import carried_arm
+from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import scalar
 
@@ -171,7 +171,7 @@ def write_new(new: NewArm, output: Path) -> list[str]:
             notes.append(f"{name}: gravity takes up to {most:.1f} Nm of it, max_effort is {effort:g} Nm")
     output.write_text(_file(new, names, ranges, efforts, needed.tolist(), home.tolist()), encoding="utf-8")
     try:
-        carried_arm(load(output), f"/{new.side}")
+        read_arm(load(output), f"/{new.side}")
     except ParameterError:
         output.unlink()
         raise

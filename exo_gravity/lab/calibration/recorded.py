@@ -20,7 +20,7 @@ from exo_gravity.lab.bag.content import TILT_TOPIC, Bag
 from exo_gravity.lab.bag.layout import Decoder
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.storage import Storage
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.trial.recording import Recording, in_blocks, still_spans
 
 
@@ -40,7 +40,7 @@ class Detection:
 DETECTION = Detection()
 
 
-def observations_of(path: Path, arm: AnyArm, with_held: bool = True) -> list[Observation]:
+def observations_of(path: Path, arm: ConfiguredArm, with_held: bool = True) -> list[Observation]:
     """Return the observations in the recording of `arm` at `path`: sweeps there and back, and poses held.
 
     with_held: False for sweeps alone, which show friction.
@@ -61,7 +61,7 @@ def observations_of(path: Path, arm: AnyArm, with_held: bool = True) -> list[Obs
     return observations
 
 
-def recording_of(bag: Bag, arm: AnyArm) -> Recording:
+def recording_of(bag: Bag, arm: ConfiguredArm) -> Recording:
     """Return the recording in `bag` that has the joints of `arm`, with its arrays in their order. Raises DataError."""
     recording = next((r for r in bag.recordings if sorted(r.joint_names) == sorted(arm.joint_names)), None)
     if recording is None:
@@ -70,7 +70,7 @@ def recording_of(bag: Bag, arm: AnyArm) -> Recording:
     return recording.in_order(arm.joint_names)
 
 
-def _down(bag: Bag, arm: AnyArm, times: np.ndarray) -> np.ndarray:
+def _down(bag: Bag, arm: ConfiguredArm, times: np.ndarray) -> np.ndarray:
     """Return gravity's direction (n, 3) in the base frame at `times` (n,) s, from the trunk's tilts if it uses any."""
     if not arm.compensator["use_imu"]:
         return np.tile(_base_direction(arm, Tilt.of(arm.side)), (len(times), 1))
@@ -80,7 +80,7 @@ def _down(bag: Bag, arm: AnyArm, times: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(times, bag.tilt[:, 0], component) for component in components], axis=1)
 
 
-def _base_direction(arm: AnyArm, tilt: Tilt) -> tuple[float, float, float]:
+def _base_direction(arm: ConfiguredArm, tilt: Tilt) -> tuple[float, float, float]:
     """Return gravity's direction (3,) in the base frame, which a URDF has in the trunk's axes."""
     return tilt.gravity_in_trunk if arm.by_urdf else tilt.direction
 

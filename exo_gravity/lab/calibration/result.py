@@ -28,7 +28,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.calibration.identification import FrictionCurve, Identified
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import columns
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.report import html
 from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, joint_colours, make_plain
@@ -65,7 +65,7 @@ class CalibrationResult:
     changes: tuple[Change, ...] = ()  #: written unless there are `refusals`
     lines: tuple[str, ...] = ()  #: what else was found, in sentences
     refusals: tuple[str, ...] = ()  #: why it is not calibrated, in sentences
-    arm: AnyArm | None = None  #: as configured before
+    arm: ConfiguredArm | None = None  #: as configured before
     model: MomentModel | None = None  #: its moments, as configured before
     observations: tuple[Observation, ...] = ()
     identified: Identified | None = None
@@ -170,7 +170,7 @@ def _comment(indent: str, note: str) -> str:
 
 
 def remainders(
-    found: Identified, arm: AnyArm, model: MomentModel, poses: Sequence[Observation]
+    found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]
 ) -> tuple[np.ndarray, ...]:
     """Return measured minus predicted torque (m, n) in Nm as commanded, and which of the poses (m,) were used.
 
@@ -226,7 +226,7 @@ def _drift(found: Identified, old: np.ndarray, _: np.ndarray, held_out: np.ndarr
         yield f"With {friction} the arm creeps {count}."
 
 
-def torque_figure(found: Identified, arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:
+def torque_figure(found: Identified, arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]) -> Figure:
     """Return a row per joint: predicted against measured torque, and what remains in each pose, with the friction."""
     count, colours = len(arm.joint_names), joint_colours(len(arm.joint_names))
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * count), layout="constrained")

@@ -21,7 +21,7 @@ from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, MAX_MOMENT
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import COMPENSATOR, urdf_table
+from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.families import MOTORS
@@ -335,7 +335,7 @@ def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     """Return the parameters of `calibrator` for an arm with the parameters `given`."""
     if given.get("law") != URDF_LAW:
         return CALIBRATOR
-    own = [replace(param, fixed=True) for param in urdf_table(given) if of_urdf(param.name)]
+    own = [replace(param, fixed=True) for param in compensator_table(given) if of_urdf(param.name)]
     known = {param.name for param in own} | {*ARM, *MOMENTS, *BRIDGE}
     bridge = {param.name: param for param in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if param.name in OF_BRIDGE}
     others = (param for param in CALIBRATOR if param.name not in known)

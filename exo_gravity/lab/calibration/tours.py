@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.joint_spring import JointSpring
 from exo_gravity.core.arm.joint_stiffness import link_angles
@@ -34,7 +33,7 @@ from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tour import observations_in, urdf_moments
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
@@ -61,7 +60,7 @@ CHECK = CheckTour()
 MOMENT_PARAMETERS = {"robot.first_moment": slice(JOINT_COUNT), "robot.off_axis": slice(JOINT_COUNT, None)}
 
 
-def calibrate_gravity(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_gravity(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses, or take them from `options.bag`, and solve for the moments. Raises ParameterError."""
     earlier = observations_in(options.earlier, len(arm.joint_names)) if options.earlier else []
     places = places_of(options)
@@ -86,7 +85,7 @@ def places_of(options: argparse.Namespace) -> Places:
 
 
 def tour_observations(
-    options: argparse.Namespace, arm: AnyArm, say: Say, changes: Mapping[str, Any], request: str = "",
+    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = "",
     moments: np.ndarray | None = None,
 ) -> list[Observation]:  # fmt: skip
     """Return what a tour measures, or what `options.bag` shows.
@@ -102,7 +101,7 @@ def tour_observations(
     return live.run_tour(options, nodes, say).complete(options.record)
 
 
-def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the poses without and with the weight, and solve for scales and moments. Raises ParameterError."""
     mass, lever, model = options.mass, options.lever, model_of(arm)
     model.load(mass, lever)
@@ -123,31 +122,33 @@ def calibrate_scale(options: argparse.Namespace, arm: AnyArm, say: Say) -> Calib
     return moments_from(arm, earlier + bare + weighed, places)
 
 
-def _request(arm: AnyArm, mass: float, lever: float) -> str:
+def _request(arm: ConfiguredArm, mass: float, lever: float) -> str:
     """Return what a person is asked to hang on the arm."""
     if arm.by_urdf:
         return f"Hang {mass:g} kg on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
     return f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
 
 
-def model_of(arm: AnyArm) -> MomentModel:
+def model_of(arm: ConfiguredArm) -> MomentModel:
     """Return the moments of an arm as configured. Raises ParameterError."""
-    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(papers(arm.robot), arm.compensator["use_imu"])
+    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(arm.papers, arm.compensator["use_imu"])
 
 
-def urdf_model_of(arm: AnyArm) -> UrdfMoments:
+def urdf_model_of(arm: ConfiguredArm) -> UrdfMoments:
     """Return the moments of an arm from a URDF as configured. Raises ParameterError."""
     return urdf_moments({**arm.compensator, "motor": arm.can_bridge["motor"]})
 
 
-def _needed(arm: AnyArm, model: MomentModel, poses: Sequence[Observation]) -> np.ndarray:
+def _needed(arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]) -> np.ndarray:
     """Return the torque (m, n) in Nm that the file's arm needs in the poses."""
     theta, direction, _, _ = columns(poses)
     gravity = model.rows(theta, direction) @ model.moments * np.array(arm.compensator["gain"])
     return np.asarray(gravity + joint_spring_of(arm.compensator).torques(theta))
 
 
-def moments_from(arm: AnyArm, observations: Sequence[Observation], places: Places | None = None) -> CalibrationResult:
+def moments_from(
+    arm: ConfiguredArm, observations: Sequence[Observation], places: Places | None = None
+) -> CalibrationResult:
     """Return moments and torque scales of `arm` as `observations` show them. Raises DataError as `identify` does.
 
     places: how exactly its zeros and axes are known; by default as usual.
@@ -168,7 +169,7 @@ def moments_from(arm: AnyArm, observations: Sequence[Observation], places: Place
     return CalibrationResult(changes, lines, impossible, arm, model, tuple(observations), found)
 
 
-def at_links(arm: AnyArm, observations: Sequence[Observation]) -> Sequence[Observation]:
+def at_links(arm: ConfiguredArm, observations: Sequence[Observation]) -> Sequence[Observation]:
     """Return `observations` with the angles of the links, where the file gives a `joint_stiffness`."""
     stiffness = arm.compensator["joint_stiffness"]
     if not any(stiffness):
@@ -176,7 +177,7 @@ def at_links(arm: AnyArm, observations: Sequence[Observation]) -> Sequence[Obser
     return [one._replace(theta=link_angles(tuple(one.theta), tuple(one.effort), stiffness)) for one in observations]
 
 
-def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
+def _scale_before(arm: ConfiguredArm, found: Identified) -> np.ndarray:
     """Return the file's torque scales (n,) at the temperatures of the poses."""
     bridge = arm.can_bridge
     columns = (bridge[name] for name in ("torque_scale", "torque_scale_slope", "torque_scale_temperature"))
@@ -184,7 +185,7 @@ def _scale_before(arm: AnyArm, found: Identified) -> np.ndarray:
     return np.array([scale_at(*motor) if math.isfinite(motor[-1]) else motor[0] for motor in motors])
 
 
-def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Iterator[Change]:
+def _moment_changes(arm: ConfiguredArm, model: MomentModel, found: Identified) -> Iterator[Change]:
     """Yield the new moments. What is unknown keeps its value."""
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
@@ -202,7 +203,7 @@ def _moment_changes(arm: AnyArm, model: MomentModel, found: Identified) -> Itera
         yield Change(node, name, moments[part].round(5).tolist(), note)
 
 
-def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[float]) -> tuple[Change, ...]:
+def _changes(arm: ConfiguredArm, model: MomentModel, found: Identified, scale: list[float]) -> tuple[Change, ...]:
     """Return the new values of the parameter file."""
     node, changes = f"{arm.namespace}/compensator", [*_moment_changes(arm, model, found)]
     changes += [
@@ -225,7 +226,7 @@ def _changes(arm: AnyArm, model: MomentModel, found: Identified, scale: list[flo
     return tuple(changes)
 
 
-def _zero_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
+def _zero_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the zeros of the encoders, where they were identified."""
     if not len(found.turn):
         return
@@ -235,7 +236,7 @@ def _zero_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
     yield Change(f"{arm.namespace}/can_bridge", "zero", (zero.round(5) + 0.0).tolist(), note)
 
 
-def _temperature_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
+def _temperature_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield at which temperatures the torque scales are true, and their slopes."""
     node, bridge = f"{arm.namespace}/can_bridge", arm.can_bridge
     if not np.all(np.isfinite(found.temperature)):
@@ -248,7 +249,7 @@ def _temperature_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
         yield Change(node, "torque_scale_slope", slope.round(5).tolist(), note)
 
 
-def _spring_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
+def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     """Yield the device's own springs, and the torque that they may add beyond gravity, where the file states one."""
     node, before = f"{arm.namespace}/compensator", joint_spring_of(arm.compensator)
     if not (np.any(found.stiffness) or before.on):
@@ -267,7 +268,7 @@ def _spring_changes(arm: AnyArm, found: Identified) -> Iterator[Change]:
         yield Change(f"{arm.namespace}/can_bridge", "largest_addition", addition.tolist(), note)
 
 
-def _lines(arm: AnyArm, found: Identified) -> Iterator[str]:
+def _lines(arm: ConfiguredArm, found: Identified) -> Iterator[str]:
     """Yield what the parameter file does not hold, in sentences."""
     for name, slide, offset in zip(arm.joint_names, found.friction, found.offset, strict=True):
         yield f"{name}: friction {slide:.2f} Nm, offset {offset:+.3f} Nm"
@@ -283,12 +284,12 @@ def row(values: np.ndarray) -> str:
     return " ".join(f"{round(value, 9):.3g}" if np.isfinite(value) else "unknown" for value in values.tolist())
 
 
-def calibrate_check(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_check(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Compare the torque that a few poses need with the file's. Raises ParameterError."""
     return checked(arm, tour_observations(options, arm, say, {"tour.poses": CHECK.poses}))
 
 
-def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
+def checked(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return in sentences how much torque each joint gives for a command, by that when it was calibrated.
 
     A joint that differs by more than `CHECK.least`, and than the band of this tour and `model_error.torque`, is a
@@ -315,18 +316,18 @@ def checked(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResu
     return CalibrationResult((), tuple(lines), tuple(refusals), arm, observations=tuple(observations))
 
 
-def torque_error(arm: AnyArm) -> Sequence[float]:
+def torque_error(arm: ConfiguredArm) -> Sequence[float]:
     """Return the file's `model_error.torque`, or its default, in Nm."""
     error: Sequence[float] = arm.compensator.get("model_error.torque", ModelError().torque)
     return error
 
 
-def calibrate_friction(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_friction(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Sweep all joints of the hanging arm, and fit the friction of each. Raises ParameterError."""
     return friction_from(arm, tour_observations(options, arm, say, {"tour.friction": True}))
 
 
-def friction_from(arm: AnyArm, observations: Sequence[Observation]) -> CalibrationResult:
+def friction_from(arm: ConfiguredArm, observations: Sequence[Observation]) -> CalibrationResult:
     """Return the friction of each joint that `observations` show. Raises DataError as `fit_friction` does."""
     speed = np.array([np.broadcast_to(one.speed, len(one.theta)) for one in observations])
     effort, friction, spread = (np.array([one[field] for one in observations]).T for field in (2, 3, 4))

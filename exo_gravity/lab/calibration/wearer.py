@@ -23,7 +23,7 @@ from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tours import at_links, row, torque_error, tour_observations
 from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest, visits
 from exo_gravity.lab.calibration.worn_arm import WornArm, worn_arm
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to relax
 
@@ -45,7 +45,7 @@ class WearerTour:
 WEARER = WearerTour()
 
 
-def calibrate_wearer(options: argparse.Namespace, arm: AnyArm, say: Say) -> CalibrationResult:
+def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
     carried = WEARER.carried if options.carried is None else one_float("carried", options.carried, 0.0, MOST_CARRIED)
     worn = worn_arm(arm)
@@ -57,7 +57,9 @@ def calibrate_wearer(options: argparse.Namespace, arm: AnyArm, say: Say) -> Cali
     return wearer_from(arm, tour_observations(options, arm, say, changes, request, worn.expected), carried)
 
 
-def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float = WEARER.carried) -> CalibrationResult:
+def wearer_from(
+    arm: ConfiguredArm, observations: Sequence[Observation], carried: float = WEARER.carried
+) -> CalibrationResult:
     """Return moments and springs of the wearer's arm: what the robot alone does not explain.
 
     carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
@@ -105,7 +107,7 @@ def wearer_from(arm: AnyArm, observations: Sequence[Observation], carried: float
     return CalibrationResult(changes, lines, refusals, arm, observations=tuple(observations))
 
 
-def _spring_changes(arm: AnyArm, fit: WearerFit, unsure: np.ndarray, carried: float) -> tuple[Change, ...]:
+def _spring_changes(arm: ConfiguredArm, fit: WearerFit, unsure: np.ndarray, carried: float) -> tuple[Change, ...]:
     """Return the new springs, and how unsure the wearer is; unsure: standard error (n,) in Nm of their torque."""
     node, stiffness_error = f"{arm.namespace}/compensator", fit.stiffness_error
     return (
@@ -116,7 +118,7 @@ def _spring_changes(arm: AnyArm, fit: WearerFit, unsure: np.ndarray, carried: fl
     )
 
 
-def _bridge_line(arm: AnyArm, worn: WornArm, moments: np.ndarray, fit: WearerFit) -> str:
+def _bridge_line(arm: ConfiguredArm, worn: WornArm, moments: np.ndarray, fit: WearerFit) -> str:
     """Return what can_bridge must let the efforts of this wearer have at support 1, if it checks them.
 
     moments: (k,) kg m of the wearer.

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.arm_data import moments_along
 from exo_gravity.core.arm.gravity import MAX_OFFSET, moments_of
 from exo_gravity.core.arm.wearer import Wearer
@@ -29,7 +28,7 @@ from exo_gravity.core.numbers import JOINT_COUNT
 from exo_gravity.lab.calibration.result import Change
 from exo_gravity.lab.calibration.tours import model_of, row, urdf_model_of
 from exo_gravity.lab.calibration.wearer_fit import PRIOR, WearerFit
-from exo_gravity.lab.inputs.arms import AnyArm
+from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.moments import MOMENTS
 
 
@@ -66,8 +65,8 @@ class PapersWorn:
     changes: Mapping[str, Any] = {}
     comfortable = np.array(WORN.comfortable)
 
-    def __init__(self, arm: AnyArm) -> None:
-        self._arm, self._robot, self.model = arm, papers(arm.robot), model_of(arm)
+    def __init__(self, arm: ConfiguredArm) -> None:
+        self._arm, self._robot, self.model = arm, arm.papers, model_of(arm)
         self.to_moments = worn_moments(self._robot.length)
         self._table = tuple(map(np.array, self._wearer(tabled=True)))
         self.known = _known(self._robot.length, *self._table)
@@ -115,7 +114,8 @@ class PapersWorn:
         if not tabled and all(values["wearer.mass"][2:]):
             return values["wearer.mass"], values["wearer.cog"]
         body_mass = values["wearer.body_mass"] or WORN.body_mass
-        return wearer_of({**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass})
+        table = {**values, "wearer.mass": (0.0,) * JOINT_COUNT, "wearer.body_mass": body_mass}
+        return wearer_of(table, self._robot.length)
 
 
 def _check_mass(mass: float) -> None:
@@ -163,10 +163,10 @@ class UrdfWorn:
 
     expected: np.ndarray | None = None
 
-    def __init__(self, arm: AnyArm) -> None:
+    def __init__(self, arm: ConfiguredArm) -> None:
         values, self._arm, self.model = arm.compensator, arm, urdf_model_of(arm)
         robot = self.model.arm
-        mass, cog = (np.array(part) for part in wearer_of(values, robot.length, values["wearer.links"]))
+        mass, cog = (np.array(part) for part in wearer_of(values, robot.length))
         if not np.any(mass):
             expected = "the wearer's, in kg, or wearer.mass and wearer.cog: they also give the inertia"
             raise ParameterError(f"{arm.namespace}/compensator wearer.body_mass", values["wearer.body_mass"], expected)
@@ -247,6 +247,6 @@ class UrdfWorn:
 WornArm = PapersWorn | UrdfWorn
 
 
-def worn_arm(arm: AnyArm) -> WornArm:
+def worn_arm(arm: ConfiguredArm) -> WornArm:
     """Return what a wearer can add to `arm`. Raises ParameterError."""
     return UrdfWorn(arm) if arm.by_urdf else PapersWorn(arm)

@@ -5,39 +5,33 @@ An arm is a namespace with a `can_bridge` and a `compensator`. Both are checked 
 unknown parameter is an error here too. Errors name node and parameter: `/right/can_bridge position_min`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.arm import ArmModel, papers
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import (
-    Settings,
-    compensator_table,
-    robot_of,
-    settings_of,
-    urdf_settings_of,
-    urdf_table,
-)
+from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import OPTIONS, JointMotor, motors_of
 from exo_gravity.core.params import Param, in_force, table_for, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.hardware.model_file import read_model
-from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
+from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.inputs.parameter_file import Nodes, load, node_of, packaged_config, recorded_parameters
 
 MASSES = {"robot.mass", "robot.first_moment"}  # a file with one of them describes the paper's arm
 
 
 @dataclass(frozen=True, eq=False)
-class AnyArm:
+class ConfiguredArm:
     """One arm of a parameter file, the paper's or one from a URDF; checked."""
 
     namespace: str  #: '/right'
@@ -46,56 +40,57 @@ class AnyArm:
     motors: tuple[JointMotor, ...]
     limits: Limits
     robot: Arm  #: the arm without a wearer
-    name: str  #: the namespace without slashes, 'arm' for the root namespace
-    side: str  #: 'left' or 'right'
-    joint_names: tuple[str, ...]  #: from the shoulder on
-    low: np.ndarray  #: lower joint limits (n,) in rad
-    high: np.ndarray  #: upper joint limits
+
+    @property
+    def name(self) -> str:
+        """The namespace without slashes, 'arm' for the root namespace."""
+        return self.namespace.strip("/") or "arm"
+
+    @property
+    def side(self) -> str:
+        """'left' or 'right'; an arm from a URDF has that of its namespace, and without one it is a right one."""
+        named_side = self.namespace.rpartition("/")[2]
+        return str(self.compensator.get("side", named_side if named_side in SIDES else SIDES[-1]))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """From the shoulder on."""
+        return tuple(self.compensator["joint_names"])
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower joint limits (n,) in rad."""
+        return np.array(self.limits.position_min)
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper joint limits (n,) in rad."""
+        return np.array(self.limits.position_max)
 
     @property
     def by_urdf(self) -> bool:
         """Whether a URDF describes it."""
         return bool(self.compensator["law"] == URDF_LAW)
 
-
-@dataclass(frozen=True, eq=False)
-class ConfiguredArm(AnyArm):
-    """One of them that is the paper's."""
-
-    robot: ArmModel
-
-    def settings(self) -> Settings:
-        """Return the compensator's settings, with the model in `anfis_file`. Raises ParameterError."""
+    @property
+    def papers(self) -> ArmModel:
+        """The robot, for what no other arm than the paper's has. Raises ParameterError."""
         with named(f"{self.namespace}/compensator "):
-            return settings_of(self.compensator, read_model)
+            return papers(self.robot)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """The compensator's settings, with the files that they name. Raises ParameterError."""
+        with named(f"{self.namespace}/compensator "):
+            return settings_from(self.compensator)
 
 
-OneArm = TypeVar("OneArm", bound=AnyArm)
+def settings_from(values: Mapping[str, Any], why: str = "") -> Settings:
+    """Return the settings that a compensator's parameter values describe, with the files that they name.
 
-
-class CarriedArm(NamedTuple):
-    """What carries one arm of a parameter file, the paper's or one from a URDF; checked."""
-
-    name: str  #: the namespace without slashes, 'arm' for the root namespace
-    can_bridge: Mapping[str, Any]  #: all parameter values by name
-    motors: tuple[JointMotor, ...]
-    limits: Limits
-    settings: Settings
-
-
-def carried_arm(nodes: Nodes, namespace: str) -> CarriedArm:
-    """Return what carries the arm of `namespace` ('/right') in the nodes of a parameter file. Raises ParameterError."""
-    node = f"{namespace}/compensator"
-    if nodes.get(node, {}).get("law") != URDF_LAW:
-        arm = read_arm(nodes, namespace)
-        return CarriedArm(arm.name, arm.can_bridge, arm.motors, arm.limits, arm.settings())
-    can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
-    with named(f"{namespace}/can_bridge "):
-        motors, limits = motors_of(can_bridge), limits_of(can_bridge)
-    values = node_values(nodes, node, urdf_table(nodes[node]))
-    with named(f"{node} "):
-        settings = urdf_settings_of(values, arm_from(values, read_urdf(values["urdf.file"])))
-    return CarriedArm(namespace.strip("/") or "arm", can_bridge, motors, limits, settings)
+    Raises ParameterError, also if a URDF comes from a topic; why: ends the sentence that it must be a file.
+    """
+    return settings_of(values, arm_in_file(values, why) if values["law"] == URDF_LAW else None, read_model)
 
 
 def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
@@ -106,78 +101,41 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     can_bridge = node_values(nodes, f"{namespace}/can_bridge", CAN_BRIDGE)
     node = f"{namespace}/compensator"
     given = nodes.get(node, {})
-    if given.get("law") == URDF_LAW:
-        if not MASSES.intersection(given):
-            raise ParameterError(f"{node} law", URDF_LAW, "exact: this is for the paper's arm alone")
+    if given.get("law") == URDF_LAW and MASSES.intersection(given):
         # The law `exact` gives the torques of a URDF of this arm.
         kept = {name: value for name, value in given.items() if not name.startswith(f"{URDF_LAW}.")}
-        nodes = {**nodes, node: {**kept, "law": "exact"}}
+        given = {**kept, "law": "exact"}
+        nodes = {**nodes, node: given}
     compensator = node_values(nodes, node, compensator_table(given))
     with named(f"{namespace}/can_bridge "):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
-    with named(f"{namespace}/compensator "):
-        # The robot does not depend on the law, and the model of `law: anfis` may not be trained yet.
-        settings_of({**compensator, "law": "exact"})
-        robot = robot_of(compensator)
-    name, names, side = namespace.strip("/") or "arm", tuple(compensator["joint_names"]), compensator["side"]
-    bounds = np.array(limits.position_min), np.array(limits.position_max)
-    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot, name, side, names, *bounds)
-
-
-def read_any_arm(nodes: Nodes, namespace: str) -> AnyArm:
-    """Return the arm of `namespace` ('/right') in the nodes of a parameter file, also one from a URDF.
-
-    Without a side in its namespace such an arm is a right one. Raises ParameterError.
-    """
-    node = f"{namespace}/compensator"
-    given = nodes.get(node, {})
-    if given.get("law") != URDF_LAW or MASSES.intersection(given):
-        return read_arm(nodes, namespace)
-    arm, side = carried_arm(nodes, namespace), namespace.rpartition("/")[2]
-    names, values = arm.limits.joint_names, node_values(nodes, node, urdf_table(given))
-    if tuple(values["joint_names"]) != names:
-        raise ParameterError(f"{node} joint_names", values["joint_names"], f"those of can_bridge, {list(names)}")
-    bounds = np.array(arm.limits.position_min), np.array(arm.limits.position_max)
-    of_side = side if side in SIDES else SIDES[-1]
-    read = arm.can_bridge, values, arm.motors, arm.limits, arm.settings.robot, arm.name
-    return AnyArm(namespace, *read, of_side, names, *bounds)
-
-
-def any_arms(params: str | Path) -> list[AnyArm]:
-    """Return every arm of a parameter file, including those from a URDF. Raises ParameterError if there is none."""
-    return _arms(params, read_any_arm)
-
-
-def any_arm(params: str | Path, side: str) -> AnyArm:
-    """Return the only arm of `side` in a parameter file, which may come from a URDF. Raises ParameterError."""
-    return _only(any_arms(params), params, side)
+    if tuple(compensator["joint_names"]) != limits.joint_names:
+        expected = f"those of can_bridge, {list(limits.joint_names)}"
+        raise ParameterError(f"{node} joint_names", compensator["joint_names"], expected)
+    with named(f"{node} "):
+        if given.get("law") == URDF_LAW:
+            robot = settings_from(compensator).robot
+        else:  # the robot does not depend on the law, and the model of `law: anfis` may not be trained yet
+            robot = settings_of({**compensator, "law": "exact"}).robot
+    return ConfiguredArm(namespace, can_bridge, compensator, motors, limits, robot)
 
 
 def configured_arms(params: str | Path) -> list[ConfiguredArm]:
-    """Return every arm of a parameter file. Raises ParameterError if there is none, or one is not the paper's."""
-    return _arms(params, read_arm)
+    """Return every arm of a parameter file. Raises ParameterError if there is none."""
+    nodes = load(params)
+    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
+    if not namespaces:
+        raise ParameterError("params", str(params), "a file with a compensator")
+    return [read_arm(nodes, namespace) for namespace in namespaces]
 
 
 def configured_arm(params: str | Path | None = None, side: str = "right") -> ConfiguredArm:
     """Return the only arm of `side` in a parameter file, by default in the packaged exo.yaml. Raises ParameterError."""
     path = params or packaged_config("exo.yaml")
-    return _only(configured_arms(path), path, side)
-
-
-def _arms(params: str | Path, read: Callable[[Nodes, str], OneArm]) -> list[OneArm]:
-    nodes = load(params)
-    namespaces = [node.removesuffix("/compensator") for node in nodes if node.endswith("/compensator")]
-    if not namespaces:
-        raise ParameterError("params", str(params), "a file with a compensator")
-    return [read(nodes, namespace) for namespace in namespaces]
-
-
-def _only(arms: Sequence[OneArm], params: str | Path, side: str) -> OneArm:
-    found = [arm for arm in arms if arm.side == side]
+    found = [arm for arm in configured_arms(path) if arm.side == side]
     if len(found) != 1:
-        raise ParameterError(
-            "params", str(params), f"a file with one compensator whose side is {side}, not {len(found)}"
-        )
+        expected = f"a file with one compensator whose side is {side}, not {len(found)}"
+        raise ParameterError("params", str(path), expected)
     return found[0]
 
 
@@ -238,4 +196,4 @@ def fitting(node: str, values: dict[str, Any]) -> dict[str, Any]:
 def _table_of(executable: str, given: Mapping[str, Any]) -> Sequence[Param]:
     """Return the table of a compensator or can_bridge that has the parameters `given`."""
     table = compensator_table(given) if executable == "compensator" else CAN_BRIDGE
-    return table_for(urdf_table(given) if given.get("law") == URDF_LAW else table, given)
+    return table_for(table, given)

@@ -5,24 +5,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import (
-    COMPENSATOR,
-    compensator_table,
-    settings_of,
-    urdf_settings_of,
-    urdf_table,
-)
+from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
 from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
 from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
-from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.network import check_environment
 from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
-from exo_gravity.hardware.urdf_arm import arm_from, read_urdf
-from exo_gravity.lab.inputs.arms import node_values, read_arm
+from exo_gravity.lab.inputs.arms import node_values, settings_from
 from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages
 
 
@@ -32,7 +24,7 @@ def check_nodes(nodes: Nodes) -> None:
     The URDF of `law: urdf` is left to the node if it comes from a topic. Raises ParameterError.
     """
     for node, given in nodes.items():
-        namespace, _, name = node.rpartition("/")
+        name = node.rpartition("/")[2]
         if name == "can_bridge":
             values = node_values(nodes, node, CAN_BRIDGE)
             with named(f"{node} "):
@@ -43,18 +35,12 @@ def check_nodes(nodes: Nodes) -> None:
             settings = ("rotation_trunk_from_imu", "rate", "gyroscope_range", "accelerometer_range")
             with named(f"{node} "):
                 TrunkEstimator(*(values[setting] for setting in settings))
-        elif name == "compensator" and given.get("law") == URDF_LAW:
-            table = urdf_table(given)
-            values = node_values({node: _of_urdf(given, table)}, node, table)
-            if values["urdf.file"]:
-                with named(f"{node} "):
-                    urdf_settings_of(values, arm_from(values, read_urdf(values["urdf.file"])))
-        elif name == "compensator" and f"{namespace}/can_bridge" in nodes:
-            read_arm(nodes, namespace).settings()
         elif name == "compensator":
-            values = node_values(nodes, node, compensator_table(given))
-            with named(f"{node} "):
-                settings_of(values, read_model)
+            table = compensator_table(given)
+            values = node_values({node: _used(given, table)}, node, table)
+            if values["law"] != URDF_LAW or values["urdf.file"]:
+                with named(f"{node} "):
+                    settings_from(values)
 
 
 def check_start(nodes: Nodes) -> None:
@@ -72,8 +58,8 @@ def check_start(nodes: Nodes) -> None:
                 raise BusError(f"{node}: CAN bus {channel} is held by {holder}, which may carry an arm: stop it first")
 
 
-def _of_urdf(given: Mapping[str, Any], table: Sequence[Param]) -> dict[str, Any]:
-    """Return the parameters without those of the exoskeleton's own arm, which the node ignores."""
+def _used(given: Mapping[str, Any], table: Sequence[Param]) -> dict[str, Any]:
+    """Return the parameters without those of the paper's arm that the node of another ignores."""
     used = {param.name for param in table}
     unused = {param.name for param in COMPENSATOR} - used
     return {name: value for name, value in given.items() if name not in unused}

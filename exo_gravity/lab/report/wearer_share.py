@@ -16,13 +16,12 @@ from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import Settings, settings_of, urdf_settings_of
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.hardware.urdf_arm import arm_in_file
 from exo_gravity.lab.bag.content import Bag
-from exo_gravity.lab.inputs.arms import recorded_of
+from exo_gravity.lab.inputs.arms import recorded_of, settings_from
 from exo_gravity.lab.observer.share import SHARE, Share, WearerCurve, joint_shares, observed, share_of, while_between
 from exo_gravity.lab.trial.recording import Recording
 
@@ -69,9 +68,8 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
 
 def _settings_of(values: Mapping[str, Any]) -> Settings:
     """Return the settings of recorded parameter values. Raises ParameterError, also if a URDF is not there any more."""
-    if values["law"] != URDF_LAW:
-        return settings_of({**values, "law": "exact"})
-    return urdf_settings_of(values, arm_in_file(values, ": the URDF came from a topic, which is not recorded"))
+    law = URDF_LAW if values["law"] == URDF_LAW else "exact"
+    return settings_from({**values, "law": law}, ": the URDF came from a topic, which is not recorded")
 
 
 def sentence(part: WearerPart, source: Source) -> str:

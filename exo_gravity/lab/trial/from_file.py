@@ -17,7 +17,7 @@ from rich.progress import Progress, TaskID
 from exo_gravity.core.errors import ParameterError, named
 from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.lab.bag.simulated import write_recordings
-from exo_gravity.lab.inputs.arms import carried_arm, node_values
+from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
 from exo_gravity.lab.trial.run import Trial, TrialEnd
@@ -48,7 +48,7 @@ def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
             true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
             trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
     for node, simulator in simulators.items():
-        arm = carried_arm(nodes, node.removesuffix("/simulator"))
+        arm = read_arm(nodes, node.removesuffix("/simulator"))
         with named(f"{node} "):
             device = device_of(simulator)
             set_faults(device, simulator)

@@ -46,17 +46,13 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm
     Returns their table, their values, a function that returns the settings that such values describe, and the arm from
     a URDF, to which the positions of its other joints are told; None for the paper's arm.
     """
-    given = given_to(node)
-    if given.get("law") != URDF_LAW:
-        table = settings.compensator_table(given)
-        return table, declare(node, table), lambda values: settings.settings_of(values, read_model), None
-    table = settings.urdf_table(given)
+    table = settings.compensator_table(given_to(node))
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)
-    arm = arm_from(values, _description(node, values))
-    for note in arm.notes:
+    arm = arm_from(values, _description(node, values)) if values["law"] == URDF_LAW else None
+    for note in arm.notes if arm else ():
         node.get_logger().warning(note)
-    return table, values, lambda values: settings.urdf_settings_of(values, arm), arm
+    return table, values, lambda values: settings.settings_of(values, arm, read_model), arm
 
 
 def check_side(namespace: str, side: str) -> None:
@@ -81,7 +77,7 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
     s, terms, now = control.settings, control.terms, time.monotonic()
     most, name = max(zip(map(abs, answer.remainder), names, strict=False), default=(0.0, NONE))
     asked, why_not = control.support_request.fresh(now), terms.assist.reason
-    worn = (*s.wearer_first_moment, *s.wearer_off_axis, *chain.from_iterable(s.wearer_moments))
+    worn = tuple(chain.from_iterable(s.wearer_moments))
     facts = {f"robot {what}": UNKNOWN if known is None else row(known) for what, known in s.robot.facts.items()}
     return {
         "law": s.law,

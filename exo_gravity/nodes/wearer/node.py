@@ -28,7 +28,7 @@ from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import Settings, settings_of, urdf_settings_of
+from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
@@ -200,7 +200,7 @@ class WearerNode(Node):
                 self._listen(values["urdf.topic"])
                 return None
             self._urdf = arm_from(values, text)
-        return urdf_settings_of(values, self._urdf)
+        return settings_of(values, self._urdf)
 
     def _listen(self, topic: str) -> None:
         """Read the parameters again when the URDF arrives."""

@@ -28,7 +28,7 @@ from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.lab.calibration.worn_arm import worn_arm
-from exo_gravity.lab.inputs.arms import AnyArm, any_arm, carried_arm
+from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.ros_yaml import text_of
 
@@ -82,7 +82,7 @@ class Bench:
 
     name: str
     params: Path
-    arm: AnyArm
+    arm: ConfiguredArm
     text: str
     off: np.ndarray  # (n,) rad by which each joint is farther than its encoder says
 
@@ -94,7 +94,7 @@ class Bench:
         nodes = load(packaged_config(f"{name}.yaml"))
         nodes["/right/compensator"]["urdf.file"] = str(wrong)
         params.write_text(text_of(nodes))
-        arm = any_arm(params, "right")
+        arm = configured_arm(params, "right")
         return cls(name, params, arm, text, np.zeros(len(arm.joint_names)))
 
     def true_arm(self, weight: tuple[float, float] = NO_WEIGHT) -> WornMujocoArm:
@@ -124,7 +124,7 @@ class Bench:
 
     def errors(self, params: Path, scales: np.ndarray) -> tuple[float, float]:
         """The median and the largest error of the true torque in 300 poses by the file `params`, of the peak."""
-        new, random = carried_arm(load(params), "/right"), np.random.default_rng(9)
+        new, random = read_arm(load(params), "/right"), np.random.default_rng(9)
         poses = random.uniform(self.arm.low, self.arm.high, (300, len(scales)))
         truth = self.true_arm()
         true = np.array([truth.torque(pose) for pose in poses])
@@ -305,7 +305,7 @@ NEW_POSES = 100
 @cache
 def relaxed_poses(name: str) -> list[np.ndarray]:
     """The poses of the tour for an arm of config, without the visits again."""
-    arm = any_arm(packaged_config(f"{name}.yaml"), "right")
+    arm = configured_arm(packaged_config(f"{name}.yaml"), "right")
     arm = replace(arm, compensator={**arm.compensator, "wearer.body_mass": BODY_MASS})
     model, (low, high) = model_of(arm), worn_arm(arm).comfortable.tolist()
     limits = replace(arm.limits, position_min=low, position_max=high)
@@ -323,7 +323,7 @@ class Person:
 
     name: str
     params: Path
-    arm: AnyArm
+    arm: ConfiguredArm
     truth: WornMujocoArm
     bare: WornMujocoArm
     seed: int
@@ -334,8 +334,8 @@ class Person:
         nodes, random = load(packaged_config(f"{name}.yaml")), np.random.default_rng(seed)
         nodes["/right/compensator"] |= {"wearer.body_mass": BODY_MASS, "mode": "zero_g", "support": 1.0}
         params.write_text(text_of(nodes))
-        arm = any_arm(params, "right")
-        settings, count = carried_arm(load(params), "/right").settings, len(arm.joint_names)
+        arm = configured_arm(params, "right")
+        settings, count = read_arm(load(params), "/right").settings, len(arm.joint_names)
         mass = np.array(settings.wearer_mass) * random.uniform(1.0 - OFF_MASS, 1.0 + OFF_MASS, count)
         place = np.array(settings.wearer_cog) + random.uniform(-OFF_PLACE, OFF_PLACE, count)
         place = np.clip(place, 0.0, arm.robot.length) * (mass > 0.0)
@@ -362,7 +362,7 @@ class Person:
         """
         output = self.params.with_suffix(".new.yaml")
         write_changes(self.params, output, result.changes, "calibrate wearer")
-        settings = carried_arm(load(output), "/right").settings
+        settings = read_arm(load(output), "/right").settings
         poses = np.random.default_rng(99).uniform(*worn_arm(self.arm).comfortable, (NEW_POSES, len(self.arm.low)))
         true = np.array([self.truth.torque(pose) for pose in poses])
         given = np.array([settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
