@@ -109,9 +109,6 @@ def read_arm(nodes: Nodes, namespace: str) -> ConfiguredArm:
     compensator = node_values(nodes, node, compensator_table(given))
     with named(f"{namespace}/can_bridge "):
         motors, limits = motors_of(can_bridge), limits_of(can_bridge)
-    if tuple(compensator["joint_names"]) != limits.joint_names:
-        expected = f"those of can_bridge, {list(limits.joint_names)}"
-        raise ParameterError(f"{node} joint_names", compensator["joint_names"], expected)
     with named(f"{node} "):
         if given.get("law") == URDF_LAW:
             robot = settings_from(compensator).robot
