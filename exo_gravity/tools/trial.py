@@ -41,7 +41,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, check_bridges, is_guided, run_attempts
+    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, check_bridges, is_guided, run_trial
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
@@ -61,7 +61,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     else:
         trial.prepare()
         tell(folder=str(folder))
-        end = run_attempts(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))
+        end = run_trial(trial, console, stopped, lambda step, left: tell(step=step, left=round(left, 1)))
         tell(phase="reporting")
     trouble, code = end.trouble, end.code
     try:

@@ -170,14 +170,9 @@ def test_a_process_that_waits_for_the_others_begins_at_a_line_and_when_its_launc
     ("file", "code", "runs"), [("sim.yaml", -9, 4), ("sim.yaml", 2, 1), ("exo.yaml", -9, 1)], ids=str
 )
 def test_a_simulation_that_dies_starts_again_three_times_and_a_real_arm_never(monkeypatch, run_tool, file, code, runs):
-    ran: list[Launcher] = []
-
-    def run(self: Launcher, _stopping: object) -> tuple[str, int]:
-        ran.append(self)
-        self.stop()
-        return "/right/can_bridge", code
-
-    monkeypatch.setattr(Launcher, "run", run)
+    ran: list[None] = []
+    died = "/right/can_bridge", code
+    monkeypatch.setattr(Launcher, "run", lambda self, _stopping: ran.append(self.stop()) or died)
     monkeypatch.setattr(launcher, "check_start", lambda nodes: None)  # whoever holds the bus
     ended = run_tool("launcher", "--params", CONFIG / file)
     assert ended.code == 1 and len(ran) == runs

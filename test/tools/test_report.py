@@ -526,6 +526,7 @@ def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp
     np.testing.assert_allclose(first, moved, atol=0.5)
     # Of whom nothing has changed nothing is read: its own summary would not be there. Named twice, it is one trial.
     again = run_tool("report", trials, f"{trials}/.", "--output", out)
+    assert "must be reported one by one" in run_tool("report", trials, "--csv", "--output", out).err
     assert again.code == 2 and "4 recordings had not changed" in again.out
     assert csv_rows(out / "cohort.csv") == rows
 

@@ -261,13 +261,12 @@ def limits_of(values: Mapping[str, Any]) -> Limits:
     given["channels"] = channels_of(values["can.channel"], len(values["joint_names"]))
     given["home_tolerance"] = tuple(MOTORS[name].home_tolerance for name in values["motor"])
     given["max_command"] = tuple(max(MAX_COMMAND, MAX_OF_PEAK * MOTORS[name].peak_torque) for name in values["motor"])
-    shortest = READING.reply_timeout
-    given["reply_timeout"] = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
+    shortest, patience = READING.reply_timeout, given["frozen_timeout"]
+    usual = min(2.0 * shortest, max(shortest, READING.missed / values["rate"]))
+    given["reply_timeout"] = patience if patience > LONGEST["frozen_timeout"] else usual
     for name in LONGEST:
         if given[name] > LONGEST[name] and values["can.interface"] not in SIMULATED_BUSES:
             raise ParameterError(name, given[name], f"at most {LONGEST[name]:g} s on a real bus")
-    if given["frozen_timeout"] > LONGEST["frozen_timeout"]:
-        given["reply_timeout"] = given["frozen_timeout"]
     return Limits(tuple(values["joint_names"]), **given)
 
 

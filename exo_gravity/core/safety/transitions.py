@@ -49,14 +49,3 @@ TRANSITIONS: dict[tuple[State, StateEvent], State] = {
     (State.FAULT, StateEvent.CLEAR): State.DISABLED,
     (State.FAULT, StateEvent.FOUND_ON): State.LETTING_DOWN,
 }
-
-# What the motors receive in each state, in words for readers; `power.SENT` has the frames.
-SENDS: dict[State, str] = {
-    State.DISABLED: "nothing that switches a motor on; EXIT now and then",
-    State.CHECKING: "as disabled",
-    State.PROVING: "ENTER; small pushes without damping",
-    State.RAMPING_IN: "the efforts, which grow from none",
-    State.ACTIVE: "the efforts, within the limits, and damping where a joint is driven",
-    State.LETTING_DOWN: "damping, and a torque that fades; no ENTER",
-    State.FAULT: "as disabled",
-}

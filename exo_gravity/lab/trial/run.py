@@ -1,13 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A trial in real time: starts the nodes, follows the script on the recorder's lines, and stops the nodes.
 
-A trial on the simulated device that fails because this computer was too busy is repeated: nothing is worn, and every
-attempt starts all nodes anew. A trial on a real arm is never repeated. Each simulator measures how long it was not run
-and how long it got no command: its arm, motors and bus are programs on this computer, so a long gap means that the
-computer ran other programs instead.
+Each simulator measures how long it was not run and how long it got no command: its arm, motors and bus are programs on
+this computer, so a long gap means that the computer ran other programs instead. A trial that ended early says so.
 """
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -37,7 +34,6 @@ START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder
 START_TIMEOUT = 60.0  # s until the arm must be carried
 GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
-ATTEMPTS = 3
 BUSY_CODE = 3
 ADVICE = "Close other programs and try again. The arm has no fault."
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
@@ -111,23 +107,13 @@ class TrialEnd:
     busy: str = ""  #: what was late because this computer was too busy, which is why it ended, or ''
 
 
-def run_attempts(
-    trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]
-) -> TrialEnd:
-    """Run a trial that is prepared; repeat it if this computer was too busy. on_progress: as in `TrialScreen`."""
+def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]) -> TrialEnd:
+    """Run a trial that is prepared. on_progress: as in `TrialScreen`."""
     # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
     unguided = START_TIME if trial.params is None else None
     lead = LEAD if trial.guided else unguided
     bridges = [node.lstrip("/") for node in stages(load(trial.params))[0]] if trial.params else []
-    for attempt in range(1, ATTEMPTS + 1):
-        end = run_nodes(trial, TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress), stopped)
-        if not end.busy or attempt == ATTEMPTS:
-            break
-        trial.folder.rename(f"{trial.folder}_attempt_{attempt}")
-        trial.prepare()
-        again = f"attempt {attempt + 1} of {ATTEMPTS}"
-        console.print(f"this computer was too busy: {end.busy}; {again}", markup=False, soft_wrap=True)
-    return end
+    return run_nodes(trial, TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress), stopped)
 
 
 def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
@@ -162,9 +148,7 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     if dead:
         node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
-        # The watchdog kills a bridge that has not run for too long.
-        killed = node.endswith("/can_bridge") and code == -signal.SIGKILL
-        return TrialEnd(trouble, 2 if code == 2 else 1, busy if killed else "")
+        return TrialEnd(trouble, 2 if code == 2 else 1)
     if not trouble:
         return TrialEnd()
     recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
