@@ -58,15 +58,17 @@ def new(run_tool, tmp_path):
 
 
 def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp_path, new):
-    ended, output = new("--channel", "can1", "--fd"), tmp_path / "arm.yaml"
+    ended, output = new("--channel", "can1"), tmp_path / "arm.yaml"
     assert ended.code == 0 and "MEASURE in it marks" in ended.out
     assert "by its URDF the arm hangs at abduction 1, flexion 0, elbow 0 degrees" in ended.out
     arm = read_arm(load(output), "/right")
     assert arm.limits.position_max == (1.9, 2.3, 2.3) and arm.limits.position_min[2] == -0.1  # it hangs at 0
     assert arm.limits.max_effort == (9.0, 9.0, 3.0)
     assert arm.can_bridge["can.channel"] == "can1" and not arm.can_bridge["autostart"]
-    assert can_options(load(output)["/right/can_bridge"]) == {"fd": True}
     assert max(map(abs, arm.settings.torque(arm.limits.home, Tilt.of("right"))[0])) < 0.01
+    output.unlink()
+    assert new("--motors", "DM-J4340", "DM-J4340", "DM-J4310", "--fd").code == 0
+    assert can_options(load(output)["/right/can_bridge"]) == {"fd": True}
 
 
 def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(tmp_path, run_tool, monkeypatch):
@@ -108,6 +110,7 @@ UNFIT = {
         "motors and ids = .*: must be one motor and one ID for each of the joints abduction",
     ),
     "no such motor": (["--motors", "AK80-9", "AK80-9", "AK99"], "motors = 'AK99': must be one of AK10-9"),
+    "a motor without CAN FD": (["--fd"], "motors = 'AK80-9': must be one of DM-.* on CAN FD"),
     "no such file": (["--urdf", "none.urdf"], "urdf.file = 'none.urdf': must be a URDF file"),
     "no such link": (["--hand", "claw"], "urdf.hand = 'claw': must be a link of the URDF"),
     "one ID twice": (["--ids", 1, 1, 2], "can_id = .*: must be 3 different IDs"),

@@ -67,9 +67,10 @@ class NewArm:
         return self.urdf if self.urdf.startswith("package://") else str(Path(self.urdf).absolute())
 
     def __post_init__(self) -> None:
+        fit = [name for name, spec in MOTORS.items() if spec.can_fd or not self.fd]
         for motor in self.motors:
-            if motor not in MOTORS:
-                raise ParameterError("motors", motor, f"one of {', '.join(MOTORS)}")
+            if motor not in fit:
+                raise ParameterError("motors", motor, f"one of {', '.join(fit)}{' on CAN FD' * self.fd}")
 
 
 class JointRange(NamedTuple):
