@@ -71,10 +71,11 @@ def test_the_written_file_takes_limits_torques_and_home_from_urdf_and_motors(tmp
     assert can_options(load(output)["/right/can_bridge"]) == {"fd": True}
 
 
-def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(tmp_path, run_tool, monkeypatch):
+@pytest.mark.parametrize("motor", [["AK80-64"], ["DM-J4340", "--fd"]], ids=" ".join)
+def test_a_simulated_arm_of_a_new_file_is_carried_wherever_it_is_started(motor, tmp_path, run_tool, monkeypatch):
     shutil.copy(CONFIG / "arms" / "elbow.urdf", tmp_path)
     monkeypatch.chdir(tmp_path)
-    arm = ("--urdf", "elbow.urdf", "--motors", "AK80-64", "--ids", 1)
+    arm = ("--urdf", "elbow.urdf", "--motors", *motor, "--ids", 1)
     assert run_tool("calibrate", "new", *arm, "--simulate", "--output", "arm.yaml").code == 0
     monkeypatch.chdir("/")
     script = TrialScript.parse({"name": "raise", "steps": [{"move": [0.8], "over": 3.0}, {"hold": 3.0}]})

@@ -189,6 +189,7 @@ def _file(
 ) -> str:
     """Return the text of the parameter file."""
     count, simulator = len(names), ""
+    timeouts = [0.0 if MOTORS[motor].family == "ak" else DAMIAO_TIMEOUT for motor in new.motors]
     edges = [edge.inside(angle) for edge, angle in zip(ranges, home, strict=True)]
     urdf = f"{{file: {json.dumps(new.file, ensure_ascii=False)}, hand: {json.dumps(new.hand, ensure_ascii=False)}}}"
     start = "autostart: false  # an operator arms it\n    rate: 250.0"
@@ -209,9 +210,9 @@ def _file(
     can_id: {_row(new.ids)}
     direction: {_row([1] * count)}
     zero: {_row([0.0] * count)}
+    motor_timeout: {_row(timeouts)}
     friction: {{coulomb: {_row([COULOMB] * count)}, viscous: {_row([VISCOUS] * count)}}}  # Nm, Nm s/rad
 """
-    timeouts = [0.0 if MOTORS[motor].family == "ak" else DAMIAO_TIMEOUT for motor in new.motors]
     listed = _row(names)
     return f"""# Written by `calibrate new` from {" ".join(new.urdf.split())}.
 # {MEASURE} marks what only the arm itself can tell: docs/first_arming.md.
