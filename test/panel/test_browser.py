@@ -429,7 +429,7 @@ def test_the_second_page_watches_lets_down_and_takes_control_also_after_a_reload
     wait_for_state(second, "unseen")
     wait_for_text(second, "#alarm", "cannot see the arms")
     wait_for_text(second, of_arm(".sentence"), "cannot see the arm", "Its last report, at ", ": Carrying.")
-    wait_for_text(second, of_arm(".remedy"), "starts again within a minute")
+    wait_for_text(second, of_arm(".remedy"), "starts again within two minutes")
     assert second.locator(of_arm("tbody tr")).count() == 0
     second.keyboard.press("Space")
     wait_for_text(second, "#alarm", "NOT confirmed")
