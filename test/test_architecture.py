@@ -44,7 +44,6 @@ ROOMS = {
         "ownership",
         "trunk_estimator",
         "imu_sources",
-        "urdf_tree",
         "urdf_checks",
         "urdf_shape",
         "urdf_links",

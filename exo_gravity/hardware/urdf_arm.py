@@ -32,7 +32,6 @@ from exo_gravity.hardware.urdf_checks import check_masses, check_size, usable_ef
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
 from exo_gravity.hardware.urdf_shape import LEAST_LENGTH, UrdfShape
-from exo_gravity.hardware.urdf_tree import LinkMoments
 
 PACKAGE = "package://"
 # The compensator's parameters.
@@ -114,8 +113,8 @@ class UrdfArm(UrdfShape):
         self._data = self._model.createData()
         # All that the joints move: each of several chains counts once, by its first joint.
         joints, supports = {*self._joints}, self._model.supports
-        first = [joint - 1 for joint in joints if not joints & {*supports[joint]} - {joint}]
-        self._own_mass = float(np.sum(self._tree.masses[first]))
+        first = [n for n, joint in enumerate(self._joints) if not joints & {*supports[joint]} - {joint}]
+        self._own_mass = float(np.sum(self.masses[first]))
         check_size(self._moves, self._own_mass, self.length)
         self.max_effort, unused = usable_efforts(self._moves)
         self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
@@ -274,7 +273,7 @@ class UrdfArm(UrdfShape):
         for n, joint in enumerate(self._joints):
             if self._bare.inertias[joint].mass:
                 across += [(n, way) for way in self._across(n)]
-        rows = self._rows(*self._sampled(0), self._link_moments(across)).reshape(-1, len(across))
+        rows = self._rows(*self._sampled(0), across).reshape(-1, len(across))
         size = np.abs(np.diag(np.linalg.qr(rows, mode="r")))
         return tuple(one for one, own in zip(across, size, strict=True) if own > DEPENDENT * size.max())
 
@@ -283,26 +282,20 @@ class UrdfArm(UrdfShape):
 
         theta: (m, n) rad. direction: (3,) or (m, 3), gravity's unit vector in the root link's axes. Gains do not count.
         """
-        return self._rows(theta, self.gravity * np.reshape(direction, (-1, 3)), self._base_moments)
+        return self._rows(theta, self.gravity * np.reshape(direction, (-1, 3)), self.base)
 
     def by_moments(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
         """Return a function that computes the torque (n,) in Nm from theta (n,) rad and tilt, with moments per joint.
 
-        moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. For one pose, Pinocchio's regressor
-        takes a third of the time of `regressor`. The function has data of its own; use it on one thread at a time.
+        moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. The function has
+        data of its own; use it on one thread at a time.
         """
-        model, compute, moves = self._model.copy(), self._pin.computeJointTorqueRegressor, self._moves
-        data, still = model.createData(), np.zeros(model.nv)
-        carried = np.zeros((len(moments), model.nv, INERTIAL))
-        for own, (n, way) in zip(moments.T, self.base, strict=True):
-            carried[:, self._numbers[n], MOMENT] += own[:, None] * way
-        carried = carried.reshape(len(moments), -1)
+        model, data = self._model.copy(), self._model.createData()
 
         def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
             model.gravity.linear = self.gravity * tilt.magnitude * np.array(tilt.gravity_in_trunk)
-            rows = compute(model, data, moves.configuration(theta), still, still)
-            # Pinocchio returns a vector for a model of one joint.
-            return tuple(np.einsum("jk,jk->j", moves.folded(rows.reshape(model.nv, -1)), carried).tolist())
+            rows = self._rows_at(model, data, self._moves.configuration(theta), self.base)
+            return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
 
         return torque
 
@@ -310,7 +303,7 @@ class UrdfArm(UrdfShape):
     def moments(self) -> np.ndarray:
         """The moments (k,) in kg m of `base`, of all that the arm holds."""
         sampled = self._sampled(1)
-        rows, torque = self._rows(*sampled, self._base_moments), self._torques(*sampled)
+        rows, torque = self._rows(*sampled, self.base), self._torques(*sampled)
         return np.asarray(np.linalg.lstsq(rows.reshape(-1, rows.shape[-1]), torque.ravel(), rcond=None)[0])
 
     def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
@@ -330,16 +323,24 @@ class UrdfArm(UrdfShape):
             row[:] = self._pin.computeGeneralizedGravity(model, data, at)
         return self._moves.folded(torques.T).T
 
-    def _rows(self, theta: np.ndarray, gravity: np.ndarray, moments: LinkMoments) -> np.ndarray:
+    def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
-        return self._moves.folded(self._tree.rows(self._moves.positions(theta), gravity, moments))
+        model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
+        rows = np.empty((len(theta), len(self.names), len(base)))
+        for row, down, at in zip(
+            rows, np.broadcast_to(gravity, (len(theta), 3)), self._moves.configurations(theta), strict=True
+        ):
+            model.gravity.linear = down
+            row[:] = self._rows_at(model, data, at, base)
+        return rows
 
-    @cached_property
-    def _base_moments(self) -> LinkMoments:
-        return self._link_moments(self.base)
-
-    def _link_moments(self, base: Base) -> LinkMoments:
-        return self._tree.moments([self._numbers[n] for n, _ in base], [way for _, way in base])
+    def _rows_at(self, model: Any, data: Any, at: np.ndarray, base: Base) -> np.ndarray:
+        """Return the same (n, k) for one configuration, under the gravity of Pinocchio's `model`."""
+        model.gravity.angular, still = np.zeros(3), np.zeros(model.nv)
+        rows = self._pin.computeJointTorqueRegressor(model, data, at, still, still)
+        parts = self._moves.folded(rows.reshape(model.nv, -1)).reshape(len(self.names), -1, INERTIAL)[..., MOMENT]
+        links, ways = zip(*base, strict=True)
+        return np.einsum("nka,ka->nk", parts[:, np.take(self._joints, links) - 1], np.array(ways))
 
     def _sampled(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Return poses (m, n) in rad at random, each with a vector of gravity (m, 3) in m/s^2."""
@@ -385,7 +386,7 @@ class UrdfArm(UrdfShape):
 
     def _anew(self) -> UrdfArm:
         """Forget what was computed for the arm that this is a copy of."""
-        for name in ("scale", "links", "_tree"):
+        for name in ("scale", "links"):
             self.__dict__.pop(name, None)
         self._data = self._model.createData()
         return self

@@ -13,9 +13,16 @@ from exo_gravity import pip_install
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.hardware.urdf_checks import UrdfJoints
-from exo_gravity.hardware.urdf_tree import Frames, JointTree
 
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
+
+
+class Frames(NamedTuple):
+    """The own frames of an arm's joints in m poses, in the root link's axes."""
+
+    before: np.ndarray  #: (m, n, 3, 3) how they would be turned with the joint itself at 0
+    after: np.ndarray  #: (m, n, 3, 3) how they are turned
+    origin: np.ndarray  #: (m, n, 3) m
 
 
 class Skeleton(NamedTuple):
@@ -49,7 +56,7 @@ class UrdfShape:
             raise ParameterError("urdf.hand", hand, f"a link of the URDF ({links})")
         self._hand = hand
         self._joints = [self._model.getJointId(name) for name in names]
-        self._numbers = [joint - 1 for joint in self._joints]  # in the tree, which has no joint of the root link
+        self._axes = self._axes_of_joints()
         self._along = self._ways()
         self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
 
@@ -74,10 +81,19 @@ class UrdfShape:
         length = np.array(self.length)[:, None]
         return np.divide(self._along, length, out=np.zeros((len(length), 3)), where=length >= LEAST_LENGTH)
 
+    def _axes_of_joints(self) -> np.ndarray:
+        """Return the joints' axes (n, 3) in their own frames."""
+        pin, model, data = self._pin, self._model, self._model.createData()
+        pin.computeJointJacobians(model, data, pin.neutral(model))
+        jacobians = ((n, pin.getJointJacobian(model, data, n, pin.ReferenceFrame.LOCAL)) for n in self._joints)
+        return np.array([np.reshape(own, (6, -1))[3:, model.joints[n].idx_v] for n, own in jacobians])
+
     @property
-    def _axes(self) -> np.ndarray:
-        """The joints' axes (n, 3) in their own frames."""
-        return self._tree.axes[self._numbers]
+    def masses(self) -> np.ndarray:
+        """What each joint (n,) moves, in kg: its link, all beyond it, and what the arm holds."""
+        data = self._model.createData()
+        self._pin.computeSubtreeMasses(self._model, data)
+        return np.array([data.mass[joint] for joint in self._joints])
 
     @cached_property
     def turns(self) -> np.ndarray:
@@ -95,7 +111,8 @@ class UrdfShape:
     @property
     def moved_by(self) -> np.ndarray:
         """Whether a joint moves the link of another, (n, n): the first index is that joint's."""
-        return self._tree.moves[np.ix_(self._numbers, self._numbers)]
+        before = [list(self._bare.supports[joint]) for joint in self._joints]
+        return np.array([[joint in moving for moving in before] for joint in self._joints])
 
     def _across(self, n: int) -> np.ndarray:
         """Return two unit vectors (2, 3) across the axis of joint n, in its frame."""
@@ -136,7 +153,7 @@ class UrdfShape:
         parents = [self._model.parents[joint] for joint in self._joints]
         if not self.moves_alone or parents[1:] != self._joints[:-1]:
             return None
-        turns, carried = self.frames(np.zeros((1, len(parents))))[1][0], self._tree.masses[self._numbers]
+        turns, carried = self.frames(np.zeros((1, len(parents))))[1][0], self.masses
         ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
         for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
             link = self._model.inertias[joint]
@@ -158,14 +175,15 @@ class UrdfShape:
         _, after, origins = frames
         return np.concatenate((origins, origins[:, -1:] + after[:, -1:] @ self._along[-1]), axis=1)
 
-    @cached_property
-    def _tree(self) -> JointTree:
-        """The joints with all that the arm holds."""
-        return JointTree(self._pin, self._model)
-
     def _frames(self, theta: np.ndarray) -> Frames:
         """Return the frames of the arm's joints at `theta` (m, n) rad."""
-        return Frames(*(part[:, self._numbers] for part in self._tree.frames(self._moves.positions(theta))))
+        model, data, frames = self._model, self._model.createData(), []
+        for at in self._moves.configurations(theta):
+            self._pin.forwardKinematics(model, data, at)
+            frames.append([place.homogeneous for place in data.oMi])
+        places, parents = np.array(frames)[..., :3, :], [model.parents[joint] for joint in self._joints]
+        turned = places[:, parents, :, :3] @ [model.jointPlacements[joint].rotation for joint in self._joints]
+        return Frames(turned, places[:, self._joints, :, :3], places[..., 3][:, self._joints])
 
     def _ways(self) -> list[np.ndarray]:
         """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
