@@ -153,14 +153,10 @@ class UrdfJoints:
         self._check_others()
         return self._configuration_at(self._own @ np.asarray(theta) + self._still)
 
-    def positions(self, theta: np.ndarray) -> np.ndarray:
-        """Return the positions (m, nv) of the model's joints for the angles `theta` (m, n) in rad. Raises likewise."""
-        self._check_others()
-        return np.asarray(theta @ self._own.T + self._still)
-
     def configurations(self, theta: np.ndarray) -> Iterator[np.ndarray]:
         """Yield Pinocchio's configuration (nq,) for each row of `theta` (m, n) in rad. Raises likewise."""
-        return map(self._configuration_at, self.positions(theta))
+        self._check_others()
+        return map(self._configuration_at, theta @ self._own.T + self._still)
 
     def spread(self, values: Sequence[float]) -> np.ndarray:
         """Return the velocities or accelerations (nv,) of the model for the arm's (n,)."""
@@ -169,7 +165,7 @@ class UrdfJoints:
     def folded(self, torque: np.ndarray) -> np.ndarray:
         """Return the torque (n,) in Nm of the arm's joints for that of all joints of the model, (nv,).
 
-        Also (n, m) for (nv, m), and (m, n, k) for (m, nv, k).
+        Also (n, m) for (nv, m).
         """
         return np.asarray(self._own.T @ torque)
 
