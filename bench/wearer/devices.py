@@ -79,7 +79,7 @@ def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     low, high = np.maximum(ARM.low, WORN.comfortable[0]), np.minimum(ARM.high, WORN.comfortable[1])
     limits = replace(ARM.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, MODEL), [hanging(limits).theta]
-    expected = moments_of(ARM.robot.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)))
+    expected = moments_of(ARM.papers.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)))
     while len(taken) < WEARER.poses:
         best = next_pose(taken, poses, UPRIGHT, expected, MODEL)
         taken.append(tuple(poses[best].tolist()))

@@ -299,10 +299,10 @@ PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.
 
 def compensator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     """Return the parameters of `compensator` for the paper's arm, or the one from a URDF, of `given` ones."""
-    optional = (part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part))
-    table = (*COMPENSATOR, *itertools.chain(*optional))
+    groups = [part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part)]
+    optional = tuple(itertools.chain(*groups))
     if given.get("law") != URDF_LAW:
-        return table
+        return (*COMPENSATOR, *optional)
     count = joint_count(given)
     changes: dict[str, dict[str, Any]] = {
         "law": {"default": URDF_LAW, "choices": (URDF_LAW,), "fixed": True,
@@ -315,8 +315,8 @@ def compensator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
         "payload.cog": {"description": "its centre of gravity in the frame of the link urdf.hand"},
         "use_imu": {"description": "false assumes that the root link's z axis points up"},
     }  # fmt: skip
-    shared = [replace(param, **changes.get(param.name, {})) for param in table if param.name not in PAPER]
-    return tuple(table_for((*shared, *URDF), given))
+    shared = [replace(param, **changes.get(param.name, {})) for param in COMPENSATOR if param.name not in PAPER]
+    return tuple(table_for((*shared, *URDF, *optional), given))
 
 
 def settings_of(
