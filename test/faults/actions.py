@@ -3,24 +3,18 @@
 
 from __future__ import annotations
 
-import math
 import os
-import resource
 import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import can
 import yaml
 from geometry_msgs.msg import Quaternion, Vector3, Vector3Stamped
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
-from exo_gravity.core.motors.ak import FAMILY
 from exo_gravity.core.motors.frames import Frame
 from exo_gravity.core.motors.joint_motor import is_fd
 from exo_gravity.hardware.can.can_port import message_of
@@ -33,18 +27,8 @@ from .rig import Rig
 
 Steps = Sequence[Mapping[str, Any]]
 
-START_LIMIT = 15.0  # s for a process that must refuse its parameters
-FILE_SIZE_LIMIT = 50_000  # bytes
+START_LIMIT = 15.0  # s for a process that must refuse to run
 FRAME_RATE = 3000  # random frames per second; with our own 2,000, as many as five Python processes on two cores receive
-FOREIGN = -6.0  # Nm
-AK_ERROR, DAMIAO_ERROR = 5, 0xB
-
-OfRig = Callable[[Rig], Any]
-
-
-def in_turn(*actions: Action) -> Action:
-    """Do one action after the other."""
-    return lambda rig: [action(rig) for action in actions] and None
 
 
 def pause(seconds: float) -> Action:
@@ -80,36 +64,12 @@ def kill_bridge_with_frozen_watchdog(seconds: float) -> Action:
     return inject
 
 
-def let_step_fail(how: str) -> Action:
-    """Let the compensator's step `sleep` forever or `raise` an exception: of a FailingStepRig."""
-    return lambda rig: rig.failure.write_text(how)
-
-
-def at_struck(value: Any, others: Any = None) -> OfRig:
-    """Return what makes a list (n,) with `value` for the joint that the rig's faults strike.
-
-    value: also a function of the rig. others: of every other joint, by default the zero of its type.
-    """
-
-    def make(rig: Rig) -> list[Any]:
-        own = value(rig) if callable(value) else value
-        rest = type(own)() if others is None else others
-        return [own if joint == rig.struck else rest for joint in range(len(rig.motors))]
-
-    return make
-
-
-def everywhere(value: Any) -> OfRig:
-    """Return what makes a list (n,) with `value` for every joint."""
-    return lambda rig: [value] * len(rig.motors)
-
-
 def simulator(**values: Any) -> Action:
-    """Set parameters of the simulator; a value may be a function of the rig."""
+    """Set parameters of the simulator."""
 
     def inject(rig: Rig) -> None:
         for name, value in values.items():
-            result = rig.probe.set_parameters("simulator", **{name: value(rig) if callable(value) else value})
+            result = rig.probe.set_parameters("simulator", **{name: value})
             assert result.successful, result.reason
 
     return inject
@@ -131,20 +91,6 @@ def wearer(rig: Rig, steps: Steps) -> None:
     script = rig.write_script(f"wearer_{time.monotonic_ns()}", steps)
     result = rig.probe.set_parameters("simulator", trial=str(script))
     assert result.successful, result.reason
-
-
-def change_message(change: Callable[[JointState], object]) -> Action:
-    """Spoil each message of efforts: of a CommandedRig."""
-    return lambda rig: setattr(rig, "change_message", change)
-
-
-def enable(on: bool) -> Action:
-    return lambda rig: rig.probe.enable(on)
-
-
-def deactivate(rig: Rig) -> None:
-    request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    rig.probe.call(ChangeState, "/right/can_bridge/change_state", request)
 
 
 def publish(message_type: type, topic: str, make_message: Callable[[Rig], object]) -> Action:
@@ -183,13 +129,6 @@ def tilt(pitch: float) -> Callable[[Rig], Vector3Stamped]:
     return lambda rig: stamped(rig, Vector3Stamped(vector=Vector3(y=pitch)))
 
 
-def raw_imu(rig: Rig) -> Imu:
-    """Return a sample of an IMU that lies on its side."""
-    message: Imu = stamped(rig, Imu(linear_acceleration=Vector3(x=9.8)))
-    message.orientation_covariance[0] = -1.0
-    return message
-
-
 def trunk_imu(x: float, w: float) -> Callable[[Rig], Imu]:
     """Return what makes a message of /imu/data with the orientation (x, 0, 0, w)."""
     return lambda rig: stamped(rig, Imu(orientation=Quaternion(x=x, w=w)))
@@ -199,27 +138,6 @@ def overload_processors(rig: Rig) -> None:
     """Start four busy processes for each of two processors, for 3 s."""
     for process in [start_spin(3.0) for _ in range(8)]:
         process.wait()
-
-
-def set_impossible_parameters(rig: Rig) -> None:
-    bad: tuple[dict[str, Any], ...] = (
-        {"robot__mass": [-1.0] * 4},
-        {"robot__mass": [math.nan] * 4},
-        {"gain": [1.0] * 3},
-        {"mode": 7},
-        {"law": ""},
-    )
-    for values in bad:
-        assert not rig.probe.set_parameters("compensator", **values).successful
-
-
-def set_contradicting_parameters(rig: Rig) -> None:
-    """Set values that are each within their range but ask for too much together, live and at the start."""
-    live = rig.probe.set_parameters("compensator", atomically=True, gain=[2.0] * 4, gravity=25.0)
-    assert not live.successful, "gain 2 with gravity 25 was accepted"
-    for values in ({"max_effort": [18.0] * 4}, {"rate": 20.0}):
-        code, log = run_bridge(rig, "/another", port_offset=1, changes=values)
-        assert code == 2, f"can_bridge started with {values}: {log[-1:]}"
 
 
 def start_second_bridge(namespace: str) -> Action:
@@ -239,17 +157,10 @@ def has_refused(rig: Rig) -> None:
 
 
 def second_bridge(
-    rig: Rig,
-    namespace: str,
-    port_offset: int = 0,
-    environment: Mapping[str, str] | None = None,
-    changes: Mapping[str, object] | None = None,
-    **streams: Any,
+    rig: Rig, namespace: str, environment: Mapping[str, str] | None = None, **streams: Any
 ) -> subprocess.Popen[str]:
-    """Start a second bridge on the rig's bus. environment, changes: of its variables and parameters."""
+    """Start a second bridge on the rig's bus. environment: changes of its variables."""
     content = yaml.safe_load(rig.nodes[0].path.read_text())["/right/can_bridge"]
-    content["ros__parameters"].update(changes or {})
-    content["ros__parameters"]["can"]["options"]["port"] += port_offset
     path = rig.folder / f"second_bridge_{time.monotonic_ns()}.yaml"
     path.write_text(yaml.safe_dump({f"{namespace}/can_bridge": content}))
     command = [executable("can_bridge"), "--ros-args", "-r", f"__ns:={namespace}", "--params-file", str(path)]
@@ -271,22 +182,6 @@ def run_bridge(rig: Rig, namespace: str, **options: Any) -> tuple[int | None, li
             process.kill()
             output, code = process.communicate()[0], None
     return code, output.splitlines()
-
-
-def record_on_a_full_disk(rig: Rig) -> None:
-    """Record the arm for 2 s with a recorder that may write only a small file.
-
-    It compiles no module: Python would leave a compiled file that is cut, with which no process starts any more.
-    """
-    folder: Path = rig.folder / f"recording_{time.monotonic_ns()}"
-    command = [executable("recorder"), "--ros-args", "-p", f"output:={folder}"]
-    silent = subprocess.DEVNULL
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-    recorder = subprocess.Popen(command, stdout=silent, stderr=silent, env=environment, start_new_session=True)
-    resource.prlimit(recorder.pid, resource.RLIMIT_FSIZE, (FILE_SIZE_LIMIT, FILE_SIZE_LIMIT))
-    time.sleep(4.0)
-    recorder.terminate()
-    recorder.wait(30.0)
 
 
 def random_frames(count: int, ids: Iterable[int]) -> Action:
@@ -320,12 +215,4 @@ def foreign_frames(frame: bytes | Callable[[Rig], Frame], rate: float = 1.0, sec
     return inject
 
 
-def motor_error(rig: Rig) -> int:
-    """Return the code of an error of the struck motor."""
-    return AK_ERROR if rig.motors[rig.struck].spec.family == FAMILY else DAMIAO_ERROR
-
-
-# Faults of the simulated device, and what ends them.
-CUT, RELEASE = simulator(fault__unplugged=everywhere(True)), simulator(fault__unplugged=everywhere(False))
 SILENCE, END_SILENCE = simulator(fault__bus_silent=True), simulator(fault__bus_silent=False)
-ERROR, NO_ERROR = simulator(fault__error=at_struck(motor_error)), simulator(fault__error=everywhere(0))

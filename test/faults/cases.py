@@ -1,108 +1,139 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The rows of the fault matrix whose subject is a process, a signal, a lock or a message: with real processes."""
+"""The rows of the fault matrix whose subject is a process, a signal, a lock, DDS or a watchdog: with real processes."""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import signal
+import subprocess
+import time
 
 from geometry_msgs.msg import Vector3Stamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from sensor_msgs.msg import Imu, JointState
 
+from exo_gravity.core.motors.ak import MIT_V3
+from exo_gravity.core.motors.families import MOTORS
+from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.safety.descent import DESCENT
+
+from ..support.ros_probe import Timeout
 from .actions import (
-    ERROR,
-    NO_ERROR,
-    deactivate,
+    END_SILENCE,
+    SILENCE,
+    foreign_frames,
     has_refused,
     in_turn,
     kill_bridge_with_frozen_watchdog,
-    let_step_fail,
     overload_processors,
     pause,
     publish,
     random_frames,
-    raw_imu,
-    record_on_a_full_disk,
+    run_bridge,
+    second_bridge,
     send_signal,
-    set_contradicting_parameters,
-    set_impossible_parameters,
     signal_bridge_and_watchdog,
     signal_watchdog,
-    simulator,
     start_second_bridge,
     states_at,
     tilt,
     trunk_imu,
 )
-from .bus_cases import OWNERSHIP, TWO_BUSES, V3_BOARDS
-from .command_cases import CLOCK, EFFORT_COMMANDS
-from .fault_case import PROCESS_REACTION, RECOVERY, FaultCase
-from .person_cases import REQUESTS
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase
 from .rig import Rig
-from .rigs import (
-    BothArmsRig,
-    BowRig,
-    FailingStepRig,
-    LauncherRig,
-    LeastFrictionRig,
-    SignCheckRig,
-    TwoLaunchersRig,
-    WearerRig,
-    variant,
-)
+from .rigs import BothArmsRig, HandedOverRig, LauncherRig, SevenRig, SignCheckRig, TwoBusRig, TwoLaunchersRig, V3Rig
+from .virtual_cases import FOREIGN
 
-STATES, EFFORTS, TILT, RAW_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data_raw"
-TRUNK_IMU = "/imu/data"
+STATES, EFFORTS, TILT, TRUNK_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data"
 HELD = ("active",)
-OFF = ("disabled", "stopped", "inactive")
-KILL, STOP, CONTINUE, TERMINATE, INTERRUPT = (
-    signal.SIGKILL,
-    signal.SIGSTOP,
-    signal.SIGCONT,
-    signal.SIGTERM,
-    signal.SIGINT,
-)
+KILL, STOP, CONTINUE, HANG_UP = signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT, signal.SIGHUP
+# s after which a watchdog has faded the torque of motors that do not reply, and hands the bus over
+GIVEN_UP = DESCENT.blind_hold + DESCENT.blind_fade_time + 1.0
+START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, or to be refused
+OBSERVED = 4.0  # s
+V3_MOTOR_2 = JointMotor(MIT_V3.ranged(MOTORS["AK80-9"]), 2, direction=-1, wire_format=MIT_V3)
+KILL_BRIDGE = send_signal("can_bridge", KILL)
 
 
-def left_arm_is_carried(rig: BothArmsRig) -> None:
-    assert rig.left.state == "active", f"the left arm is {rig.left.state}"
+def start_in_another_session(rig: Rig) -> None:
+    """Start a bridge as another user of the bus: it shares no folder with the first one."""
+    folder = rig.folder / "another_session"
+    folder.mkdir(exist_ok=True)
+    names = ("XDG_RUNTIME_DIR", "HOME", "TMPDIR", "XDG_CACHE_HOME")
+    rig.second_bridge = run_bridge(rig, "/second", environment=dict.fromkeys(names, str(folder)))
+
+
+def start_with_silent_motors(rig: HandedOverRig) -> None:
+    """Leave the watchdog alone with motors that do not reply; they reply again once the next bridge has the bus."""
+    SILENCE(rig)
+    bridge = rig.pid("can_bridge")
+    rig.launcher.kill()
+    os.kill(bridge, signal.SIGKILL)
+    time.sleep(GIVEN_UP)
+    with rig.log_of_next.open("w") as log:
+        rig.next_bridge = second_bridge(rig, "/right", stdout=log, stderr=subprocess.STDOUT)
+    with contextlib.suppress(Timeout):  # then it was refused
+        rig.probe.wait_until(lambda: "letting the arm down" in rig.log_of_next.read_text(), START_LIMIT)
+    END_SILENCE(rig)
+
+
+def next_bridge_let_it_down(rig: HandedOverRig) -> None:
+    log = rig.log_of_next.read_text()
+    assert "the arm is down, its motors are off" in log, f"the next bridge did not let the arm down: {log[-300:]}"
+
+
+def activate_while_deactivating(rig: Rig) -> float:
+    """Deactivate the bridge, and activate it meanwhile without waiting for either answer."""
+    start = time.time()
+    client = rig.probe.node.create_client(ChangeState, "/right/can_bridge/change_state")
+    rig.probe.wait_until(client.service_is_ready)
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+        client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        time.sleep(0.3)
+    rig.probe.wait_until(rig.truth.motors_are_off)
+    time.sleep(OBSERVED)
+    return start
 
 
 # fmt: off
-HELD_ROWS = (
-    FaultCase("NaN joint states", publish(JointState, STATES, states_at([math.nan] * 4)), limit=None),
-    FaultCase("NaN tilt", publish(Vector3Stamped, TILT, tilt(math.nan)), limit=None),
-    FaultCase("NaN orientation of the trunk", publish(Imu, TRUNK_IMU, trunk_imu(math.nan, 1.0)), limit=None),
-    FaultCase("impossible parameters", set_impossible_parameters, limit=None, outcomes=HELD),
-    FaultCase("parameters that contradict each other", set_contradicting_parameters, limit=None, outcomes=HELD),
+BUS = (
     FaultCase("second can_bridge on the bus", start_second_bridge("/second"), limit=None, outcomes=HELD,
         afterwards=has_refused),
-    FaultCase("disk full for the recorder", record_on_a_full_disk, limit=None, outcomes=HELD),
+    FaultCase("can_bridge of another session on the bus", start_in_another_session, limit=None, outcomes=HELD,
+        afterwards=has_refused),
     FaultCase("30,000 random frames", random_frames(30_000, (0, *range(5, 2048))), limit=None),  # 1-4: the motors
-    FaultCase("foreign frames, 3,000 a second", random_frames(15_000, range(0x100, 0x200)), limit=None),
-    FaultCase("processors overloaded", overload_processors, limit=None),
+    FaultCase("V3 boards: foreign 6 Nm to motor 2, 500 a second for 2 s",
+        foreign_frames(lambda rig: (V3_MOTOR_2.command_id, V3_MOTOR_2.command(FOREIGN, 0.0)), 500.0, 2.0), V3Rig,
+        steps_from=2.1, outcomes=("foreign_command",), energy_limit=2.0),
 )
 MESSAGES = (
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
     FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
     FaultCase("second publisher of the trunk's orientation", publish(Imu, TRUNK_IMU, trunk_imu(0.6, 0.8))),
-    FaultCase("second publisher of the raw IMU", publish(Imu, RAW_IMU, raw_imu), limit=0.3),
-)
-DESCENT = (
-    FaultCase("can_bridge killed while let down", send_signal("can_bridge", KILL), limit=PROCESS_REACTION,
-        stage="letting down"),
-)
-START = (
-    FaultCase("imu frozen while ramping in", send_signal("imu", STOP), SignCheckRig, PROCESS_REACTION, "ramping in",
-        clear=send_signal("imu", CONTINUE)),
-    FaultCase("can_bridge killed while proving", send_signal("can_bridge", KILL), SignCheckRig, PROCESS_REACTION,
-        "proving signs"),
-    FaultCase("can_bridge killed while ramping in", send_signal("can_bridge", KILL), SignCheckRig, PROCESS_REACTION,
-        "ramping in"),
+    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]),
+        TwoLaunchersRig, outcomes=("second_commander",)),
 )
 PROCESSES = (
+    FaultCase("processors overloaded", overload_processors, limit=None),
     FaultCase("imu frozen", send_signal("imu", STOP), limit=PROCESS_REACTION, clear=send_signal("imu", CONTINUE)),
-    FaultCase("can_bridge deactivated", deactivate, outcomes=OFF, ends_rig=True),
+    FaultCase("compensator killed", send_signal("compensator", KILL), limit=PROCESS_REACTION),
+    FaultCase("compensator killed, the rest runs on", send_signal("compensator", KILL), TwoLaunchersRig,
+        ends_rig=True, outcomes=("command_stale",)),
+    FaultCase("can_bridge frozen", send_signal("can_bridge", STOP), limit=PROCESS_REACTION),
+    FaultCase("can_bridge terminated", send_signal("can_bridge", signal.SIGTERM), limit=PROCESS_REACTION),
+    FaultCase("can_bridge: SIGHUP", send_signal("can_bridge", HANG_UP), limit=PROCESS_REACTION),
+    FaultCase("activate, abandoned while can_bridge deactivates", activate_while_deactivating,
+        outcomes=("disabled", "inactive", "stopped"), ends_rig=True),
+    FaultCase("launcher killed", lambda rig: rig.launcher.kill(), LauncherRig, PROCESS_REACTION),
+    FaultCase("launcher interrupted", lambda rig: rig.launcher.send_signal(signal.SIGINT), LauncherRig,
+        PROCESS_REACTION),
+    FaultCase("launcher's terminal closed", lambda rig: rig.launcher.send_signal(HANG_UP), LauncherRig,
+        PROCESS_REACTION),
+)
+WATCHDOG = (
     FaultCase("watchdog frozen", signal_watchdog(STOP), limit=0.6, clear=signal_watchdog(CONTINUE),
         outcomes=("watchdog_dead",), ends_rig=True),
     FaultCase("watchdog killed", signal_watchdog(KILL), limit=PROCESS_REACTION, outcomes=("watchdog_dead",),
@@ -110,48 +141,24 @@ PROCESSES = (
     FaultCase("can_bridge and watchdog frozen for 1 s",
         in_turn(signal_bridge_and_watchdog(STOP), pause(1.0), signal_bridge_and_watchdog(CONTINUE)),
         limit=1.0 + PROCESS_REACTION, ends_rig=True),
-    FaultCase("compensator killed", send_signal("compensator", KILL), limit=PROCESS_REACTION),
-    FaultCase("imu killed", send_signal("imu", KILL), limit=PROCESS_REACTION),
-    FaultCase("can_bridge killed", send_signal("can_bridge", KILL), limit=PROCESS_REACTION),
-    FaultCase("can_bridge killed and started again at once",
-        in_turn(send_signal("can_bridge", KILL), start_second_bridge("/right")), limit=PROCESS_REACTION,
-        afterwards=has_refused),
-    FaultCase("can_bridge frozen", send_signal("can_bridge", STOP), limit=PROCESS_REACTION),
-    FaultCase("can_bridge terminated", send_signal("can_bridge", TERMINATE), limit=PROCESS_REACTION),
+    FaultCase("can_bridge and watchdog killed", signal_bridge_and_watchdog(KILL), limit=RECOVERY),
+    # Motors that were cut off for so long drop, under full damping, what has faded meanwhile: no frame tells before.
+    FaultCase("motors silent for long, then the next can_bridge", start_with_silent_motors, HandedOverRig, limit=None,
+        unreached=ALL_JOINTS, steps_from=math.inf, afterwards=next_bridge_let_it_down, ends_rig=True),
+    FaultCase("can_bridge killed", KILL_BRIDGE, limit=PROCESS_REACTION),
+    FaultCase("can_bridge killed while let down", KILL_BRIDGE, limit=PROCESS_REACTION, stage="letting down"),
+    FaultCase("can_bridge killed while proving", KILL_BRIDGE, SignCheckRig, PROCESS_REACTION, "proving signs"),
+    FaultCase("can_bridge killed and started again at once", in_turn(KILL_BRIDGE, start_second_bridge("/right")),
+        limit=PROCESS_REACTION, afterwards=has_refused),
     FaultCase("can_bridge killed, its watchdog frozen for 1 s", kill_bridge_with_frozen_watchdog(1.0),
         limit=1.0 + PROCESS_REACTION),
-    FaultCase("can_bridge and watchdog killed", signal_bridge_and_watchdog(KILL), limit=RECOVERY),
-    FaultCase("second publisher of efforts", publish(JointState, EFFORTS, lambda rig: rig.probe.effort_commands[-1]),
-        TwoLaunchersRig, outcomes=("second_commander",)),
-    FaultCase("compensator killed, the rest runs on", send_signal("compensator", KILL), TwoLaunchersRig,
-        ends_rig=True, outcomes=("command_stale",)),
-    FaultCase("compensator's step never returns", let_step_fail("sleep"), FailingStepRig, ends_rig=True,
-        outcomes=("command_stale",)),
-    FaultCase("launcher killed", lambda rig: rig.launcher.kill(), LauncherRig, PROCESS_REACTION),
-    FaultCase("launcher interrupted", lambda rig: rig.launcher.send_signal(INTERRUPT), LauncherRig, PROCESS_REACTION),
     FaultCase("can_bridge killed, the launcher frozen",
-        in_turn(lambda rig: rig.launcher.send_signal(STOP), send_signal("can_bridge", KILL)), LauncherRig,
-        PROCESS_REACTION, clear=lambda rig: rig.launcher.send_signal(CONTINUE)),
-)
-ARMS = (
-    FaultCase("can_bridge killed, friction 0.01 Nm", send_signal("can_bridge", KILL), LeastFrictionRig,
-        PROCESS_REACTION),
-    FaultCase("trunk bows past 90 degrees", in_turn(simulator(trunk__pitch=1.9), pause(4.5)), BowRig, None,
-        outcomes=HELD, clear=in_turn(simulator(trunk__pitch=0.1), pause(4.0))),
-    FaultCase("can_bridge killed, Zero-G, 75 kg", send_signal("can_bridge", KILL), WearerRig, PROCESS_REACTION),
-    FaultCase("motor 2 of the right of two arms reports an error", ERROR, BothArmsRig, clear=NO_ERROR,
-        afterwards=left_arm_is_carried, outcomes=("motor_error",)),
-    FaultCase("can_bridge of the right of two arms killed", send_signal("can_bridge", KILL), BothArmsRig,
-        PROCESS_REACTION),
-)
-OTHER_ARMS = (  # one strong motor with a high gear; Damiao motors on CAN FD
-    FaultCase("elbow, AK80-64: can_bridge killed", send_signal("can_bridge", KILL),
-        variant(Rig, base="elbow.yaml", pose=(1.3,), struck=0), PROCESS_REACTION),
-    FaultCase("seven Damiao joints: can_bridge killed", send_signal("can_bridge", KILL),
-        variant(Rig, base="seven_joints.yaml", pose=(0.3, 1.1, 0.0, 0.4, 0.1, 0.1, -0.1)), PROCESS_REACTION),
+        in_turn(lambda rig: rig.launcher.send_signal(STOP), KILL_BRIDGE), LauncherRig, PROCESS_REACTION,
+        clear=lambda rig: rig.launcher.send_signal(CONTINUE)),
+    FaultCase("can_bridge of the right of two arms killed", KILL_BRIDGE, BothArmsRig, PROCESS_REACTION),
+    FaultCase("V3 boards: can_bridge killed", KILL_BRIDGE, V3Rig, PROCESS_REACTION),
+    FaultCase("two buses: can_bridge killed", KILL_BRIDGE, TwoBusRig, PROCESS_REACTION),
+    FaultCase("seven Damiao joints: can_bridge killed", KILL_BRIDGE, SevenRig, PROCESS_REACTION),
 )
 # fmt: on
-CASES = (
-    *(*HELD_ROWS, *MESSAGES, *DESCENT, *START, *PROCESSES, *EFFORT_COMMANDS, *CLOCK, *ARMS, *V3_BOARDS),
-    *(*OWNERSHIP, *TWO_BUSES, *REQUESTS, *OTHER_ARMS),
-)
+CASES = (*BUS, *MESSAGES, *PROCESSES, *WATCHDOG)

@@ -27,6 +27,11 @@ DESCENT = 30.0  # s until the arm must be down
 BEFORE = 0.1  # s before the fault, from which on the torque is known
 
 
+def in_turn(*actions: Action) -> Action:
+    """Do one action after the other."""
+    return lambda rig: [action(rig) for action in actions] and None
+
+
 @dataclass(frozen=True)
 class FaultCase:
     """One fault. inject(rig) causes it, and may return the time (s on the clock of the records) at which it began.
@@ -37,7 +42,6 @@ class FaultCase:
     afterwards(rig) checks, once the arm is down, what happens next: it raises AssertionError.
     stage: the bridge's state in which the fault occurs, or "started".
     limit: s until the arm must be let down, None where it may stay carried, because the fault is refused or ignored.
-    outcomes: the allowed results, fault codes or states; () for any.
     unreached: joints (0..) whose motors no frame can reach.
     unpowered: joints that fall, because a motor has no power, so that nothing can brake them.
     steps_from: s after the fault from which on torque steps count, where the fault itself is a step.

@@ -19,9 +19,9 @@ from exo_gravity.sim.judge import measure
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
-from .rigs import COMPENSATOR, BothArmsRig, WearerRig
+from .rigs import BothArmsRig
 from .stall_clock import StallClock
-from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, SHAKE, THROW
+from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, WORN_COG, WORN_MASS
 
 MINUTE = 60.0  # s
 STALL = READING.reply_timeout  # s
@@ -37,9 +37,9 @@ class SoakRig(BothArmsRig):
     """Both arms carry the arm of a 75 kg wearer, and a recorder runs."""
 
     rate = 50.0
-    pose = WearerRig.pose
-    compensator: ClassVar[Parameters] = WearerRig.compensator
-    simulator: ClassVar[Parameters] = {"wearer": WearerRig.simulator["wearer"]}
+    pose = WORN.pose
+    compensator: ClassVar[Parameters] = {"mode": "zero_g", "support": 1.0, "wearer": {"body_mass": 75.0}}
+    simulator: ClassVar[Parameters] = {"wearer": {"mass": WORN_MASS.tolist(), "cog": WORN_COG.tolist()}}
 
     def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
         content = yaml.safe_load((CONFIG / "sim_both.yaml").read_text())
@@ -73,7 +73,7 @@ class SoakRig(BothArmsRig):
         return [resident(self.process(node).pid) for node in NODES]
 
 
-CARRIED = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75.0, "robot.mass": COMPENSATOR["robot.mass"], **RATED}
+CARRIED = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75.0, "robot.mass": list(ROBOT.mass), **RATED}
 BACK: Steps = [{"move": list(SoakRig.pose), "over": over} for over in (1.5, 60.0)]  # where the wearer carries their arm
 # As the virtual wearer's 25 Nm permit while the motors do not carry them.
 ACTS: dict[str, Steps] = {

@@ -42,12 +42,11 @@ class Rig:
 
     shipped_timeouts: whether the nodes have their default time-outs, or longer ones for a busy machine.
     struck: the joint (0..) whose motor is the one that fails; it carries much of the arm's weight.
-    bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. one_process:
-    whether can_bridge and compensator of an arm share a process, in every rig of a run. two_buses: whether motors 3 and
-    4 are on a second bus. without: nodes that do not run, or not with the bridge. wearer: whether `wearer` runs.
+    bridge, compensator, simulator: the nodes' parameters, apart from those of the configuration `base`. two_buses:
+    whether motors 3 and 4 are on a second bus. without: nodes that do not run, or not with the bridge.
     """
 
-    one_process = two_buses = wearer = False
+    two_buses = False
     without: Sequence[str] = ("simulator",)
     base = "sim.yaml"
     rate = 250.0  # Hz
@@ -103,11 +102,10 @@ class Rig:
         """Return the nodes of each launcher apart from the simulator; the first one has the bridge."""
         changes = {"can_bridge": {"rate": self.rate, **self.bridge}, "compensator": self.compensator}
         changes = {node: values for node, values in changes.items() if node not in self.without}
-        return [self._nodes(without=self.without, port=port, wearer=self.wearer, **changes)]
+        return [self._nodes(without=self.without, port=port, **changes)]
 
     def _nodes(self, **options: Any) -> LaunchedNodes:
-        share: dict[str, Any] = {"one_process": self.one_process, "two_buses": self.two_buses}
-        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, **share, **options)
+        return LaunchedNodes(self.folder, base=self.base, timing=self.timing, two_buses=self.two_buses, **options)
 
     def bring_to(self, stage: str) -> None:
         """Clear what the last fault left and bring the arm to `stage`, in several attempts.

@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """`make study NAME=faults`: run the fault matrix on the simulated device, with processes; print a table and write JSON.
 
-    python -m test.faults.run [--only TEXT ...] [--start N] [--output build/faults.json] [--busy] [--one-process]
+    python -m test.faults.run [--only TEXT ...] [--start N] [--output build/faults.json] [--busy]
 
 The JSON file is written after every case. The exit code is 1 if a case was unsafe or could not be run. Safe means, by
 the arm's true motion until 3 s after the last motor was switched off: damping on every motor in time, no joint above
@@ -32,8 +32,6 @@ from rich.table import Table
 
 from .cases import CASES
 from .fault_case import FaultCase
-from .one_process import in_one_process
-from .rig import Rig
 from .runner import Result, RigPool, not_run
 from .stall_clock import StallClock
 
@@ -51,12 +49,8 @@ def main() -> int:
     parser.add_argument("--start", default=1, type=int, metavar="N", help="begin with the Nth of them")
     parser.add_argument("--output", default=Path("build/faults.json"), type=Path, metavar="FILE", help="(%(default)s)")
     parser.add_argument("--busy", action="store_true", help="for a busy machine: long time-outs, reactions not judged")
-    share = "can_bridge and compensator of an arm share a process"
-    parser.add_argument("--one-process", action="store_true", help=share)
     arguments = parser.parse_args()
-    Rig.one_process = arguments.one_process
-    rows = in_one_process(CASES) if arguments.one_process else CASES
-    chosen = [case for case in rows if any(_matches(case, text, arguments.exactly) for text in arguments.only)]
+    chosen = [case for case in CASES if any(_matches(case, text, arguments.exactly) for text in arguments.only)]
     cases = chosen[arguments.start - 1 :]
     console = Console(width=max(120, Console().width))
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -37,12 +37,13 @@ from rich.console import Console
 from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.lab.bag.reader import read_bag
 
-from .actions import END_SILENCE, ERROR, NO_ERROR, SILENCE, enable, foreign_frames, in_turn, pause, send_signal
+from .actions import END_SILENCE, SILENCE, foreign_frames, in_turn, pause, send_signal, simulator
 from .cases import CASES
 from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
 from .live_arm import MINUTE, NODES, STALL, LiveArm, SoakRig
 from .runner import Result, RigPool
 from .stall_clock import StallClock
+from .virtual import AK_ERROR
 
 WARM_UP = 5  # min until memory counts: caches and buffers fill
 MAX_GROWTH = 5.0  # MB, from then until the end
@@ -51,12 +52,17 @@ MAX_GAP = 1.0  # s between two recorded joint states of an arm
 LIVE, LIVE_BEFORE_FAULT = 45.0, 15.0  # s of a minute after which no further change and act begin
 
 
-HARMLESS = ("NaN joint states", "NaN tilt", "second publisher of efforts")  # rows of the matrix
+HARMLESS = [f"second publisher of {what}" for what in ("joint states", "the tilt", "efforts")]  # rows of the matrix
 FAULTS = (  # after which the same nodes run on
     *(replace(case, rig=SoakRig, outcomes=()) for case in CASES if case.name in HARMLESS),
-    FaultCase("arm disabled", enable(False), SoakRig),
+    FaultCase("arm disabled", lambda rig: rig.probe.enable(False), SoakRig),
     FaultCase("foreign EXIT to motor 2, once", foreign_frames(EXIT), SoakRig, steps_from=0.05),
-    FaultCase("motor 2 reports an error", ERROR, SoakRig, clear=NO_ERROR),
+    FaultCase(
+        "motor 2 reports an error",
+        simulator(fault__error=[0, AK_ERROR, 0, 0]),
+        SoakRig,
+        clear=simulator(fault__error=[0] * 4),
+    ),
     FaultCase("bus silent for 1 s", in_turn(SILENCE, pause(1.0), END_SILENCE), SoakRig, unreached=ALL_JOINTS),
     FaultCase(
         "compensator frozen",

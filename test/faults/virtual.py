@@ -25,7 +25,7 @@ from exo_gravity.sim.rig import Rig
 
 from ..support import CONFIG
 from ..support.copies import copied
-from .fault_case import AFTER_EXIT, BEFORE, CARRYING, DESCENT, OBSERVATION, Action, FaultCase
+from .fault_case import AFTER_EXIT, BEFORE, CARRYING, DESCENT, OBSERVATION, Action, FaultCase, in_turn
 
 RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
 TIMEOUTS: Mapping[str, Mapping[str, Any]] = {  # those of a real device
@@ -35,6 +35,7 @@ TIMEOUTS: Mapping[str, Mapping[str, Any]] = {  # those of a real device
 STEADY = 1.25  # s after a move in which the arm comes to rest
 GYRO_BIAS = 1e-3  # rad/s, as an ordinary IMU has at least
 FALLING = 0.2  # rad/s of the struck joint, from which on an arm is on its way down
+AT_LEAST, RESTS = 0.5, 1e-3  # s after the last motor was switched off, and rad/s: nothing more can happen to the arm
 AK_ERROR, DAMIAO_ERROR = 5, 0xB
 
 Parameters = Mapping[str, Any]
@@ -125,10 +126,11 @@ class StruckArm(Rig):
             self.safety.trip(FaultCode.CONTROL_LOST, reason, self.now)
 
     def set_parameters(self, values: Parameters) -> None:
-        """Set parameters of the compensator together, as the operator would."""
-        self.nodes["/right/compensator"] |= values
-        self.settings = read_arm(self.nodes, "/right").settings
+        """Set parameters of the compensator together, as the operator would. Raises ParameterError."""
+        nodes = {**self.nodes, "/right/compensator": {**self.nodes["/right/compensator"], **values}}
+        self.settings = read_arm(nodes, "/right").settings
         self.compensator.apply(self.settings)
+        self.nodes = nodes
 
     def bring_to(self, stage: str) -> None:
         """Bring the hanging arm to a state of its bridge."""
@@ -156,6 +158,11 @@ class StruckArm(Rig):
     def are_off(self) -> bool:
         """Return whether every motor is off."""
         return not self.device.powered
+
+    def rests(self) -> bool:
+        """Return whether every motor is off, and nothing moves."""
+        self.catch_up()
+        return self.are_off() and max(map(abs, self.device.arm.velocities)) < RESTS
 
     @property
     def outcome(self) -> str:
@@ -207,7 +214,8 @@ def play(case: FaultCase, is_fresh: bool = False) -> Played:
         rig.run_until(lambda: rig.outcome not in CARRYING, DESCENT)
     if rig.outcome not in CARRYING and not case.must_stay_off:
         rig.run_until(rig.are_off, DESCENT)
-        rig.run(AFTER_EXIT)
+        rig.run(AT_LEAST)
+        rig.run_until(rig.rests, AFTER_EXIT - AT_LEAST)
     outcome = rig.outcome
     rig.catch_up()
     records = rig.truth.records
@@ -232,11 +240,6 @@ def _observe(case: FaultCase, rig: StruckArm) -> None:
         if rig.state not in (State.LETTING_DOWN, State.FAULT):
             return
     rig.run_until(lambda: rig.state is State.FAULT or rig.are_off(), DESCENT)
-
-
-def in_turn(*actions: Action) -> Action:
-    """Do one action after the other."""
-    return lambda rig: [action(rig) for action in actions] and None
 
 
 def pause(seconds: float) -> Action:

@@ -10,16 +10,22 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pytest
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.frames import SET_ZERO
+from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.limits import CONFIRM
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.judge import USUAL, resolution
 from exo_gravity.sim.rig import IMU_PERIOD
+from exo_gravity.sim.virtual_arm import TrunkReading
 
 from ..support import CONFIG
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, Action, FaultCase
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, Action, FaultCase, in_turn
 from .virtual import (
     CONNECT,
     CUT,
@@ -42,7 +48,6 @@ from .virtual import (
     foreign,
     freeze,
     happens,
-    in_turn,
     no_error,
     no_jump,
     pause,
@@ -58,6 +63,8 @@ Steps = Sequence[Mapping[str, Any]]
 FOREIGN = -6.0  # Nm
 OBSERVED = 3.0  # s after the supply returns
 GAP = 4.0  # s for which motors are mute
+BLIND = 30.0  # s, longer than a let-down waits for motors that do not reply
+LAP = [0.1, 0.3, 0.3, 1.3]  # rad, near to hanging but for the elbow, which then reads 0.25
 OFF = ("disabled",)
 UNEXPLAINED = ("unexplained_torque",)
 RIDE = 0.5  # s from the fault, in which the motors have damped and are free again
@@ -70,6 +77,7 @@ DROP_SPEED, LOAD_LOST = 4.8, 2.9  # rad/s of the paper's arm and of the elbow, b
 # stopped for 75 ms may miss one cycle more than that
 FIRMWARE_FALL = 1.5
 CARELESS = 1.5  # rad/s, where the replies are lost: nobody knows how fast the joints are
+BOWING = 0.5  # rad/s
 LET_DOWN = 1.5  # s from the death of who holds control
 GONE_FOR = 0.45  # s from the fault, in which the assistance is out; that of a sound stream may then return
 TOLERANCE = 0.08  # Nm
@@ -86,6 +94,16 @@ IN_IT = {"wearer.mass": WORN_MASS.tolist(), "wearer.cog": WORN_COG.tolist(), "fr
 ZERO_G = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75.0}
 _NODE = load(CONFIG / "sim.yaml")["/right/compensator"]
 ROBOT = ArmModel(*(_NODE[name] for name in ("link_length", "robot.cog", "robot.mass")))
+
+# Of the compensator; those of can_bridge: test/core/test_refused.py.
+IMPOSSIBLE: tuple[Mapping[str, Any], ...] = (
+    {"robot.mass": [-1.0] * 4},
+    {"robot.mass": [math.nan] * 4},
+    {"gain": [1.0] * 3},
+    {"mode": 7},
+    {"law": ""},
+    {"gain": [2.0] * 4, "gravity": 25.0},
+)
 
 PAPER = Arm()
 ALONE = Arm(compensator=NO_IMU, simulator=UPRIGHT)  # without an IMU
@@ -105,6 +123,8 @@ ON_V3 = Arm(can_bridge=V3, simulator=V3)
 # The elbow's upper limit is within reach of a push, and far from the mechanical stop.
 AT_WALL = Arm(pose=(0.0, 0.3, 0.3, 1.0), can_bridge={"position_max": [1.65, 3.14, 2.53, 1.2]})
 WITH_TIMEOUT = Arm(simulator={"firmware.timeout": 0.025})
+# In this pose the motors can hold the arm on a trunk that is bowed to any angle up to 110 degrees.
+BOWED = Arm(pose=(0.0, 0.4, 1.0, 1.8))
 # The bridge knows what the robot needs at most. Soon down: these rows are about what is refused.
 MONITORED = Arm(
     pose=(0.0, 0.6, 0.0, 0.3),
@@ -317,6 +337,58 @@ def stop_imu_for_a_moment(rig: StruckArm) -> None:
     rig.tell(rig.compensator, rig.newest_reading, rig.now - IMU_PERIOD / 2.0)
 
 
+def bow(pitch: float) -> Action:
+    """Let the trunk turn to `pitch` rad, farther than a trial script may bow, at BOWING."""
+
+    def inject(rig: StruckArm) -> None:
+        count = round(abs(pitch - rig.device.pitch) / (BOWING * IMU_PERIOD))
+        for number, angle in enumerate(np.linspace(rig.device.pitch, pitch, 1 + count).tolist()):
+            rig.clock.later(number * IMU_PERIOD, partial(setattr, rig.device, "pitch", angle))
+
+    return inject
+
+
+def unknown_states(rig: StruckArm) -> None:
+    """Let the compensator read NaN for every angle."""
+    take = rig.direct.take
+    rig.direct.take = lambda now, samples: take(  # type: ignore[method-assign]
+        now, [sample._replace(position=math.nan) for sample in samples]
+    )
+
+
+def unknown_tilt(rig: StruckArm) -> None:
+    """Let the IMU read NaN."""
+    rig.imu_frozen = TrunkReading((math.nan,) * 3)
+
+
+def set_impossible_parameters(rig: StruckArm) -> None:
+    """Set values of the compensator that are impossible, alone or together."""
+    for values in IMPOSSIBLE:
+        with pytest.raises(ParameterError):
+            rig.set_parameters(values)
+
+
+def stop_in_the_lap(rig: StruckArm) -> None:
+    """Press the emergency stop, lay the arm in the lap, release it, clear the fault and enable; the wearer relaxes.
+
+    The elbow's encoder has lost a turn, so that the arm seems to hang. The operator does not confirm that it does.
+    """
+    rig.safety.limits = replace(rig.safety.limits, start_pose=CONFIRM)
+    CUT(rig)
+    rig.act({"move": LAP, "over": 4.0}, {"move": LAP, "over": 60.0})
+    rig.run(5.0)
+    rig.run_until(lambda: rig.state is State.FAULT, BLIND)
+    ACTS["encoder_slip"](rig, joint=3, error=-rig.motors[3].joint.spec.rotor_turn)
+    RELEASE(rig)
+    rig.run(1.0)
+    clear(rig)
+    rig.run(1.0)
+    rig.between_cycles(rig.safety.enable)
+    rig.run(GAP)
+    rig.act()
+    rig.run(GAP)
+
+
 def mute(*joints: int) -> Action:
     """Lose the replies of these motors for GAP s; the motors obey."""
     return in_turn(happens("mute", motors=joints, duration=GAP), pause(GAP))
@@ -413,6 +485,9 @@ EFFORTS = (
     FaultCase("compensator frozen, the rest runs on", freeze, ALONE, clear=resume, outcomes=("command_stale",)),
     FaultCase("compensator's step raises an exception", raises, ALONE, outcomes=("command_stale",)),
     FaultCase("effort NaN", happens("efforts_nan"), COMMANDED),
+    FaultCase("NaN joint states", unknown_states, PAPER, outcomes=("command_withdrawn",)),
+    FaultCase("NaN tilt", unknown_tilt, PAPER, limit=PROCESS_REACTION, outcomes=("command_withdrawn",)),
+    FaultCase("impossible parameters", set_impossible_parameters, PAPER, limit=None, outcomes=("active",)),
     FaultCase("no efforts", happens("efforts_withdrawn"), COMMANDED),
     FaultCase("efforts 3 times too large", change_efforts(lambda now, effort: [3.0 * each for each in effort]),
         MONITORED, limit=0.5, outcomes=UNEXPLAINED),
@@ -431,9 +506,9 @@ EFFORTS = (
 ARMS = (
     FaultCase("arm disabled, friction 0.01 Nm", happens("disable"), with_friction(0.01, viscous=[0.0] * 4),
         outcomes=OFF),
-    FaultCase("arm disabled, friction 0.05 Nm", happens("disable"), with_friction(0.05, viscous=[0.0] * 4),
-        outcomes=OFF),
     FaultCase("arm disabled, friction 0.5 Nm", happens("disable"), with_friction(0.5), outcomes=OFF),
+    FaultCase("trunk bows past 90 degrees", in_turn(bow(1.9), pause(4.5)), BOWED, None,
+        outcomes=("active",), clear=in_turn(bow(0.1), pause(4.0))),
     FaultCase("elbow pushed into the soft wall", happens("wearer", steps=WALL_PUSH), AT_WALL, None, speed_limit=5.0,
         check=not_thrown_back),
     FaultCase("arm disabled, Zero-G, 75 kg", happens("disable"), WORN, outcomes=OFF),
@@ -443,7 +518,9 @@ V3_BOARDS = (
     FaultCase("V3 boards: arm disabled", happens("disable"), ON_V3, outcomes=OFF),
     FaultCase("V3 boards: motor 2 cut off from the bus", CUT_OFF, ON_V3, clear=CONNECT, unreached=(1,),
         outcomes=("motor_silent",)),
-    FaultCase("V3 boards: bus silent for 3 s", in_turn(SILENCE, pause(3.0), END_SILENCE), ON_V3, unreached=ALL_JOINTS),
+    # Status frames tell what a motor still holds: it drops nothing when it is reached again.
+    FaultCase("V3 boards: bus silent until the arm is given up", SILENCE, ON_V3, clear=END_SILENCE,
+        unreached=ALL_JOINTS, outcomes=("motor_silent",), driven_limit=0.6),
     FaultCase("V3 boards: motor 2 reports an error", ERROR, ON_V3, clear=no_error, outcomes=("motor_error",)),
     FaultCase("V3 boards: foreign exit of motor 2, once", exit_frame, ON_V3, steps_from=0.05,
         outcomes=("foreign_command", "torque_not_delivered")),
@@ -451,6 +528,8 @@ V3_BOARDS = (
 SUPPLY = (
     FaultCase("enabled, and the supply cut for 4 s while checking", in_turn(CUT, pause(4.0), RELEASE, pause(OBSERVED)),
         SHORT_ENABLE, stage="checking", outcomes=OFF, afterwards=expired),
+    FaultCase("supply cut, the arm laid in the lap, then clear and enable", stop_in_the_lap, WORN,
+        unpowered=ALL_JOINTS, steps_from=0.1, check=stays_off),
     supply_case("supply cut for 2 s", CUT, pause(2.0)),
     supply_case("supply cut for 30 s, cleared meanwhile", CUT, pause(15.0), clear, pause(15.0)),
     supply_case("V3 boards: supply cut for 2 s", CUT, pause(2.0), arm=ON_V3),

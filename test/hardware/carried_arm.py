@@ -25,10 +25,9 @@ from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.rig import Rig
-from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.virtual_time import Wire
-from exo_gravity.sim.virtual_wearer import VirtualWearer
 
+from ..support.active_wearer import Behaviour, attach
 from ..support.copies import prepared
 from ..support.simulated_device import joints_of
 
@@ -40,21 +39,6 @@ DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause
 # While a motor has no power and it is not yet known, the others push on with the torque of the pose before.
 UNKNOWN_LOSS = 1.9, 0.5  # rad/s and J
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
-Hand = Callable[[float, Sequence[float], Sequence[float]], Sequence[float]]  # s, angles, velocities -> (n,) Nm
-
-
-class Led(VirtualWearer):
-    """Applies the torque of a hand."""
-
-    def __init__(self, hand: Hand) -> None:
-        super().__init__(IDLE)
-        self._hand = hand
-
-    def torque(self, elapsed: float, theta: Sequence[float], velocity: Sequence[float]) -> tuple[float, ...]:
-        return tuple(self._hand(elapsed, theta, velocity))
-
-    def idle(self, elapsed: float, duration: float) -> bool:
-        return False
 
 
 class JudgedArm(Rig):
@@ -66,10 +50,10 @@ class JudgedArm(Rig):
         assert self.state is State.ACTIVE, self.safety.fault
         self.forget()
 
-    def lead(self, hand: Hand) -> None:
+    def lead(self, hand: Behaviour) -> None:
         """Let a hand act on the arm from now on."""
         self.catch_up()
-        self.device.start(Led(hand))
+        attach(self.device, hand)
 
     @property
     def answer(self) -> Compensation:

@@ -14,7 +14,7 @@ import pytest
 from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
-from exo_gravity.core.motors.frames import EXIT, WireFormat
+from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -26,7 +26,6 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, LOWERING, ControlLoop, NoController
 from exo_gravity.sim.virtual_time import Wire
 
-from ..support.simulated_device import frame
 from ..support.thorough import quick
 from .rig import CYCLE, FIRST, LIMITS, MOTORS_OF_ARM, SECOND, CarriedArm, TwoBusRig, VirtualRig, raised_arm
 from .wires import Responder
@@ -210,26 +209,6 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     assert not loop.cycle()
 
 
-@pytest.mark.parametrize(
-    ("data", "period", "echoes"),
-    [
-        (EXIT, 0.1, False),
-        (MOTORS_OF_ARM[1].command(6.0, 0.0), 0.002, True),
-    ],
-    ids=["EXIT at 10 Hz", "6 Nm at 500 Hz, echoed"],
-)
-def test_foreign_commands_are_opposed_at_once_and_the_arm_is_let_down(data: bytes, period: float, echoes: bool):
-    arm = raised_arm(echoes)
-    assert arm.bus.foreign_commands == 0
-    arm.wire.repeat(frame(2, data), period)
-    arm.run_until(lambda: arm.safety.fault)
-    assert arm.safety.fault.code == "foreign_command"
-    assert "another sender commands motor 2" in arm.safety.fault.reason
-    arm.run(1.0)
-    assert arm.safety.state is State.LETTING_DOWN
-    assert arm.rig.top_speed < OPPOSED_SPEED
-
-
 @pytest.mark.parametrize("echoes", [False, True])
 def test_our_own_frames_are_never_foreign(echoes: bool):
     arm = raised_arm(echoes)
@@ -237,17 +216,6 @@ def test_our_own_frames_are_never_foreign(echoes: bool):
     assert arm.bus.foreign_commands == 0
     assert arm.safety.state is State.ACTIVE
     assert ("echo" in arm.bus.ignored) == echoes
-
-
-def test_a_foreign_command_refuses_the_start():
-    rig = VirtualRig(pose=NO_TORQUE, carried=False)
-    loop = rig.loop_with().loop
-    assert loop.safety.enable(rig.clock.monotonic())
-    rig.wire.repeat(frame(2, EXIT), 0.05)
-    for _ in range(20):
-        loop.cycle()
-    assert loop.safety.state is State.FAULT
-    assert loop.safety.fault.code == "foreign_command"
 
 
 # An arm whose motors are on two buses: one safety unit.

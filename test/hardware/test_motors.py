@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import struct
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +48,6 @@ from .carried_arm import (
     EVENTS,
     PEAK,
     POSE,
-    RATED,
     REAL_RATE,
     UNKNOWN_LOSS,
     CarriedArm,
@@ -269,29 +268,6 @@ def test_a_motor_that_is_set_otherwise_than_the_file_says_is_not_switched_on(
     assert not arm.device.powered and not arm.caused.energy
 
 
-def test_a_motor_with_an_error_is_never_switched_on_again() -> None:
-    arm = raised_arm("damiao")
-    arm.device.motors[1].error = 0xA
-    arm.run(4.0)
-    fault = arm.safety.fault
-    assert fault and fault.code is FaultCode.MOTOR_ERROR and "error 10 (over-current)" in fault.reason
-    assert not arm.device.motors[1].entered
-    arm.assert_not_thrown(*UNKNOWN_LOSS)
-
-
-def test_an_error_that_has_passed_is_forgotten_once_the_operator_clears_the_fault() -> None:
-    arm = raised_arm("damiao")
-    motor = damiao_of(arm, 1)
-    motor.error = 0xB
-    assert arm.run_until(lambda: arm.loop.is_off, 30.0)
-    motor.error = 0
-    arm.run(1.0)
-    assert motor.latched == 0xB
-    assert arm.safety.clear(arm.now)
-    arm.carry()  # at once: the last reply still shows the error
-    assert motor.latched == 0 and motor.entered
-
-
 def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
     arm = arm_of("damiao")
     joints = [
@@ -365,26 +341,6 @@ def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
 
 USUAL = joints_of((MIT,) * 4)
 IDS = [(EXCHANGED, True), (EXCHANGED, False), (RIGHT, True), (RIGHT, False)]
-
-
-@pytest.mark.parametrize(("ids", "is_worn"), quick([(EXCHANGED, True), (RIGHT, True)], IDS))
-def test_an_arm_with_exchanged_ids_of_shoulder_flexion_and_elbow_is_never_carried(
-    ids: Sequence[int], is_worn: bool
-) -> None:
-    arm = CarriedArm(joints_of((MIT,) * 4, ids), [SimulatedMotor(joint) for joint in USUAL], RATED)
-    if not is_worn:
-        arm.device.arm.config = replace(arm.device.arm.config, wearer_mass=(0.0,) * len(ids))
-        arm.device.arm.carry(0.0)
-    arm.enable()
-    assert arm.run_until(lambda: arm.safety.state in (State.ACTIVE, State.FAULT), 60.0)
-    if ids == RIGHT:
-        assert arm.safety.state is State.ACTIVE
-        return
-    assert arm.safety.fault and arm.safety.fault.code is FaultCode.JOINTS_EXCHANGED
-    assert "shoulder_flexion moved sooner than elbow_flexion" in arm.safety.fault.reason
-    arm.run(1.0)
-    assert not arm.device.powered
-    arm.assert_not_thrown()
 
 
 # Reach, come back, and wait there until the arm is at rest.

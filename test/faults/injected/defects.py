@@ -10,11 +10,9 @@ import importlib
 import math
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -321,18 +319,3 @@ def by_name(name: str) -> Defect:
         if defect.name == name:
             return defect
     raise LookupError(f"no defect {name!r}")
-
-
-def let_step_fail(path: str) -> None:
-    """Let the compensator's step fail once the file exists: with the text `sleep` it never returns, else it raises."""
-    owner, name, step = find(COMPENSATOR)
-    file = Path(path)
-
-    def failing(*reading: Any) -> Any:
-        if file.exists():
-            if file.read_text() == "sleep":
-                time.sleep(3600.0)
-            raise ZeroDivisionError("division by zero")
-        return step(*reading)
-
-    setattr(owner, name, failing)
