@@ -26,7 +26,6 @@ from .actions import (
     SILENCE,
     foreign_frames,
     has_refused,
-    in_turn,
     kill_bridge_with_frozen_watchdog,
     overload_processors,
     pause,
@@ -42,7 +41,7 @@ from .actions import (
     tilt,
     trunk_imu,
 )
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase, in_turn
 from .rig import Rig
 from .rigs import BothArmsRig, HandedOverRig, LauncherRig, SevenRig, SignCheckRig, TwoBusRig, TwoLaunchersRig, V3Rig
 from .virtual_cases import FOREIGN

@@ -21,7 +21,7 @@ from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
 from .rigs import BothArmsRig
 from .stall_clock import StallClock
-from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, WORN_COG, WORN_MASS
+from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, WORN_COG, WORN_MASS, ZERO_G
 
 MINUTE = 60.0  # s
 STALL = READING.reply_timeout  # s
@@ -73,7 +73,13 @@ class SoakRig(BothArmsRig):
         return [resident(self.process(node).pid) for node in NODES]
 
 
-CARRIED = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75.0, "robot.mass": list(ROBOT.mass), **RATED}
+CARRIED: dict[str, Any] = {
+    "mode": "zero_g",
+    "support": 1.0,
+    "wearer.body_mass": 75.0,
+    "robot.mass": list(ROBOT.mass),
+    **RATED,
+}
 BACK: Steps = [{"move": list(SoakRig.pose), "over": over} for over in (1.5, 60.0)]  # where the wearer carries their arm
 # As the virtual wearer's 25 Nm permit while the motors do not carry them.
 ACTS: dict[str, Steps] = {

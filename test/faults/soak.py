@@ -37,9 +37,9 @@ from rich.console import Console
 from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.lab.bag.reader import read_bag
 
-from .actions import END_SILENCE, SILENCE, foreign_frames, in_turn, pause, send_signal, simulator
+from .actions import END_SILENCE, SILENCE, foreign_frames, pause, send_signal, simulator
 from .cases import CASES
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase, in_turn
 from .live_arm import MINUTE, NODES, STALL, LiveArm, SoakRig
 from .runner import Result, RigPool
 from .stall_clock import StallClock

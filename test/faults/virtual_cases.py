@@ -528,7 +528,7 @@ V3_BOARDS = (
 SUPPLY = (
     FaultCase("enabled, and the supply cut for 4 s while checking", in_turn(CUT, pause(4.0), RELEASE, pause(OBSERVED)),
         SHORT_ENABLE, stage="checking", outcomes=OFF, afterwards=expired),
-    FaultCase("supply cut, the arm laid in the lap, then clear and enable", stop_in_the_lap, WORN,
+    FaultCase("supply cut, the arm laid in the lap, then clear and enable", stop_in_the_lap, PAPER,
         unpowered=ALL_JOINTS, steps_from=0.1, check=stays_off),
     supply_case("supply cut for 2 s", CUT, pause(2.0)),
     supply_case("supply cut for 30 s, cleared meanwhile", CUT, pause(15.0), clear, pause(15.0)),

@@ -290,6 +290,38 @@ def test_under_a_clock_that_stands_still_efforts_grow_old_and_those_of_a_late_ti
     assert (tuple(found.effort), found.answered, found.damped, found.held) == (effort, 100.0, False, bool(held))
 
 
+def shift(message: JointState) -> None:
+    message.header.stamp.sec -= 3600
+
+
+@pytest.mark.parametrize(
+    ("spoil", "word", "tripped"),
+    [
+        (lambda message: message.effort.pop(), "invalid", ["command_impossible"]),
+        (lambda message: message.name.__setitem__(3, "left_knee"), "invalid", ["command_impossible"]),
+        (lambda message: message.velocity.append(0.5), "invalid", ["command_impossible"]),
+        (shift, "unknown_stamp", []),
+    ],
+    ids=["three efforts", "a wrong name", "a velocity", "a stamp an hour old"],
+)
+def test_efforts_that_are_malformed_let_the_arm_down_and_those_of_another_stamp_are_not_taken(
+    node, spoil, word, tripped
+):
+    """What the arm does then: rows `effort NaN` and `compensator frozen` of the fault matrix."""
+    trips: list[FaultCode] = []
+
+    def answer(state: JointState) -> JointState:
+        message = JointState(name=list(state.name), effort=[0.0, 1.0, 2.0, 3.0])
+        message.header.stamp.sec, message.header.stamp.nanosec = state.header.stamp.sec, state.header.stamp.nanosec
+        spoil(message)
+        return message
+
+    loop = SimpleNamespace(trip=lambda code, reason: trips.append(code))
+    exchange = EffortExchange(node, Limits(NAMES), lambda: loop, answer)
+    exchange.take(100.0, [JointSample(0.0, 0.0, 0.0, 40, 0, 100.0)] * 4)
+    assert (exchange.refusal.word, trips, exchange.newest.effort) == (word, tripped, None)
+
+
 # Who operates an arm
 
 
