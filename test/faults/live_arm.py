@@ -21,7 +21,7 @@ from ..support.launched_nodes import CALM, LaunchedNodes, Parameters
 from .actions import Steps, compensator, wearer
 from .rigs import BothArmsRig
 from .stall_clock import StallClock
-from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, WORN_COG, WORN_MASS, ZERO_G
+from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, WORN_COG, WORN_MASS
 
 MINUTE = 60.0  # s
 STALL = READING.reply_timeout  # s

@@ -190,7 +190,6 @@ class LauncherProcess(LaunchedNodes):
                 str(self.path),
                 "--only",
                 *self.names,
-                *["--one-process"] * self.one_process,
             ],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
