@@ -48,11 +48,6 @@ def test_pitch_and_roll_are_recovered_from_gravity():
     assert pitch_roll((1.0, 0.0, 0.0))[0] == pytest.approx(math.pi / 2)
 
 
-def test_the_right_arms_direction_is_the_left_arms_at_the_opposite_roll():
-    for pitch, roll in random_tilts():
-        assert Tilt.of("right", pitch, roll).direction == Tilt.of("left", pitch, -roll).direction
-
-
 def test_the_axis_angle_is_the_angle_between_the_trunks_vertical_and_gravity():
     for pitch, roll in random_tilts():
         expected = math.acos(np.clip(rotation(pitch, roll).as_matrix()[2, 2], -1, 1))
@@ -341,10 +336,6 @@ def test_a_restart_keeps_the_bias():
     for _ in range(30):
         orientation.advance(0.01, (0.02, 0.0, 0.0), (0.02, 0.0, 0.0), (0.0, 0.0, G))
     assert orientation.bias[0] == pytest.approx(0.02, abs=2e-3)
-
-
-G = 9.80665
-STILL = (0.0, 0.0, 0.0)
 
 
 def following(force, spin, until=1.0, period=0.01):

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from datetime import date
 from pathlib import Path
 
@@ -151,32 +150,22 @@ def test_a_code_names_the_folder_of_the_subject_and_the_day_and_without_one_ther
     assert Session(code).folder(date(2026, 3, 14)) == (f"{code}/2026-03-14" if code else "")
 
 
-@pytest.mark.parametrize("code", ["Anna Meier", "../P01", "a/b", ".", "-P01", "Jörg", "P01\n", "A" * 33, "P.1", "CON:"])
-def test_characters_that_do_not_belong_in_the_name_of_a_folder_are_refused(code):
-    with pytest.raises(ParameterError, match=r"subject = .*: must be a code"):
-        Session(code)
+NO_CODES = ("Anna Meier", "../P01", "a/b", ".", "-P01", "Jörg", "P01\n", "A" * 33, "P.1", "CON:")
+# An emoji that a field's maxlength has cut; and a string of C, which ends at its 0.
+NO_TEXTS = ({"note": "x" * 1001}, {"note": "calm \ud83d"}, {"protocol": "a\0"}, {"protocol": 1}, {"subject": None})
 
 
-HALF = ({"note": "calm \ud83d"}, {"protocol": "a\0"})  # an emoji cut by a field's maxlength; a C string ends there
-
-
-@pytest.mark.parametrize("wrong", [{"note": "x" * 1001}, {"protocol": 1}, {"subject": None}, *HALF])
-def test_a_text_that_is_too_long_or_no_whole_text_is_refused(wrong):
-    with pytest.raises(ParameterError, match=next(iter(wrong))):
+@pytest.mark.parametrize("wrong", [*({"subject": code} for code in NO_CODES), *NO_TEXTS])
+def test_what_is_no_code_for_a_folder_and_no_whole_text_of_this_length_is_refused_by_name(wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(ParameterError, match="subject = .*: must be a code" if value in NO_CODES else name):
         Session(**wrong)
 
 
-def square(item: int) -> int:
-    """Return the square of most numbers."""
-    if item == 3:
-        os._exit(1)
-    if item == 4:
-        raise RuntimeError("not this one")
-    return item * item
-
-
 def test_every_item_has_one_outcome_also_when_a_process_dies():
-    outcomes = sorted(in_processes(square, range(8), workers=2), key=lambda outcome: outcome.item)
-    failed = {3: ENDED, 4: "RuntimeError: not this one"}
-    squares = [Outcome(item, item * item) for item in range(8)]
-    assert outcomes == [Outcome(one.item, None, failed[one.item]) if one.item in failed else one for one in squares]
+    values = {f"{number} * {number}": number * number for number in range(6)}
+    failed = {"__import__('os')._exit(1)": ENDED, "1 / 0": "ZeroDivisionError: division by zero"}
+    found = in_processes(eval, [*values, *failed], workers=2)
+    expected = [Outcome(item, value) for item, value in values.items()]
+    expected += [Outcome(item, None, failure) for item, failure in failed.items()]
+    assert sorted(found, key=lambda one: one.item) == sorted(expected, key=lambda one: one.item)

@@ -242,7 +242,7 @@ def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_p
     process = start(tmp_path / "bag", env=dict(os.environ, EXO_GRAVITY_SUPERVISED="1"))
     arm.wait_until(arm.is_recorded)
     k, now = 0, time.monotonic()
-    death, end = now + 0.5, now + 2.5
+    death, end = now + 0.3, now + 1.3
     while (now := time.monotonic()) < end:  # the bridge lets the arm down
         arm.publish(k := k + 1)
         if now > death:

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
@@ -22,7 +23,6 @@ from exo_gravity.sim.urdf import UrdfConfig
 from ..support.calibration_device import off_axis_of
 from ..support.chains import random_chain
 from ..support.simulated_device import make_device
-from ..support.trunk import orientation
 
 RAISED = (0.3, 0.8, 0.7, 0.6)  # rad
 
@@ -142,7 +142,7 @@ def on_trunk():
     def torque(state, theta, velocity, acceleration):
         data.qpos[:] = 0, 0, 0, state.pitch, state.roll, *theta
         data.qvel[:] = 0, 0, 0, state.pitch_rate, state.roll_rate, *velocity
-        moving = orientation(state) @ state.acceleration
+        moving = Rotation.from_euler("xyz", (state.roll, state.pitch, 0.0)).apply(state.acceleration)
         data.qacc[:] = *moving, state.pitch_acceleration, state.roll_acceleration, *acceleration
         mujoco.mj_inverse(model, data)
         return data.qfrc_inverse[5:].copy()

@@ -7,14 +7,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import ImuConfig, SimulatedImu
 from exo_gravity.sim.imu import measured_tilt
 from exo_gravity.sim.script import Step
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
-
-from ..support.trunk import orientation
 
 START = (0.1, -0.06)
 MOTIONS = {
@@ -29,6 +28,11 @@ QUIET = {f"{sensor}_{error}": 0.0 for sensor in ("gyroscope", "accelerometer") f
 EXACT = {**QUIET, "gyroscope_bias": 0.0, "accelerometer_bias": 0.0, "delay": 0.0}
 # Turned by 120 degrees about (1, 1, 1): the IMU's x, y, z point along the trunk's y, z, x.
 MOUNTED = (0.5, 0.5, 0.5, 0.5)
+
+
+def orientation(state: TrunkState) -> np.ndarray:
+    """Return the rotation (3, 3), world from trunk: a roll, and then a pitch, about fixed axes."""
+    return Rotation.from_euler("xyz", (state.roll, state.pitch, 0.0)).as_matrix()
 
 
 @pytest.mark.parametrize("name", MOTIONS)
