@@ -1,7 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of every form, also cut short, damaged or others': what can be read is read, the rest is named.
 
-rosbags is the independent writer and decoder. What was recorded is known, so is the verdict: the arm held.
+rosbags is the independent writer and decoder. What was recorded is known, so is the verdict: the arm held. At the end
+messages decoded in bulk, events, parameters, and time series as a table of pandas.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import os
 import random
 import shutil
 import sqlite3
+import sys
 import tracemalloc
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -21,15 +23,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from exo_gravity.core.errors import DataError
+from exo_gravity.lab.bag.content import NodeStatus
+from exo_gravity.lab.bag.layout import Batch, Decoder
 from exo_gravity.lab.bag.pairing import PAIRING
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.report.trial_report import analyse
 from exo_gravity.lab.trial.recording import in_blocks
+from exo_gravity.lab.trial.session import Session
 
 from ...support import synthetic_bags as made
 
@@ -574,7 +582,7 @@ class Named:
     is_commanded: bool = True
 
 
-def given(topic: str, text: str, words: str, **more: object) -> Named:
+def with_text(topic: str, text: str, words: str, **more: object) -> Named:
     return Named((topic, words), [made.text_entry(topic, 5.0, text)], **more)
 
 
@@ -602,11 +610,11 @@ GRIPPER = [
 LEFT_OUT = "damaged messages left out: 1"
 NAMED = {
     **{
-        text: given(STEPS, text, "", is_problem=True)
+        text: with_text(STEPS, text, "", is_problem=True)
         for text in ("no JSON", "[1]", "{}", '{"action": "hold", "duration": null}', "[" * 100_000)
     },
-    "nested too deep": given(SESSION, "[" * 100_000, "invalid", is_problem=True),
-    "gibberish alone": replace(given(STEPS, "gibberish", "", is_problem=True), content=without(STEPS)),
+    "nested too deep": with_text(SESSION, "[" * 100_000, "invalid", is_problem=True),
+    "gibberish alone": replace(with_text(STEPS, "gibberish", "", is_problem=True), content=without(STEPS)),
     "nan": not_finite(np.nan),
     "inf": not_finite(np.inf),
     "commands of others": Named(
@@ -621,11 +629,11 @@ NAMED = {
         ("/left/joint_states: not reported",),
         [("/left/joint_states", *entry[1:]) for entry in CONTENT if entry[0] == STATES],
     ),
-    "law": given(PARAMETERS, "/right/compensator:\n  ros__parameters: {law: a: b}\n", LEFT_OUT),
-    "no mapping": given(PARAMETERS, "/right/compensator:\n  ros__parameters: 1\n", LEFT_OUT),
-    "no parameters": given(PARAMETERS, "/right/compensator", LEFT_OUT),
+    "law": with_text(PARAMETERS, "/right/compensator:\n  ros__parameters: {law: a: b}\n", LEFT_OUT),
+    "no mapping": with_text(PARAMETERS, "/right/compensator:\n  ros__parameters: 1\n", LEFT_OUT),
+    "no parameters": with_text(PARAMETERS, "/right/compensator", LEFT_OUT),
     **{
-        values: given(PARAMETERS, f"/right/{node}: {{ros__parameters: {values}}}", LEFT_OUT)
+        values: with_text(PARAMETERS, f"/right/{node}: {{ros__parameters: {values}}}", LEFT_OUT)
         for node, values in (
             ("compensator", "{support: lots}"),
             ("can_bridge", "{can.interface: socketcan, can.channel: {a: 1}}"),
@@ -662,3 +670,201 @@ def test_a_single_impossible_angle_is_left_out(tmp_path):
     found = read(tmp_path, poses(lambda k, pose: pose * (99.0 if k == 300 else 1.0)))
     assert len(found.recordings[0].time) == len(TRIAL.time) - 1
     assert "right: joint states left out, a position is beyond ±2 pi: 1" in found.notes
+
+
+# Messages decoded in bulk
+
+TYPES = made.STORE.types
+
+BASES = {
+    "float64": st.floats(width=64),
+    "int32": st.integers(-(2**31), 2**31 - 1),
+    "uint32": st.integers(0, 2**32 - 1),
+    "string": st.text("abcü_1/", max_size=9),
+}
+KINDS = (made.JOINT_STATE, "sensor_msgs/msg/Imu", "geometry_msgs/msg/Vector3Stamped", "std_msgs/msg/Float64")
+
+
+def filled(draw, node, detail):
+    """A value at random of a type, as rosbags describes it."""
+    if node is Nodetype.NAME:
+        return TYPES[detail](*(filled(draw, *field) for _, field in made.STORE.fielddefs[detail][1]))
+    if node is Nodetype.BASE:
+        return draw(BASES[detail[0]])
+    (_, (base, _)), count = detail
+    values = draw(st.lists(BASES[base], min_size=count, max_size=count or 6))
+    return values if base == "string" else np.array(values)
+
+
+def batch_of(messages):
+    length = np.array([len(message) for message in messages])
+    data = np.frombuffer(b"".join(messages), np.uint8)
+    return Batch(data, np.cumsum(length) - length, length, np.arange(len(messages)))
+
+
+def member(message, path):
+    for name in path.split("."):
+        message = getattr(message, name)
+    return message
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(deadline=None, max_examples=30)
+@given(st.data())
+def test_numbers_and_texts_are_those_that_rosbags_decodes(kind, data):
+    written = [filled(data.draw, Nodetype.NAME, kind) for _ in range(data.draw(st.integers(1, 4)))]
+    messages = [
+        bytes(made.STORE.serialize_cdr(message, kind, little_endian=data.draw(st.booleans())))
+        for message in written
+        for _ in range(data.draw(st.integers(1, 3)))
+    ]
+    order = data.draw(st.permutations(messages))
+    decoder, seen = Decoder(kind), []
+    for index, layout, values in decoder.decode(batch_of(order)):
+        seen += index.tolist()
+        for at, row in zip(index.tolist(), values, strict=True):
+            expected = made.STORE.deserialize_cdr(order[at], kind)
+            for path in layout.numbers.names or ():
+                found, true = np.asarray(row[path]), np.asarray(member(expected, path))
+                assert found.astype(true.dtype).tobytes() == true.tobytes()
+            for path, texts in layout.texts.items():
+                true = member(expected, path)
+                assert list(texts) == ([true] if isinstance(true, str) else true)
+    assert sorted(seen) == list(range(len(order))) and not decoder.damaged
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=40), st.integers(0, 100))
+def test_a_damaged_message_is_left_out_and_counted(noise, at):
+    whole = [made.joint_state(k, ("a",), [float(k)]) for k in range(3)]
+    damaged = (whole[0][: at % len(whole[0])] + noise)[: len(whole[0]) - 1]
+    decoder, found = Decoder(made.JOINT_STATE), {}
+    for index, _, values in decoder.decode(batch_of([whole[0], damaged, *whole[1:]])):
+        found |= {
+            at: values["position"][row, 0] for row, at in enumerate(index) if "position" in (values.dtype.names or ())
+        }
+    assert [found[at] for at in (0, 2, 3)] == [0.0, 1.0, 2.0]
+    assert decoder.damaged <= 1
+
+
+# Events and parameters
+
+
+@pytest.fixture(scope="module")
+def content():
+    return list(made.messages(made.trial(made.POSES, hold=2.0, rate=200.0)))
+
+
+def read_of(content, folder, *more, until=np.inf):
+    kept = [item for item in (*content, *more) if item[2] < made.START + until * 1e9]
+    return read_bag(made.write_bag(folder / "bag", kept))
+
+
+def states(*names, first=0.1, period=0.5):
+    """The bridge's state, every half second from 0.1 s on; None for no report."""
+    return [made.status(first + number * period, name, state=name) for number, name in enumerate(names) if name]
+
+
+def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tmp_path):
+    names = ["checking", "ramping in", "active", "active", "letting down", "fault", "checking", "active", "active"]
+    (arm,) = read_of(content, tmp_path, *states(*names, first=0.0, period=0.1)).recordings
+    arrival = 0.0002  # s, of the first joint state, at which time begins
+    np.testing.assert_allclose(arm.carried, [(0.1 - arrival, 0.3 - arrival), (0.7 - arrival, 0.8 - arrival)], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "notes"),
+    [
+        (["active"] * 20, 1),
+        (["active"] * 6 + ["letting down"] * 3, 1),
+        *((["active"] * 4 + [last] * 5, 0) for last in ("disabled", "fault", None)),
+    ],
+)
+def test_a_recording_that_ends_before_the_arm_is_down_says_so(content, tmp_path, names, notes):
+    found = read_of(content, tmp_path, *states(*names), until=4.35)
+    assert len(found.notes) == notes and all(note.startswith("right: the recording ends") for note in found.notes)
+    if len(names) == 20:
+        (arm,) = found.recordings
+        assert arm.carried == ((pytest.approx(0.0998), arm.time[-1]),)
+
+
+def parameter_event(seconds, name, number):
+    types, kind = made.STORE.types, "rcl_interfaces/msg/ParameterEvent"
+    value = types["rcl_interfaces/msg/ParameterValue"](
+        3, False, 0, number, "", np.zeros(0, np.uint8), np.zeros(0, bool), np.zeros(0, np.int64), np.zeros(0), []
+    )
+    changed = types["rcl_interfaces/msg/Parameter"](name, value)
+    data = made.serialised(kind, made.header().stamp, "/right/compensator", [], [changed], [])
+    return "/parameter_events", kind, made.START + round(seconds * 1e9), data
+
+
+def test_faults_changed_parameters_and_parameters_at_the_start_are_read(content, tmp_path):
+    snapshot = "/right/compensator:\n  ros__parameters: {law: exact}\n"
+    keys = {"fault": "motor_silent", "fault text": "elbow: no reply for 0.05 s"}
+    silent = [made.status(seconds, "motor 2 is silent", level=2, **keys) for seconds in (3.0, 3.5)]
+    found = read_of(
+        content, tmp_path, made.text_entry("/recorder/parameters", 1.0, snapshot), made.status(2.0, "fine"), *silent,
+        made.status(4.0, "fine"), parameter_event(5.0, "support", 0.5),
+    )  # fmt: skip
+    assert [(round(event.time, 3), event.text) for event in found.events] == [
+        (3.0, "right/can_bridge: motor 2 is silent"),
+        (4.0, "right/can_bridge: OK, fine"),
+        (5.0, "/right/compensator: support = 0.5"),
+    ]
+    assert found.events[-1].setting == ("/right/compensator", "support", 0.5)
+    statuses = [event.status for event in found.events[:2]]
+    assert statuses == [
+        NodeStatus("right/can_bridge", 2, "motor 2 is silent", *keys.values()),
+        NodeStatus("right/can_bridge", 0, "fine", "none", ""),
+    ]
+    assert found.parameters == {"/right/compensator": snapshot}
+
+
+# The time series as columns and as a table
+
+
+@pytest.fixture(scope="module")
+def bag():
+    right = made.trial(made.POSES, hold=1.0, rate=50.0)
+    middle = float(right.time[len(right.time) // 2])
+    right = replace(right, carried=((0.5, middle),), command=np.full_like(right.command, np.nan))
+    left = replace(right, name="left", carried=None, position=right.position + 0.25, steps=())
+    return replace(made.bag_of(right), recordings=(right, left), session=Session(subject="P07"))
+
+
+def test_each_sample_of_each_joint_of_each_arm_is_a_row_with_its_step_and_whether_the_arm_was_carried(bag):
+    columns = bag.columns()
+    right, left = bag.recordings
+    assert {len(column) for column in columns.values()} == {8 * len(right.time)}
+    rows = list(zip(*columns.values(), strict=True))
+    assert set(columns["subject"]) == {"P07"}
+    seen = {row[1:4]: dict(zip(columns, row, strict=True)) for row in rows}
+    assert len(seen) == len(rows)
+    for recording in (right, left):
+        for sample in range(0, len(recording.time), 7):
+            for joint, name in enumerate(recording.joint_names):
+                row = seen[recording.name, name, recording.time[sample]]
+                assert row["position_rad"] == recording.position[sample, joint]
+                assert row["velocity_rad_per_s"] == recording.velocity[sample, joint]
+                assert row["torque_nm"] == recording.effort[sample, joint]
+                assert np.isnan(row["command_nm"])
+                steps = enumerate(recording.steps, 1)
+                inside = [(n, one.action) for n, one in steps if one.start <= row["time_s"] < one.end]
+                assert (row["step"], row["action"]) == (inside[0] if inside else (0, ""))
+                first, last = recording.carried[0] if recording.carried else (0.0, np.inf)
+                assert row["carried"] == (first <= row["time_s"] <= last)
+
+
+def test_the_frame_has_the_same_columns(bag):
+    frame, columns = bag.to_frame(), bag.columns()
+    assert list(frame) == list(columns)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(frame[name].to_numpy(), column)
+    wide = frame[frame.arm == "left"].pivot(index="time_s", columns="joint", values="position_rad")
+    np.testing.assert_array_equal(wide[list(bag.recordings[1].joint_names)], bag.recordings[1].position)
+
+
+def test_without_pandas_one_sentence_says_what_to_install(bag, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ModuleNotFoundError, match=r"^to_frame needs pandas.*pip install 'pandas'"):
+        bag.to_frame()
