@@ -65,7 +65,7 @@ def weigh(mass: float, *after: dict[str, Any]) -> tuple[Weighing, str, np.ndarra
     device = make_device(config=ArmConfig(wearer_mass=SETTINGS.wearer_mass, wearer_cog=SETTINGS.wearer_cog))
     device.arm.carry(mass)
     device.arm.reset((0.0, 0.05, 0.05, 0.05))
-    steps = [{"move": list(POSE), "over": MOVE}, *(after or ({"hold": 12.0},))]
+    steps = [{"move": list(POSE), "over": MOVE}, *(after or ({"hold": 20.0},))]
     limits = Limits(JOINTS, max_effort=SETTINGS.max_effort, sign_check_torque=0.0)
     compensator = Balance(SETTINGS, at=HELD)
     trial = OfflineTrial(
