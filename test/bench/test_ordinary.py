@@ -14,7 +14,7 @@ from bench.ordinary.rows import EQUIPMENT, Row
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 
-from ..sim.test_ak_motor import SPEC, TORQUE_CODE, command, reply_to
+from ..sim.test_motors import SPEC, TORQUE_CODE, command, reply_to
 from ..support.thorough import quick
 
 pytestmark = pytest.mark.thorough
