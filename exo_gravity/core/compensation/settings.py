@@ -50,7 +50,6 @@ MODES = ("one_g", "zero_g")
 # Gain times gravity, m/s^2: twice the Earth's, rounded up. Calibrated gains are 0.8 to 1.3.
 MAX_SCALE = 20.0
 MAX_CARRIED = 10.0  # kg, robot and wearer's share: the arm of a 150 kg wearer has 8; more is probably in another unit
-LEAST_GRAVITY, LEAST_EFFORT = 1.0, 0.1  # m/s^2, Nm; with less nothing carries the arm
 LARGEST_EFFORT = 1000.0  # Nm; an industrial arm's largest joint
 
 
@@ -227,7 +226,7 @@ COMPENSATOR = (
     param_of(Settings, "support"),
     param_of(Settings, "support_adapts"),
     Param("gain", [1.0, 1.0, 1.0, 1.0], "c_n, scales the torque of joint n", (0.0, MAX_GAIN)),
-    Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (LEAST_GRAVITY, MAX_GRAVITY), "m/s^2"),
+    Param("gravity", STANDARD_GRAVITY, "g, acceleration of gravity", (1.0, MAX_GRAVITY), "m/s^2"),
     Param("robot.mass", [0.585, 0.468, 0.598, 0.203], "m_n, link masses", (0.0, MAX_MASS), "kg"),
     Param("robot.cog", [0.046, 0.113, 0.237, 0.128], "d_n, centre of gravity from joint n", (0.0, MAX_LENGTH), "m"),
     Param("robot.first_moment", [0.0] * JOINT_COUNT, "M1 to M4 along the links, by `calibrate`, for the law exact; all "
@@ -248,7 +247,7 @@ COMPENSATOR = (
           (0.0, MAX_PAYLOAD), "kg"),
     Param("payload.cog", [0.0] * 3, "its centre of gravity from the end of link 4, along x_4, y_4, z_4",
           (-MAX_REACH, MAX_REACH), "m", vector=True),
-    replace(param_of(Settings, "max_effort"), bounds=(LEAST_EFFORT, MAX_EFFORT)),
+    replace(param_of(Settings, "max_effort"), bounds=(0.1, MAX_EFFORT)),
     param_of(Settings, "max_effort_rate"),
     param_of(Settings, "inertial"),
     param_of(Settings, "shoulder_from_imu"),

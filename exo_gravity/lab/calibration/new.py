@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
@@ -26,11 +27,9 @@ from exo_gravity.lab.inputs.ros_yaml import scalar
 
 LARGEST_ANGLE = 3.1  # rad, of a joint without limits
 POSES = 2000  # at random, for gravity's largest torque
-STARTS, STEPS, ALONG = 12, 2000, 50  # poses from which the arm is let fall, steps of a fall, points of a way
-FALL = 0.5  # rad and step under gravity's largest torque
-SAME, STOPPED = 1e-6, 0.02  # Nm, differences of energy, and torques at rest, that count as none
+STARTS = 12  # poses from which the arm is let fall
+LITTLE = 0.02  # Nm of a joint at rest, and J, that count as none
 INSIDE = 0.1  # rad by which the limits are inside the URDF's: a start moves each joint a little
-COULOMB, VISCOUS = 0.1, 0.02  # Nm and Nm s/rad, friction of a simulated joint
 SIMULATED_BUS = "interface: udp_multicast, channel: 239.74.163.9, options: {port: 43119, hop_limit: 0"
 DAMIAO_TIMEOUT = 0.3  # s
 MEASURE = "MEASURE"
@@ -114,23 +113,25 @@ def hanging(arm: UrdfArm, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     Of several such poses the lowest one; a joint that gravity does not turn is as near to 0 as it can be.
     """
     count, down = len(low), Tilt.of("left").direction
-    theta = np.random.default_rng(0).uniform(low, high, (STARTS, count))
+    shares = np.linspace(0.01, 0.99, 50)[:, None]  # of the way from 0
 
     def torques(poses: np.ndarray) -> np.ndarray:
         return np.asarray(arm.torques(poses, np.tile(down, (len(poses), 1))))
 
     def energy(pose: np.ndarray) -> float:
         """Return the work of gravity's torque in J on the way from 0."""
-        return float(np.sum(torques(np.outer((np.arange(ALONG) + 0.5) / ALONG, pose)) @ pose) / ALONG)
+        return float(np.mean(torques(shares * pose) @ pose))
 
-    step = FALL / max(SAME, np.abs(torques(theta)).max())
-    for _ in range(STEPS):
-        theta = np.clip(theta - step * torques(theta), low, high)
-    best = min(theta, key=energy)
+    def fall(start: np.ndarray) -> np.ndarray:
+        bounds = list(zip(low, high, strict=True))
+        return np.asarray(minimize(energy, start, jac=lambda pose: torques(pose[None])[0], bounds=bounds).x)
+
+    starts = np.random.default_rng(0).uniform(low, high, (STARTS, count))
+    best = min(map(fall, starts), key=energy)
     for joint in range(count):
         simpler = best.copy()
         simpler[joint] = np.clip(0.0, low[joint], high[joint])
-        if energy(simpler) < energy(best) + SAME:
+        if abs(energy(simpler) - energy(best)) < 1e-3 * LITTLE:
             best = simpler
     return best
 
@@ -139,7 +140,7 @@ def on_stops(arm: UrdfArm, names: Sequence[str], home: np.ndarray) -> list[str]:
     """Return how the arm hangs, or which joints rest on their stops, in a sentence."""
     angles = ", ".join(f"{name} {math.degrees(angle) + 0.0:.0f}" for name, angle in zip(names, home, strict=True))
     torque = np.abs(arm.torque(home.tolist(), Tilt.of("left")))
-    stopped = [name for name, one in zip(names, torque, strict=True) if one > STOPPED]
+    stopped = [name for name, one in zip(names, torque, strict=True) if one > LITTLE]
     if stopped:
         return [
             f"the arm cannot hang within its limits: {', '.join(stopped)} would rest on a stop, and no start begins "
@@ -211,7 +212,7 @@ def _file(
     direction: {_row([1] * count)}
     zero: {_row([0.0] * count)}
     motor_timeout: {_row(timeouts)}
-    friction: {{coulomb: {_row([COULOMB] * count)}, viscous: {_row([VISCOUS] * count)}}}  # Nm, Nm s/rad
+    friction: {{coulomb: {_row([0.1] * count)}, viscous: {_row([0.02] * count)}}}  # Nm, Nm s/rad
 """
     listed = _row(names)
     return f"""# Written by `calibrate new` from {" ".join(new.urdf.split())}.
