@@ -9,8 +9,7 @@ With --attach it starts the recorder alone, for arms that are carried already: t
 It then prints one JSON object per line: {"folder": PATH}; ten times a second while it records {"step": -1.., "left": s}
 after the script {"phase": "reporting"}; last {"problem": TEXT}, '' for none.
 
-Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: wrong use or wrong file. 3: the simulated
-device could not run in real time because this computer was too busy.
+Exit code 0: the arm held. 1: it did not hold, or the trial did not finish. 2: wrong use or wrong file.
 """
 
 import argparse
@@ -41,7 +40,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     """Run and report a trial; return the exit code. Raises ExoGravityError."""
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import trial_report
-    from exo_gravity.lab.trial.run import ADVICE, BUSY_CODE, Trial, check_bridges, is_guided, run_trial
+    from exo_gravity.lab.trial.run import Trial, check_bridges, is_guided, run_trial
 
     path, script = read_script(options.name)
     session, now = Session(options.subject, options.protocol, options.note, version()), datetime.now()
@@ -80,8 +79,6 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
             video.write(bag, clip, console)
     log = "" if options.offline else ", log"
     console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
-    if end.busy:
-        trouble, code = f"this computer was too busy: {end.busy}. {ADVICE}", BUSY_CODE
     if trouble:
         console.print(f"trial: {trouble}", markup=False, soft_wrap=True)
     tell(problem=trouble)

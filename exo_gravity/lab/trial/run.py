@@ -19,7 +19,7 @@ from rich.console import Console
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.core.safety.drive import FaultCode, State
+from exo_gravity.core.safety.drive import State
 from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.node_checks import check_nodes, check_start
 from exo_gravity.lab.inputs.parameter_file import load, stages
@@ -34,19 +34,7 @@ START_TIME = 1.0  # s for a panel to start the virtual wearer, once the recorder
 START_TIMEOUT = 60.0  # s until the arm must be carried
 GRACE = 0.5  # s recorded after the last step
 RECORDER_TIMEOUT = 10.0  # s without a line from the recorder
-BUSY_CODE = 3
-ADVICE = "Close other programs and try again. The arm has no fault."
 LONG_GAP = 50.0  # ms; a simulated device loses time after such a stall
-# Faults that a busy computer can cause; '' stands for a trial that ended early without a fault. A connected simulated
-# motor always replies and the compensator always answers: if they are late, the computer is, also without a long gap.
-POSSIBLE = {
-    "": "",
-    FaultCode.MOTOR_SILENT.value: "the replies of the simulated motors came too late",
-    FaultCode.COMMAND_STALE.value: "the efforts came too late",
-    FaultCode.COMMAND_WITHDRAWN.value: "",
-    FaultCode.SIGN_UNPROVEN.value: "",
-    FaultCode.TORQUE_NOT_DELIVERED.value: "",
-}
 
 Status = Mapping[str, Mapping[str, Any]]  # of each node on /diagnostics, as in the recorder's live lines
 
@@ -104,7 +92,6 @@ class TrialEnd:
 
     trouble: str = ""  #: why it ended before the script, or ''
     code: int = 0  #: the exit code for that
-    busy: str = ""  #: what was late because this computer was too busy, which is why it ended, or ''
 
 
 def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]) -> TrialEnd:
@@ -134,7 +121,6 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
         ending = threading.Event()
         nodes = pool.submit(launcher.run, ending)
         trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
-        recorder_failed = launcher.exit_code(RECORDER) is not None and launcher.dead() is None
         down_by = time.monotonic() + DESCENT_TIMEOUT
         while is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
@@ -142,9 +128,6 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
             screen.end("letting the arm down and closing the recording")
         ending.set()
         dead = nodes.result()
-    # A fault is excused on a simulated device alone that this trial has started.
-    may_be_busy = trial.params and not (stopped.is_set() or recorder_failed)
-    busy = too_busy(screen.status) if may_be_busy else ""
     if dead:
         node, code = dead
         trouble = f"{node.lstrip('/')} ended with exit code {code}: {last_errors.get(node, f'see {path}')}"
@@ -152,7 +135,7 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
     if not trouble:
         return TrialEnd()
     recorder = f": {last_errors[RECORDER]}" if RECORDER in last_errors else ""
-    return TrialEnd(f"{trouble}{recorder}", 1, busy)
+    return TrialEnd(f"{trouble}{recorder}{stall_of(screen.status)}", 1)
 
 
 def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], int | None], nodes: Future[Any]) -> str:
@@ -196,19 +179,11 @@ def refusal_of(status: Status) -> str:
     return next((f"{name}: {status[name]['message']}" for name in ended), "")
 
 
-def too_busy(status: Status) -> str:
-    """Return what was late and, if it is known, by how much; '' if the simulated device ran in time.
-
-    status: of all nodes, after a trial that ended early. A simulated fault is a reason by itself.
-    """
-    simulators = {name: values for name, values in status.items() if "longest stall (ms)" in values}
-    code, _ = fault_of(status)
-    if code not in POSSIBLE or any(values["disconnected"] == "yes" for values in simulators.values()):
-        return ""
-    for name, values in simulators.items():
-        stall, silence = float(values["longest stall (ms)"]), float(values["longest silence (ms)"])
-        if stall >= LONG_GAP:
-            return f"{name} was not run for {stall:.0f} ms"
-        if silence >= LONG_GAP:
-            return f"{name.removesuffix('simulator')}can_bridge was not run for {silence:.0f} ms"
-    return POSSIBLE[code] if simulators else ""
+def stall_of(status: Status) -> str:
+    """Return, as a clause, which simulator or bridge was not run for long while a simulated trial failed, or ''."""
+    for key, node in (("longest stall (ms)", "simulator"), ("longest silence (ms)", "can_bridge")):
+        for name, values in status.items():
+            if values.get("disconnected") == "no" and float(values[key]) >= LONG_GAP:  # a simulator's
+                who = name.replace("simulator", node)
+                return f"; {who} was not run for {values[key]} ms: this computer was too busy"
+    return ""
