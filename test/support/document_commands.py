@@ -29,7 +29,7 @@ ROS2 = {
     f'ros2 param set {RIGHT} robot.mass "[0.5, 0.4, 0.6]"': "failed: robot.mass = .* must be 4 numbers",
     f"ros2 param describe {RIGHT} max_effort": r"torque limit per joint \[Nm\]",
     f"ros2 param set {RIGHT} wearer.body_mass 75.0": SUCCESS,
-    f"ros2 param set {RIGHT} support 0.3": SUCCESS,
+    f"ros2 param set {RIGHT} support 0.01": SUCCESS,
     f"ros2 param set {RIGHT} mode zero_g": SUCCESS,
     f"ros2 param set {RIGHT} payload.mass 0.973": SUCCESS,
     f"ros2 param set {RIGHT} support_adapts true": SUCCESS,

@@ -148,8 +148,7 @@ def run(tmp_path, run_tool):
         path.write_text(yaml.safe_dump(script))
         # Saves seconds. The wearer first moves after RAMPING_IN, in which a joint that moves gives up its torque.
         params = LaunchedNodes(tmp_path, simulator={"trial_delay": 3.0, **(simulator or {})}, **changes).path
-        ended = run_tool("trial", path, "--params", params, "--output", output, *arguments)
-        return ended, next(output.iterdir())
+        return run_tool("trial", path, "--params", params, "--output", output, *arguments), next(output.iterdir())
 
     yield run
     for number, handler in handlers:
