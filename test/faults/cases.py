@@ -41,9 +41,19 @@ from .actions import (
     tilt,
     trunk_imu,
 )
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, FaultCase, in_turn
+from .fault_case import ALL_JOINTS, PROCESS_REACTION, RECOVERY, Action, FaultCase, in_turn
 from .rig import Rig
-from .rigs import BothArmsRig, HandedOverRig, LauncherRig, SevenRig, SignCheckRig, TwoBusRig, TwoLaunchersRig, V3Rig
+from .rigs import (
+    BothArmsRig,
+    ExternalClockRig,
+    HandedOverRig,
+    LauncherRig,
+    SevenRig,
+    SignCheckRig,
+    TwoBusRig,
+    TwoLaunchersRig,
+    V3Rig,
+)
 from .virtual_cases import FOREIGN
 
 STATES, EFFORTS, TILT, TRUNK_IMU = "/right/joint_states", "/right/effort_commands", "/imu/pitch_yaw", "/imu/data"
@@ -55,6 +65,11 @@ START_LIMIT = 20.0  # s for the next bridge to start and to take the bus over, o
 OBSERVED = 4.0  # s
 V3_MOTOR_2 = JointMotor(MIT_V3.ranged(MOTORS["AK80-9"]), 2, direction=-1, wire_format=MIT_V3)
 KILL_BRIDGE = send_signal("can_bridge", KILL)
+
+
+def set_clock(seconds: float) -> Action:
+    """Set the clock of bridge and compensator by `seconds`."""
+    return lambda rig: setattr(rig, "clock_offset", seconds)
 
 
 def start_in_another_session(rig: Rig) -> None:
@@ -109,6 +124,8 @@ BUS = (
         steps_from=2.1, outcomes=("foreign_command",), energy_limit=2.0),
 )
 MESSAGES = (
+    FaultCase("clock set back an hour", set_clock(-3600.0), ExternalClockRig, None, outcomes=HELD),
+    FaultCase("clock set ahead an hour", set_clock(3600.0), ExternalClockRig, None, outcomes=HELD),
     FaultCase("second publisher of joint states", publish(JointState, STATES, states_at([1.0] * 4))),
     FaultCase("second publisher of the tilt", publish(Vector3Stamped, TILT, tilt(1.0))),
     FaultCase("second publisher of the trunk's orientation", publish(Imu, TRUNK_IMU, trunk_imu(0.6, 0.8))),

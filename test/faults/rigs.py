@@ -3,9 +3,14 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
+import time
 from pathlib import Path
 from typing import Any, ClassVar
+
+from builtin_interfaces.msg import Time
+from rosgraph_msgs.msg import Clock
 
 from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
 from ..support.ros_probe import RosProbe
@@ -29,6 +34,26 @@ class TwoLaunchersRig(Rig):
         others = self._nodes(without=("compensator", "imu", "simulator"), port=port, can_bridge=bridge)
         compensator = self._nodes(without=("can_bridge", "simulator", "imu"), port=port, compensator=NO_IMU)
         return [others, compensator]
+
+
+class ExternalClockRig(Rig):
+    """Bridge and compensator use /clock, which this process publishes, `clock_offset` s off the system's clock."""
+
+    without = ("imu", "simulator")
+    bridge: ClassVar[Parameters] = {"use_sim_time": True}
+    compensator: ClassVar[Parameters] = {"use_sim_time": True, **NO_IMU}
+    simulator: ClassVar[Parameters] = {"trunk": {"pitch": 0.0, "roll": 0.0}}
+
+    def __init__(self, folder: Path, shipped_timeouts: bool = True) -> None:
+        super().__init__(folder, shipped_timeouts)
+        self.clock_offset = 0.0
+        self._publisher = self.probe.node.create_publisher(Clock, "/clock", 10)
+        self.probe.node.create_timer(0.002, self._publish_clock)
+        self.probe.executor.wake()
+
+    def _publish_clock(self) -> None:
+        fraction, seconds = math.modf(time.time() + self.clock_offset)
+        self._publisher.publish(Clock(clock=Time(sec=int(seconds), nanosec=int(fraction * 1e9))))
 
 
 class LauncherRig(Rig):

@@ -43,6 +43,18 @@ def bare_arm() -> CarriedArm:
     return arm
 
 
+def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down():
+    arm = raised_usual_arm((0.3, 0.45, 0.10, 0.4))
+    arm.run(1.0)
+    arm.forget()
+    gap(arm, 0.15)
+    arm.run(0.3)
+    assert arm.safety.state is State.ACTIVE and arm.safety.ride.rides == 1
+    assert arm.fastest < 0.02 and felt(arm) < 0.05 and arm.largest_step < 0.05
+    gap(arm, 0.25)
+    assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.COMMAND_STALE)
+
+
 def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
     arm = bare_arm()
     position = arm.device.arm.positions
