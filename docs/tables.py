@@ -8,6 +8,7 @@ A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import runpy
 from collections import defaultdict
@@ -34,6 +35,12 @@ DOCS = Path(__file__).parent
 POLICY = DOCS.parent / "config" / "sros2" / "policy.py"  # a test compares it with the running nodes
 TOPICS = DOCS / "topics.md"
 EVERY_NODES = {"/parameter_events", "/rosout"}
+STRINGS = DOCS.parent / "exo_gravity" / "panel" / "strings.json"
+#: States on the operator's card, in the order of a session.
+CARD = (
+    *("disabled", "checking", "pose", "proving signs", "ramping in", "active"),
+    *("moving", "sinking", "letting down", "fault", "silent", "unseen"),
+)
 COMMAND = "python docs/tables.py"
 OF_URDF = compensator_table({"law": "urdf", "joint_names": ["joint"], "command_interface": "joint_state"})
 OF_PAPER = [param.for_joints(1) for param in COMPENSATOR]
@@ -183,6 +190,20 @@ def topic_list() -> str:
     return "".join(items)
 
 
+def card_table(column: int) -> str:
+    """Return the table of the operator's card from the page's texts: what it says, what that means, what to do.
+
+    column: of the language in strings.json.
+    """
+    texts = defaultdict(lambda: ["", ""], json.loads(STRINGS.read_text(encoding="utf-8"))["texts"])
+    words = {word: texts[f"state.{word}"] if f"state.{word}" in texts else texts[word] for word in CARD}
+    keys = [(words[word], texts[f"sentence.{word}"], texts[f"todo.{word}"]) for word in CARD]
+    return markdown(
+        [texts[f"card.{part}"][column] for part in ("state", "why", "todo")],
+        [[cell[column] for cell in row] for row in keys],
+    )
+
+
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
@@ -195,6 +216,8 @@ def renewed(text: str) -> str:
         "faults": fault_list(),
         "motors": motor_table(),
         "topics": topic_list(),
+        "card_en": card_table(0),
+        "card_de": card_table(1),
     }
     return TABLE.sub(lambda found: f"{found[1]}\n{tables[found[2]]}\n{found[3]}", text)
 

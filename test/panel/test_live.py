@@ -135,7 +135,6 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     page.select_option("#trials", "long")
     page.click("#trial-start")
     page.wait_for_selector("#trial-step:has-text('Hands off')")
-    page.focus("#plots-head")
     page.keyboard.press("m")
     page.wait_for_selector("#message:has-text('marker')")
     page.click("#trial-stop")
@@ -147,7 +146,7 @@ def test_a_trial_that_is_stopped_ends_its_wearer_and_is_reported_with_subject_an
     assert "stopped by the operator" in report and "Subject: P01" in report
     assert any("wearer: done" in line for line in clinic.nodes.log)
     page.reload()
-    page.click("#session summary")
+    page.click("#past-head")
     page.wait_for_selector("#past tr:has-text('long')")
 
 

@@ -42,12 +42,20 @@ def chromium(gives_way: bool = False) -> Iterator[Browser]:
         browser.close()
 
 
-def open_page(browser: Browser, url: str, width: int = 1100, height: int = 900) -> Page:
-    """Open the panel in a new window, and wait until it shows an arm."""
+def unfold(page: Page) -> None:
+    """Open all that is folded, once the page shows an arm."""
+    page.wait_for_selector(".arm .badge[data-state]")
+    page.eval_on_selector_all("details", "all => all.forEach((one) => (one.open = true))")
+
+
+def open_page(browser: Browser, url: str, width: int = 1100, height: int = 900, folded: bool = False) -> Page:
+    """Open the panel in a new window, and wait until it shows an arm. folded: as its user finds it."""
     page = browser.new_context(viewport={"width": width, "height": height}).new_page()
     page.set_default_timeout(PATIENCE)
     page.goto(url)
     page.wait_for_selector(".arm .badge[data-state]")
+    if not folded:
+        unfold(page)
     return page
 
 

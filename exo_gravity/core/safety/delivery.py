@@ -92,7 +92,7 @@ class DeliveryMonitor:
             if self._evidence[i] >= DELIVERY.evidence and not fault:
                 name = self._limits.joint_names[i]
                 reason = f"{name}: {nearest:.2f} Nm commanded, {joint.effort:.2f} Nm replied"
-                fault = Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+                fault = Fault(FaultCode.TORQUE_NOT_DELIVERED, reason, name)
         return fault
 
 

@@ -143,3 +143,4 @@ class Fault(NamedTuple):
 
     code: FaultCode
     reason: str
+    joint: str = ""  #: its name; '' where no joint alone is concerned

@@ -108,7 +108,7 @@ def missing_for_a_start(
                     f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
                     "bring the joint there by hand, or correct the parameter zero"
                 )
-                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason)
+                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason, name)
     is_moving = any(abs(joint.velocity) > START_GATE.at_rest for joint in joints)
     return Reason(Wait.REST, "the arm to be at rest") if is_moving else NO_REASON
 
@@ -138,7 +138,7 @@ def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | Non
                 f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
                 "the whole arm hang, or correct rotation_trunk_from_imu, can_id, joint_names, side or the masses"
             )
-            return Fault(FaultCode.TORQUE_WHILE_HANGING, reason)
+            return Fault(FaultCode.TORQUE_WHILE_HANGING, reason, name)
     return None
 
 
@@ -243,7 +243,7 @@ class SwitchOnCheck:
                         "a V3 board ignores commands while its configuration cable is plugged in, a V1 or V2 board "
                         "while it is in servo mode (set MIT mode with the vendor's tool)"
                     )
-                    return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason)
+                    return Fault(FaultCode.TORQUE_NOT_DELIVERED, reason, name)
             self._products, self._squares = [0.0] * len(self._names), [0.0] * len(self._names)
         self._pushes = pushes
         for i, torque in enumerate(self._torque):
@@ -371,4 +371,4 @@ class SignCheck:
         self.effort[i] = limited(effort, self.effort[i], rate * self._dt)
 
     def _fault(self, i: int, reason: str, code: FaultCode = FaultCode.SIGN_UNPROVEN) -> Fault:
-        return Fault(code, f"{self._names[i]}: {reason}")
+        return Fault(code, f"{self._names[i]}: {reason}", self._names[i])

@@ -225,16 +225,16 @@ class Limits:
         faults = []
         if joint.error:
             reason = f"{name}: the motor reports error {joint.error} ({joint.trouble})"
-            faults.append(Fault(FaultCode.MOTOR_ERROR, reason))
+            faults.append(Fault(FaultCode.MOTOR_ERROR, reason, name))
         if joint.temperature is not None and joint.temperature >= HEAT.most:
             reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
-            faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason))
+            faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason, name))
         if not abs(joint.velocity) <= fastest:
             reason = f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}"
-            faults.append(Fault(FaultCode.OVER_SPEED, reason))
+            faults.append(Fault(FaultCode.OVER_SPEED, reason, name))
         if not low - READING.overshoot <= joint.position <= high + READING.overshoot:
             reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-            faults.append(Fault(FaultCode.OUTSIDE_LIMITS, reason))
+            faults.append(Fault(FaultCode.OUTSIDE_LIMITS, reason, name))
         return faults
 
 

@@ -266,7 +266,7 @@ class SafetyMachine:
         for name, power, joint in motors:
             if power.state is Power.ON and power.is_told_off:
                 why = f": {joint.trouble}" if joint.trouble else ""
-                return Fault(FaultCode.TORQUE_NOT_DELIVERED, f"{name}: its motor says that it is off{why}")
+                return Fault(FaultCode.TORQUE_NOT_DELIVERED, f"{name}: its motor says that it is off{why}", name)
         return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:

@@ -111,7 +111,11 @@ class MotionMonitor:
                 reason = f"{torque:.2f} Nm asked for, gravity explains {low:.2f} to {high:.2f} Nm"
                 if low <= torque <= high:
                     reason = f"{change:+.2f} Nm asked for in {MOTION.slow:g} s, in which the arm hardly moved"
-                fault = Fault(FaultCode.UNEXPLAINED_TORQUE, f"{self._limits.joint_names[i]}: {reason}")
+                fault = Fault(
+                    FaultCode.UNEXPLAINED_TORQUE,
+                    f"{self._limits.joint_names[i]}: {reason}",
+                    self._limits.joint_names[i],
+                )
         return passed, fault
 
     def explained(self, theta: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:

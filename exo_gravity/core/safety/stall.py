@@ -62,5 +62,5 @@ class StallWatch:
                     f"{name} fell while the loop stood still for {1000.0 * self._gap:.0f} ms: "
                     "its motor's own time-out is shorter; set it to 0.15 to 0.5 s"
                 )
-                return False, Fault(FaultCode.TORQUE_DIPPED, reason)
+                return False, Fault(FaultCode.TORQUE_DIPPED, reason, name)
         return False, None

@@ -173,7 +173,7 @@ class Readings:
         was_short = limits.reply_timeout < silence and (is_known or silence <= restart)
         if is_jump or (is_turn and was_short):
             what = f"from {last.position:.3f} to {joint.position:.3f} rad in {1000.0 * (joint.time - last.time):.0f} ms"
-            faults.append(Fault(FaultCode.POSITION_JUMP, f"{limits.joint_names[i]}: {what}"))
+            faults.append(Fault(FaultCode.POSITION_JUMP, f"{limits.joint_names[i]}: {what}", limits.joint_names[i]))
         return sorted(faults, key=lambda fault: fault.code is FaultCode.OUTSIDE_LIMITS)  # what a jump explains
 
     def _contradiction(self, i: int) -> Fault:
@@ -182,7 +182,7 @@ class Readings:
             f"{self._limits.joint_names[i]}: its angle has turned by {slip.turned:+.2f} rad, but its velocity says "
             f"{slip.turned - slip.difference:+.2f}: check velocity_range, and whether the encoder slips"
         )
-        return Fault(FaultCode.READINGS_CONTRADICT, reason)
+        return Fault(FaultCode.READINGS_CONTRADICT, reason, self._limits.joint_names[i])
 
     def _silence(self) -> Fault:
         limits = self._limits
@@ -192,4 +192,4 @@ class Readings:
         reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
         if len(buses) > 1 and (dead := buses - replying):
             reason += f"; no motor on {' and '.join(sorted(dead))} replies: the bus is lost, or the supply is cut"
-        return Fault(FaultCode.MOTOR_SILENT, reason)
+        return Fault(FaultCode.MOTOR_SILENT, reason, name)

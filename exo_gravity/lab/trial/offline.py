@@ -147,7 +147,7 @@ class OfflineTrial:
         self.safety.disable(now)
 
     def _note(self, now: float, executable: str, message: str, fault: Fault | None) -> None:
-        code, reason = fault or (NONE, "")
+        code, reason, _ = fault or (NONE, "", "")
         status = NodeStatus(node_of(self.arm.name, executable).lstrip("/"), NOT_OK, message, str(code), reason)
         self.events.append(Event(now, f"{status.node}: {message}", status=status))
 

@@ -303,6 +303,7 @@ class BridgeReport:
             "source": self._source,
             "motors": safety.motors,
             "fault": fault.code if fault else NONE,
+            "fault joint": (fault and fault.joint) or NONE,
             "fault text": fault.reason if fault else "",
             **self._start(safety, samples),
             "resume": resume.word,

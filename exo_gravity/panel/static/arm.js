@@ -12,7 +12,8 @@ const CARRIED = ["proving signs", "ramping in", "active"];
 const STILL = 0.08; // rad/s; slower joints rest
 const MEAN = 3; // states over which speed and power are averaged: a velocity is noisy
 const RESTED = 1000; // ms at rest after which an arm no longer moves
-const OFF = ["inactive", "disabled", "checking", "fault"]; // the motors are off
+const DOWN = ["inactive", "disabled", "fault"];
+const OFF = [...DOWN, "checking"]; // the motors are off
 
 export class ArmCard {
   constructor(name, actions) {
@@ -21,6 +22,8 @@ export class ArmCard {
     this.setup = null;
     this.source = "unknown";
     this.limit = null; // the largest support 0..1 within the motors' rated torque
+    this.limited = {}; // the settings for which that was found: new ones have none for up to a second
+    this.isDown = false; // whether to let it down would change nothing
     this.adapts = ""; // what the support that adapts does
     this.weighed = null; // kg
     this.root = document.getElementById("arm").content.cloneNode(true).firstElementChild;
@@ -176,7 +179,10 @@ export class ArmCard {
     this.showAction(told, name, operates);
     const compensator = alive ? state.compensator : null;
     const wearer = alive ? state.wearer : null;
-    this.limit = finite(wearer?.["largest support"]);
+    const limit = finite(wearer?.["largest support"]);
+    if (limit !== this.limit) this.limited = this.setup?.settings ?? {};
+    this.limit = limit;
+    this.isDown = name === "letting down" || (DOWN.includes(name) && (bridge.motors ?? "off") === "off");
     this.adapts = this.adaptsText(wearer);
     showShare(this, wearer, name === "active");
     showLoad(this, compensator, wearer, operates, name === "active");
@@ -284,8 +290,8 @@ export class ArmCard {
 
   // The support for a wearer's new data: 0 for the first ones; never more than rated torque allows a heavier arm.
   supportFor(mass, sex, lengths) {
-    const now = this.setup?.settings ?? {};
-    if (!now["wearer.body_mass"] || this.limit === null) return 0;
+    const now = this.limited;
+    if (!this.setup?.settings?.["wearer.body_mass"] || !now["wearer.body_mass"] || this.limit === null) return 0;
     const shares = lengths.map((length, n) => (length ? now["wearer.segment_length"][n] / length : 1));
     const share = Math.min(1, ...shares) * (sex === now["wearer.sex"] ? 1 : 0.84); // a man's forearm is the heavier one
     const limit = (this.limit * share * now["wearer.body_mass"]) / mass;

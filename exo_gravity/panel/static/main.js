@@ -139,8 +139,8 @@ const actions = {
 };
 
 const sections = new Sections(actions, cards);
-const plots = new Plots(byId("plots"));
-const picture = new Picture(byId("picture"), byId("views"));
+const plots = new Plots(byId("plots"), byId("figures"));
+const picture = new Picture(byId("picture"));
 
 // What arrives
 
@@ -193,9 +193,12 @@ function showBar() {
     chips.children[n].toggleAttribute("data-moves", card.moves);
     write(chips.children[n], card.summary());
   });
-  const off = link.alive && cards.size > 0 && [...cards.values()].every((card) => ["disabled", "inactive"].includes(card.state));
-  byId("let-down").toggleAttribute("data-off", off);
-  write(byId("let-down-hint"), t(off ? "let_down_off" : "let_down_hint"));
+  // Red while it can do something; pressed, it always asks the arms.
+  const all = [...cards.values()];
+  const isVain = link.alive && all.length > 0 && all.every((card) => card.isDown);
+  byId("let-down").toggleAttribute("data-off", isVain);
+  const goes = all.some((card) => card.state === "letting down") ? "let_down_runs" : "let_down_off";
+  write(byId("let-down-hint"), t(isVain ? goes : "let_down_hint"));
   const { on, foreign, seconds } = state.recording;
   byId("light").hidden = !(link.alive && (on || foreign));
   const clock = `${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}`;

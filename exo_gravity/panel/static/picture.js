@@ -5,24 +5,20 @@
 
 import { colour } from "./colours.js";
 import { Painter } from "./painter.js";
-import { t } from "./texts.js";
+import { t, write } from "./texts.js";
 
-const VIEWS = { oblique: [1.5, -0.9, 0.35], front: [1.85, 0, 0], side: [0, -1.85, 0] };
+const VIEWS = { front: [1.75, 0, 0], right: [0, -1.75, 0], left: [0, 1.75, 0], oblique: [1.45, -0.9, 0.35] };
+const NARROWEST = 150; // px of a view; as many are drawn side by side as the picture is wide for
 const CENTRE = [0, 0, -0.27];
 const GHOST = [0.04, 0.31, 0.62, 0.3]; // red, green, blue, opacity
 
 export class Picture {
-  constructor(place, views) {
+  constructor(place) {
     this.place = place;
-    this.view = "oblique";
+    this.views = ["front"];
+    this.turn = 0; // which of them was drawn last
     this.painter = new Painter(() => this.draw());
     this.description = "";
-    for (const button of views.querySelectorAll("button"))
-      button.addEventListener("click", () => {
-        this.view = button.dataset.view;
-        for (const other of views.querySelectorAll("button")) other.setAttribute("aria-pressed", String(other === button));
-        this.look();
-      });
   }
 
   async configure(urdf) {
@@ -45,25 +41,19 @@ export class Picture {
 
   start() {
     const T = this.three;
-    this.renderer = new T.WebGLRenderer({ antialias: true });
+    this.renderer = new T.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
     const canvas = this.renderer.domElement;
     canvas.setAttribute("role", "img");
     canvas.setAttribute("aria-label", t("picture_of"));
-    this.place.replaceChildren(canvas);
+    this.names = document.createElement("div"); // of the views
+    this.place.replaceChildren(canvas, this.names);
+    this.renderer.setScissorTest(true);
     this.camera = new T.PerspectiveCamera(40, 1, 0.05, 20);
     this.camera.up.set(0, 0, 1);
     this.scene = new T.Scene();
     this.scene.add(new T.HemisphereLight("#ffffff", "#8a94a0", 2.5));
-    this.gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.75, 0), 0.35, 0, 0.09, 0.05);
+    this.gravity = new T.ArrowHelper(new T.Vector3(0, 0, -1), new T.Vector3(0, 0.45, 0), 0.35, 0, 0.09, 0.05);
     this.scene.add(this.gravity);
-    this.look();
-  }
-
-  look() {
-    if (!this.renderer) return;
-    this.camera.position.set(...VIEWS[this.view].map((value, n) => value + CENTRE[n]));
-    this.camera.lookAt(...CENTRE);
-    this.render();
   }
 
   // robot: the root element of the URDF
@@ -103,7 +93,7 @@ export class Picture {
     if (!marked) return { child, axis, start };
     const [lower] = numbers(joint, "limit", "lower");
     const [upper] = numbers(joint, "limit", "upper");
-    const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0xa61218 }));
+    const bar = new T.Mesh(new T.CylinderGeometry(0.014, 0.014, 1, 12), new T.MeshLambertMaterial({ color: 0x8b2f77 }));
     const turn = new T.Quaternion().setFromUnitVectors(new T.Vector3(0, 1, 0), axis);
     bar.quaternion.copy(turn);
     bar.scale.y = 0.001; // until a torque is known
@@ -136,12 +126,14 @@ export class Picture {
   // target: rad, the pose to which a trial leads the arms: the ghost shows it.
   pose(arms, tilt, setups, target) {
     if (!this.renderer || !this.arms) return;
+    const sides = Object.keys(VIEWS).filter((view) => view in arms);
+    this.views = ["front", ...(sides.length ? sides : ["right"]), "oblique"];
     for (const [arm, state] of Object.entries(arms))
       (state.joints ?? []).forEach((joint, n) => {
         const part = this.arms.joints[joint.name];
         if (!part) return;
-        this.turn(part, joint.position);
-        if (target) this.turn(this.ghost.joints[joint.name], target[n]);
+        this.rotate(part, joint.position);
+        if (target) this.rotate(this.ghost.joints[joint.name], target[n]);
         const share = (joint.effort ?? 0) / (setups[arm]?.max_effort?.[n] || 1);
         part.bar.scale.y = Math.max(0.001, 0.25 * Math.abs(share));
         part.bar.position.copy(part.axis).multiplyScalar(0.125 * share);
@@ -152,7 +144,7 @@ export class Picture {
     this.render();
   }
 
-  turn(part, angle) {
+  rotate(part, angle) {
     part.child.quaternion.copy(part.start).multiply(new this.three.Quaternion().setFromAxisAngle(part.axis, angle));
   }
 
@@ -163,14 +155,20 @@ export class Picture {
   draw() {
     const { clientWidth: width, clientHeight: height } = this.place;
     if (!width || !height) return;
-    if (this.width !== width || this.height !== height) {
-      [this.width, this.height] = [width, height];
-      this.renderer.setSize(width, height, false);
-      this.camera.aspect = width / height;
-      this.camera.updateProjectionMatrix();
-    }
+    if (this.width !== width || this.height !== height) this.renderer.setSize(width, height, false);
+    [this.width, this.height] = [width, height];
+    const views = this.views.slice(0, Math.max(1, Math.floor(width / NARROWEST)));
+    const share = width / views.length;
+    this.camera.aspect = share / height;
+    this.camera.updateProjectionMatrix();
     this.scene.background = new this.three.Color(colour("--ground"));
     this.gravity.setColor(colour("--accent"));
+    while (this.names.children.length > views.length) this.names.lastElementChild.remove();
+    views.forEach((view, n) => write(this.names.children[n] ?? this.names.appendChild(document.createElement("span")), t(`view.${view}`)));
+    this.turn = (this.turn + 1) % views.length; // one of them at a time: it blocks the page for shorter
+    for (const area of ["setViewport", "setScissor"]) this.renderer[area](this.turn * share, 0, share, height);
+    this.camera.position.set(...VIEWS[views[this.turn]].map((value, axis) => value + CENTRE[axis]));
+    this.camera.lookAt(...CENTRE);
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures
   }

@@ -9,7 +9,7 @@ import { headText, jointText } from "./telling.js";
 import { degrees, finite, t, write } from "./texts.js";
 
 const LENGTH = 300; // states, ten a second
-const HEIGHT = 160; // px
+const BESIDE = ["angle", "torque"]; // the kinds beside the state; the others are folded
 const AGES = [30, 20, 10, 0]; // s, which the time axis names
 const COLOURS = ["--curve-1", "--curve-2", "--curve-3", "--curve-4"]; // of panel.css
 const DASHES = [[], [8, 4], [2, 3], [10, 3, 2, 3]]; // so that colour is not all
@@ -24,8 +24,10 @@ const colourOf = (n) => COLOURS[n % COLOURS.length];
 const dashOf = (n) => (n + Math.floor(n / COLOURS.length)) % DASHES.length;
 
 export class Plots {
-  constructor(place) {
+  // place: of the plots beside the state, with their legend before it. more: of the others.
+  constructor(place, more) {
     this.place = place;
+    this.more = more;
     this.note = document.getElementById("plots-blank");
     this.arms = new Map(); // name -> {figures}
     this.limits = {};
@@ -34,7 +36,7 @@ export class Plots {
       for (const entry of entries) entry.target.dataset.visible = entry.isIntersecting ? "yes" : "";
     });
     this.observer = new ResizeObserver(() => this.resize());
-    this.observer.observe(place);
+    for (const each of [place, more]) this.observer.observe(each);
   }
 
   configure(setups) {
@@ -72,6 +74,7 @@ export class Plots {
     const rates = (arm) => [finite(arm.bridge?.["rate (Hz)"]), finite(arm.bridge?.["age of efforts (ms)"])];
     figures.push(this.figure(name, "rate", "Hz, ms", ["rate", "age"], rates));
     this.arms.set(name, { figures });
+    this.translate();
   }
 
   // values: returns the newest number of each curve from an arm's state, null where there is none.
@@ -81,53 +84,69 @@ export class Plots {
     const canvas = document.createElement("div");
     const blank = Object.assign(document.createElement("p"), { className: "blank" });
     element.append(caption, canvas, blank);
-    this.place.append(element);
+    (BESIDE.includes(kind) ? this.place : this.more).append(element);
     this.visible.observe(element);
     const axis = { stroke: () => colour("--ink"), grid: { stroke: () => colour("--grid") }, ticks: { stroke: () => colour("--grid") } };
     const options = {
-      width: widthOf(element),
-      height: HEIGHT,
+      ...sizeOf(canvas),
       legend: { show: false },
       cursor: { show: false },
-      scales: { x: { time: false } },
+      scales: { x: { time: false }, y: { range: (plot, low, high) => rangeOf(low, high, kind === "torque" ? this.limits[arm] : []) } },
       axes: [
-        { ...axis, size: 30, splits: agesOf, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
+        { ...axis, size: 26, splits: agesOf, values: (plot, splits) => splits.map((s) => `${Math.round(s - plot.scales.x.max)} s`) },
         { ...axis, size: 50 },
       ],
       series: [{}, ...names.map((_, n) => ({ stroke: () => colour(colourOf(n)), dash: DASHES[dashOf(n)], width: 2 }))],
       hooks: { draw: [(plot) => kind === "torque" && drawLimits(plot, this.limits[arm] ?? [])] },
     };
     const data = [[], ...names.map(() => [])];
-    const figure = { arm, kind, unit, names, values, element, caption, blank, plot: new uPlot(options, data, canvas), data };
-    showTitle(figure);
-    return figure;
+    return { arm, kind, unit, names, values, element, caption, canvas, blank, plot: new uPlot(options, data, canvas), data };
   }
 
   translate() {
-    for (const { figures } of this.arms.values()) for (const figure of figures) showTitle(figure);
+    const known = new Set(); // arms with the same joints have one legend
+    const legend = document.getElementById("legend");
+    legend.replaceChildren();
+    for (const { figures } of this.arms.values())
+      for (const figure of figures) {
+        const head = document.createElement("div");
+        const isBeside = BESIDE.includes(figure.kind);
+        write(head, titleOf(figure));
+        figure.caption.replaceChildren(head, ...(isBeside ? [] : curvesOf(figure)));
+        if (isBeside) legend.append(...curvesOf(figure).filter(({ textContent: text }) => !known.has(text) && known.add(text)));
+      }
   }
 
   resize() {
     for (const { figures } of this.arms.values())
-      for (const { plot, element } of figures) {
-        const width = widthOf(element);
-        if (plot.width !== width) plot.setSize({ width, height: HEIGHT }); // the first one was made while it had the row alone
+      for (const { plot, canvas } of figures) {
+        const size = sizeOf(canvas);
+        if (plot.width !== size.width || plot.height !== size.height) plot.setSize(size);
       }
   }
 }
 
-const widthOf = (element) => Math.max(200, element.clientWidth);
+const sizeOf = ({ clientWidth, clientHeight }) => ({ width: Math.max(200, clientWidth), height: Math.max(80, clientHeight) });
 
-// What the figure shows, and each curve's name behind its mark, both in its colour.
-function showTitle({ arm, kind, unit, names, caption }) {
+// The ends of the vertical axis: every limit is in sight. low, high: of the curves, null without one.
+function rangeOf(low, high, limits = []) {
+  const most = 1.1 * Math.max(0, ...limits);
+  if (most) return [Math.min(low, -most), Math.max(high, most)];
+  return low === null ? [low, high] : uPlot.rangeNum(low, high, 0.1, true);
+}
+
+function titleOf({ arm, kind, unit }) {
+  return `${headText(arm)}: ${kind === "rate" ? `${t("rate")}, ${t("age")}` : `${t(kind)} (${unit})`}`;
+}
+
+// Each curve's name behind its mark, both in its colour.
+function curvesOf({ arm, kind, names }) {
   const words = kind === "rate" ? [`${t("rate")} (Hz)`, `${t("age")} (ms)`] : names.map((name) => jointText(arm, name));
-  const head = kind === "rate" ? `${t("rate")}, ${t("age")}` : `${t(kind)} (${unit})`;
-  const curves = words.map((word, n) => {
+  return words.map((word, n) => {
     const mark = Object.assign(document.createElement("span"), { textContent: `${MARKS[dashOf(n)]} ${word}`, className: "curve" });
     mark.style.color = `var(${colourOf(n)})`;
     return mark;
   });
-  caption.replaceChildren(Object.assign(document.createElement("div"), { textContent: `${headText(arm)}: ${head}` }), ...curves);
 }
 
 function push({ data }, now, values) {
@@ -157,6 +176,7 @@ function drawLimits(plot, limits) {
       if (!(y >= bbox.top && y <= bbox.top + bbox.height)) continue;
       ctx.strokeStyle = colour(colourOf(n));
       ctx.lineWidth = 1;
+      ctx.setLineDash([]);
       ctx.beginPath();
       ctx.moveTo(bbox.left, y);
       ctx.lineTo(bbox.left + bbox.width, y);

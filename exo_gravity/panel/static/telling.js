@@ -43,14 +43,13 @@ export function tell(arm, name, state, moving, isSimulated, last) {
   if (name === "silent" || name === "unseen") {
     const time = last?.time.toLocaleTimeString(document.documentElement.lang);
     const known = last ? t("last_report", time, has(`state.${last.name}`) ? t(`state.${last.name}`) : last.name) : "";
-    return { why: join([t(`sentence.${name}`), known]), todo: t(isSimulated ? "do.simulation_gone" : `do.${name}`), action };
+    return { why: join([t(`sentence.${name}`), known]), todo: t(isSimulated ? "do.simulation_gone" : `todo.${name}`), action };
   }
-  const fault = faultOf(bridge, state, isSimulated);
+  const fault = faultOf(arm, state, isSimulated);
   const unreached = bridge.motors === "unreached";
-  const first = unreached ? [t("unreached")] : [];
   const usual = usually(arm, name, state, moving);
-  const why = [...first, ...(fault?.why ?? []), usual.why];
-  const todo = [...(unreached ? [t("do.unreached")] : []), ...(fault?.todo ?? []), fault ? then(name, bridge) : usual.todo];
+  const why = [unreached ? t("unreached") : "", ...(fault?.why ?? [usual.why])];
+  const todo = unreached ? [t("do.unreached")] : fault ? [...fault.todo, then(name, bridge)] : [usual.todo];
   return { why: join(why), todo: join(todo), action, engineer: ENGINEER.includes(bridge.fault) };
 }
 
@@ -59,6 +58,7 @@ const join = (texts) => texts.filter(Boolean).join(" ");
 function actionOf(name, bridge) {
   if (name === "disabled" || name === "inactive") return "enable";
   if (name === "fault") return bridge.resume === "possible" ? "resume" : "clear";
+  if (name === "letting down") return "";
   return poseAsked(bridge) ? "look" : "down";
 }
 
@@ -77,8 +77,7 @@ function usually(arm, name, state, moving) {
   const [refusal] = list(bridge.refusal);
   if (name === "disabled" && refusal) return { why: waitText(arm, refusal, bridge, true), todo: t("then.enable") };
   const [wait] = list(bridge["waiting for"]);
-  if (!wait || wait === "pose")
-    return name === "inactive" ? { why: t("sentence.inactive"), todo: t("todo.disabled") } : texts(name);
+  if (!wait || wait === "pose") return texts(name === "inactive" ? "disabled" : name);
   const reason = wait === "efforts" ? reasonText(compensator) : "";
   return { why: join([waitText(arm, wait, bridge, false), reason]), todo: "" };
 }
@@ -104,7 +103,8 @@ function reasonText(compensator) {
 }
 
 // What a fault is and what to do about it, each a list of sentences; null without one.
-function faultOf(bridge, state, isSimulated) {
+function faultOf(arm, state, isSimulated) {
+  const { bridge } = state;
   const [code] = list(bridge.fault);
   if (!code) return null;
   const found = [];
@@ -112,11 +112,13 @@ function faultOf(bridge, state, isSimulated) {
   if (stall) found.push(stall);
   if (!stall || code !== "motor_silent") { // no cable is simulated
     const key = has(`fault.${code}`) ? code : "unknown";
-    found.push({ why: t(`fault.${key}`), todo: t(`do.${key}`) });
+    const [joint] = list(bridge["fault joint"]);
+    const why = t(`fault.${key}`);
+    found.push({ why: joint ? t("fault.at", jointText(arm, joint), why) : why, todo: t(`do.${key}`) });
   }
   if (code === "command_withdrawn" && reasonText(state.compensator)) found.push({ why: reasonText(state.compensator) });
-  if (state.cause && CAUSED.includes(code)) found.push({ why: causeText(state.cause), todo: t("do.cause") });
-  return { why: found.map((one) => one.why), todo: found.map((one) => one.todo) };
+  const cause = state.cause && CAUSED.includes(code) ? causeText(state.cause) : "";
+  return { why: [...found.map((one) => one.why), cause], todo: cause ? [t("do.cause")] : found.map((one) => one.todo) };
 }
 
 // The change of load that came shortly before a fault.
