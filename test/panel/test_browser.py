@@ -399,9 +399,9 @@ def test_an_arm_that_moves_is_not_called_carried_and_a_plot_without_a_curve_says
     stage.arms.reports.clear()
     stage.arms.silent = set()
     wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
-    wait_until(page, lambda: page.locator("#plots figure").count() == 8)
+    wait_until(page, lambda: page.locator(".plots figure").count() == 8)
     widths = "figures => figures.map(figure => [figure.clientWidth, figure.querySelector('.u-wrap').clientWidth])"
-    wait_until(page, lambda: all(a == b for a, b in page.eval_on_selector_all("#plots figure", widths)))
+    wait_until(page, lambda: all(a == b for a, b in page.eval_on_selector_all(".plots figure", widths)))
 
 
 def test_the_page_says_which_arm_is_simulated_as_the_devices_say(page, stage):
