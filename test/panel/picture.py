@@ -38,12 +38,14 @@ def main() -> None:
 
 def _shoot(browser: Browser, stage: Stage, name: str, width: int, height: int) -> None:
     """Write the picture of the page, once it shows both arms and has drawn them."""
-    page = open_page(browser, stage.url, width, height)
+    page = open_page(browser, stage.url, width, height, folded=True)
     wait_for_state(page, stage.arms.states["left"], "left")
     page.wait_for_selector("[data-arm=right] .mark:not([hidden])", state="attached")
+    page.wait_for_timeout(8000)
     if page.is_visible("#take"):  # the page before this one held control, and is gone
         page.click("#take")
-    page.wait_for_timeout(8000)
+        page.wait_for_selector("#release:visible")
+        page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=DOCS / f"{name}.png")
     page.context.close()
 

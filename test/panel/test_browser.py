@@ -581,7 +581,7 @@ def test_at_1280_by_800_a_training_is_on_one_screen_and_on_a_phone_the_remedy_co
     boxes = [page.locator(part).bounding_box() for part in needed]
     assert max(box["y"] + box["height"] for box in boxes) <= page.locator("footer").bounding_box()["y"]
     assert boxes[-3]["width"] >= 600  # the picture: three views side by side
-    assert page.locator("#picture span").count() == 3
+    wait_until(page, lambda: page.locator("#picture span").count() == 3)
     page.set_viewport_size({"width": 390, "height": 844})
     remedy, control = (page.locator(part).bounding_box() for part in (of_arm(".remedy"), "#control"))
     assert remedy["y"] + remedy["height"] < min(control["y"], 400)

@@ -9,6 +9,7 @@ import { t, write } from "./texts.js";
 
 const VIEWS = { front: [1.75, 0, 0], right: [0, -1.75, 0], left: [0, 1.75, 0], oblique: [1.45, -0.9, 0.35] };
 const NARROWEST = 150; // px of a view; as many are drawn side by side as the picture is wide for
+const WHOLE = 0.95; // width by height from which on a view is wide enough
 const CENTRE = [0, 0, -0.27];
 const GHOST = [0.04, 0.31, 0.62, 0.3]; // red, green, blue, opacity
 
@@ -167,7 +168,8 @@ export class Picture {
     views.forEach((view, n) => write(this.names.children[n] ?? this.names.appendChild(document.createElement("span")), t(`view.${view}`)));
     this.turn = (this.turn + 1) % views.length; // one of them at a time: it blocks the page for shorter
     for (const area of ["setViewport", "setScissor"]) this.renderer[area](this.turn * share, 0, share, height);
-    this.camera.position.set(...VIEWS[views[this.turn]].map((value, axis) => value + CENTRE[axis]));
+    const far = Math.max(1, WHOLE / this.camera.aspect); // a narrow view shows the whole arm, too
+    this.camera.position.set(...VIEWS[views[this.turn]].map((value, axis) => far * value + CENTRE[axis]));
     this.camera.lookAt(...CENTRE);
     this.renderer.render(this.scene, this.camera);
     this.renderer.getContext().finish(); // else a slow computer queues pictures

@@ -126,7 +126,7 @@ export class Plots {
   }
 }
 
-const sizeOf = ({ clientWidth, clientHeight }) => ({ width: Math.max(200, clientWidth), height: Math.max(80, clientHeight) });
+const sizeOf = ({ clientWidth, clientHeight }) => ({ width: Math.max(100, clientWidth), height: Math.max(80, clientHeight) });
 
 // The ends of the vertical axis: every limit is in sight. low, high: of the curves, null without one.
 function rangeOf(low, high, limits = []) {
