@@ -17,7 +17,7 @@ def random_chain(count: int, seed: int, zero: Sequence[float] = ()) -> tuple[str
 
     zero: rad, where the angles of the same arm without `zero` are 0 here; () where they are 0 there.
     """
-    random = np.random.default_rng(seed)
+    random, most = np.random.default_rng(seed), 0.2 if count < 9 else 0.15  # m: no arm reaches farther than 2
     names = [f"joint_{n}" for n in range(count)]
     parts, parent, last = ['<link name="base"/>'], "base", np.zeros(3)
     for name, angle in zip(names, zero or [0.0] * count, strict=True):
@@ -28,7 +28,7 @@ def random_chain(count: int, seed: int, zero: Sequence[float] = ()) -> tuple[str
                 break
         last, child = axis, f"link_of_{name}"
         middle = f"{child}_mount"
-        place, rpy = random.uniform(-0.2, 0.2, 3), random.uniform(-3, 3, 3)
+        place, rpy = random.uniform(-most, most, 3), random.uniform(-3, 3, 3)
         parts += [
             joint(f"{name}_mount", "fixed", parent, middle, random.uniform(-0.05, 0.05, 3), random.uniform(-3, 3, 3)),
             f'<link name="{middle}">{inertial(random, 0.1)}</link>',
