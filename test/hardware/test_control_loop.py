@@ -52,7 +52,7 @@ def test_an_arm_is_let_down_after_its_computer_was_suspended():
     assert arm.safety.state is State.ACTIVE
     arm.clock.slept += 3600.0
     arm.run(2 * CYCLE)
-    assert arm.safety.fault == ("motor_silent", "the computer was suspended for 3601 s")
+    assert arm.safety.fault[:2] == ("motor_silent", "the computer was suspended for 3601 s")
     arm.assert_let_down()
 
 
@@ -116,7 +116,7 @@ def test_an_arm_whose_owner_stands_still_is_let_down(monkeypatch):
         arm.run(0.9)
         assert arm.safety.state is State.ACTIVE
     arm.run(0.2)
-    assert arm.safety.fault == ("internal_error", "no service and no timer of the node has run for 1 s")
+    assert arm.safety.fault[:2] == ("internal_error", "no service and no timer of the node has run for 1 s")
     arm.assert_let_down()
 
 

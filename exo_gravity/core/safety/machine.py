@@ -169,16 +169,17 @@ class SafetyMachine:
         """Clear the fault and enable, on the operator's request only. Return False, and do nothing, if refused."""
         return not self.why_not_resumed and self.clear(now) and self.enable(now)
 
-    def trip(self, code: FaultCode, reason: str, now: float) -> None:
+    def trip(self, code: FaultCode, reason: str, now: float, joint: str = "") -> None:
         """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays.
 
+        joint: its name, '' where no joint alone is concerned.
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
         if code.needs_recheck:
             self._readings.doubt()
         if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
             return
-        self.fault = self.fault or Fault(code, reason)
+        self.fault = self.fault or Fault(code, reason, joint)
         self._on(StateEvent.FAULT, now)
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
@@ -454,7 +455,7 @@ class SafetyMachine:
 
     def _trip(self, fault: Fault | None) -> None:
         if fault:
-            self.trip(*fault, self._now)
+            self.trip(fault.code, fault.reason, self._now, fault.joint)
 
     def _change_power(self, change: PowerChange) -> None:
         for power in self.power:
