@@ -40,7 +40,8 @@ WITHOUT_OTHERS = ("can_bridge", "simulator", "imu")
 
 def is_down(truth: Truth, since: float) -> bool:
     """Return whether the motors are off, and no joint was fast since that time."""
-    return truth.motors_are_off() and float(np.abs(truth.since(since)["velocity"]).max()) < 1.0
+    wait_until(truth.motors_are_off)  # the truth is written after the state is told
+    return float(np.abs(truth.since(since)["velocity"]).max()) < 1.0
 
 
 @pytest.mark.real_time
