@@ -290,11 +290,11 @@ class UrdfArm(UrdfShape):
         moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. The function has
         data of its own; use it on one thread at a time.
         """
-        model, data = self._model.copy(), self._model.createData()
+        rows_at = self._rows_at(self.base)
 
         def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
-            model.gravity.linear = self.gravity * tilt.magnitude * np.array(tilt.gravity_in_trunk)
-            rows = self._rows_at(model, data, self._moves.configuration(theta), self.base)
+            gravity = self.gravity * tilt.magnitude * np.array(tilt.gravity_in_trunk)
+            rows = rows_at(self._moves.configuration(theta), gravity)
             return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
 
         return torque
@@ -325,22 +325,29 @@ class UrdfArm(UrdfShape):
 
     def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
-        model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
-        rows = np.empty((len(theta), len(self.names), len(base)))
-        for row, down, at in zip(
-            rows, np.broadcast_to(gravity, (len(theta), 3)), self._moves.configurations(theta), strict=True
-        ):
-            model.gravity.linear = down
-            row[:] = self._rows_at(model, data, at, base)
+        rows_at, rows = self._rows_at(base), np.empty((len(theta), len(self.names), len(base)))
+        downs = np.broadcast_to(gravity, (len(theta), 3))
+        for row, down, at in zip(rows, downs, self._moves.configurations(theta), strict=True):
+            row[:] = rows_at(at, down)
         return rows
 
-    def _rows_at(self, model: Any, data: Any, at: np.ndarray, base: Base) -> np.ndarray:
-        """Return the same (n, k) for one configuration, under the gravity of Pinocchio's `model`."""
-        model.gravity.angular, still = np.zeros(3), np.zeros(model.nv)
-        rows = self._pin.computeJointTorqueRegressor(model, data, at, still, still)
-        parts = self._moves.folded(rows.reshape(model.nv, -1)).reshape(len(self.names), -1, INERTIAL)[..., MOMENT]
+    def _rows_at(self, base: Base) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """Return a function that returns the same (n, k) for one configuration and gravity (3,) in m/s^2.
+
+        Its model is its own: another thread may use the arm.
+        """
+        model, data = self._model.copy(), self._model.createData()
+        model.gravity.angular, still, shape = np.zeros(3), np.zeros(model.nv), (len(self.names), -1, INERTIAL)
         links, ways = zip(*base, strict=True)
-        return np.einsum("nka,ka->nk", parts[:, np.take(self._joints, links) - 1], np.array(ways))
+        columns, along = np.take(self._joints, links) - 1, np.array(ways)
+
+        def rows_at(at: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+            model.gravity.linear = gravity
+            rows = self._pin.computeJointTorqueRegressor(model, data, at, still, still).reshape(model.nv, -1)
+            parts = self._moves.folded(rows).reshape(shape)[..., MOMENT]
+            return np.einsum("nka,ka->nk", parts[:, columns], along)
+
+        return rows_at
 
     def _sampled(self, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Return poses (m, n) in rad at random, each with a vector of gravity (m, 3) in m/s^2."""
