@@ -57,7 +57,7 @@ def guard(
     inhibit: called often with whether the computer must not be suspended.
     """
     arm: ArmOnBus | None = None
-    clock = notes.clock
+    clock, patience = notes.clock, Limits.frozen_timeout
     why, silence = "has died", Silence(clock.monotonic(), 2 * POLL)
     with contextlib.suppress(EOFError, ConnectionError, ProcessLookupError):  # of `kill`: it has died meanwhile
         while True:
@@ -67,7 +67,7 @@ def guard(
                     kill()
                     why = f"handed the arm over and has been killed ({message})"
                     break
-                arm = message
+                arm, patience = message, message.limits.frozen_timeout
                 with contextlib.suppress(KeyError, ImportError):  # imports the bus's module ahead of time
                     importlib.import_module(can.interfaces.BACKENDS[message.address[0]][0])
             is_powered, noted, now = notes.drive.powered, notes.time, clock.monotonic()
@@ -75,7 +75,6 @@ def guard(
                 for page in notes.noted:
                     page.heartbeat = now
             inhibit(is_powered)
-            patience = (arm.limits if arm else Limits).frozen_timeout
             if silence.look(now, noted, is_powered) > patience:
                 kill()  # it sends nothing from here on, even if it takes long to die
                 why = f"was frozen for {patience * 1000:.0f} ms and has been killed"
