@@ -40,8 +40,10 @@ WITHOUT_OTHERS = ("can_bridge", "simulator", "imu")
 
 def is_down(truth: Truth, since: float) -> bool:
     """Return whether the motors are off, and no joint was fast since that time."""
-    wait_until(truth.motors_are_off)  # the truth is written after the state is told
-    return float(np.abs(truth.since(since)["velocity"]).max()) < 1.0
+    now = time.time()
+    wait_until(truth.motors_are_off)  # the log is written every 20 ms
+    records = truth.since(since)
+    return records["time"][records["on"].any(axis=1)].max() < now and float(np.abs(records["velocity"]).max()) < 1.0
 
 
 @pytest.mark.real_time
