@@ -90,9 +90,8 @@ class DeliveryMonitor:
             added = min(DELIVERY.evidence / 2, DELIVERY.excess(joint.effort, nearest) * dt)
             self._evidence[i] = max(0.0, min(DELIVERY.evidence, self._evidence[i] + added))
             if self._evidence[i] >= DELIVERY.evidence and not fault:
-                name = self._limits.joint_names[i]
-                reason = f"{name}: {nearest:.2f} Nm commanded, {joint.effort:.2f} Nm replied"
-                fault = Fault(FaultCode.TORQUE_NOT_DELIVERED, reason, name)
+                reason = f"{nearest:.2f} Nm commanded, {joint.effort:.2f} Nm replied"
+                fault = Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, self._limits.joint_names[i], reason)
         return fault
 
 

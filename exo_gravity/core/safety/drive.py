@@ -144,3 +144,8 @@ class Fault(NamedTuple):
     code: FaultCode
     reason: str
     joint: str = ""  #: its name; '' where no joint alone is concerned
+
+    @classmethod
+    def of_joint(cls, code: FaultCode, joint: str, reason: str) -> "Fault":
+        """Return the fault of one joint, whose sentence begins with its name."""
+        return cls(code, f"{joint}: {reason}", joint)

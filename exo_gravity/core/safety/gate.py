@@ -104,11 +104,12 @@ def missing_for_a_start(
         zeros = zip(limits.joint_names, joints, limits.home, limits.home_tolerance, strict=True)
         for name, joint, home, tolerance in zeros:
             if not abs(joint.position - home) <= tolerance:
-                reason = (
-                    f"{name}: {joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
-                    "bring the joint there by hand, or correct the parameter zero"
+                return Fault.of_joint(
+                    FaultCode.IMPLAUSIBLE_ZERO,
+                    name,
+                    f"{joint.position:.3f} rad at the start, must be within {tolerance:g} of {home:g}: "
+                    "bring the joint there by hand, or correct the parameter zero",
                 )
-                return Fault(FaultCode.IMPLAUSIBLE_ZERO, reason, name)
     is_moving = any(abs(joint.velocity) > START_GATE.at_rest for joint in joints)
     return Reason(Wait.REST, "the arm to be at rest") if is_moving else NO_REASON
 
@@ -134,11 +135,12 @@ def torque_while_hanging(limits: Limits, effort: Sequence[float]) -> Fault | Non
     for name, torque, permitted, addition in columns:
         most = max(HANGING_ARM.torque, HANGING_ARM.share * permitted) + addition
         if not abs(torque) <= most:
-            reason = (
-                f"{name}: {torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
-                "the whole arm hang, or correct rotation_trunk_from_imu, can_id, joint_names, side or the masses"
+            return Fault.of_joint(
+                FaultCode.TORQUE_WHILE_HANGING,
+                name,
+                f"{torque:.1f} Nm asked for on an arm that hangs, must be at most {most:g}: let "
+                "the whole arm hang, or correct rotation_trunk_from_imu, can_id, joint_names, side or the masses",
             )
-            return Fault(FaultCode.TORQUE_WHILE_HANGING, reason, name)
     return None
 
 
@@ -371,4 +373,4 @@ class SignCheck:
         self.effort[i] = limited(effort, self.effort[i], rate * self._dt)
 
     def _fault(self, i: int, reason: str, code: FaultCode = FaultCode.SIGN_UNPROVEN) -> Fault:
-        return Fault(code, f"{self._names[i]}: {reason}", self._names[i])
+        return Fault.of_joint(code, self._names[i], reason)

@@ -72,7 +72,7 @@ class ReadingLimits:
 
 
 WALL, HEAT, READING = SoftWall(), Derating(), ReadingLimits()
-# s, on a real bus. On a simulated one a busy computer is waited for: nobody is in that arm.
+# s, on a real bus. A simulated bus may have longer ones: nobody wears that arm, and its computer may be busy.
 LONGEST = {"command_timeout": 0.1, "frozen_timeout": 0.2}
 PERIODS = 2  # of control that must fit into each time-out, so that one late cycle is not a fault
 
@@ -220,22 +220,17 @@ class Limits:
 
     def find_faults(self, i: int, joint: JointSample) -> list[Fault]:
         """Return the faults that the reading `joint` of joint `i` shows by itself."""
-        name, fastest = self.joint_names[i], self.max_velocity[i]
-        low, high = self.position_min[i], self.position_max[i]
-        faults = []
+        low, high, fastest = self.position_min[i], self.position_max[i], self.max_velocity[i]
+        found: dict[FaultCode, str] = {}
         if joint.error:
-            reason = f"{name}: the motor reports error {joint.error} ({joint.trouble})"
-            faults.append(Fault(FaultCode.MOTOR_ERROR, reason, name))
+            found[FaultCode.MOTOR_ERROR] = f"the motor reports error {joint.error} ({joint.trouble})"
         if joint.temperature is not None and joint.temperature >= HEAT.most:
-            reason = f"{name}: {joint.temperature} degC, the limit is {HEAT.most:g}"
-            faults.append(Fault(FaultCode.OVER_TEMPERATURE, reason, name))
+            found[FaultCode.OVER_TEMPERATURE] = f"{joint.temperature} degC, the limit is {HEAT.most:g}"
         if not abs(joint.velocity) <= fastest:
-            reason = f"{name}: {joint.velocity:.2f} rad/s, the limit is {fastest:g}"
-            faults.append(Fault(FaultCode.OVER_SPEED, reason, name))
+            found[FaultCode.OVER_SPEED] = f"{joint.velocity:.2f} rad/s, the limit is {fastest:g}"
         if not low - READING.overshoot <= joint.position <= high + READING.overshoot:
-            reason = f"{name}: {joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-            faults.append(Fault(FaultCode.OUTSIDE_LIMITS, reason, name))
-        return faults
+            found[FaultCode.OUTSIDE_LIMITS] = f"{joint.position:.3f} rad, the limits are {low:g} to {high:g}"
+        return [Fault.of_joint(code, self.joint_names[i], reason) for code, reason in found.items()]
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

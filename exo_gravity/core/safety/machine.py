@@ -169,18 +169,12 @@ class SafetyMachine:
         """Clear the fault and enable, on the operator's request only. Return False, and do nothing, if refused."""
         return not self.why_not_resumed and self.clear(now) and self.enable(now)
 
-    def trip(self, code: FaultCode, reason: str, now: float, joint: str = "") -> None:
+    def trip(self, code: FaultCode, reason: str, now: float) -> None:
         """Latch a fault detected elsewhere (a broken bus, an impossible command). The first fault stays.
 
-        joint: its name, '' where no joint alone is concerned.
         While the arm is off only a foreign command is a fault: it may have switched a motor on.
         """
-        if code.needs_recheck:
-            self._readings.doubt()
-        if self.state is State.FAULT or (self.state is State.DISABLED and code is not FaultCode.FOREIGN_COMMAND):
-            return
-        self.fault = self.fault or Fault(code, reason, joint)
-        self._on(StateEvent.FAULT, now)
+        self._latch(Fault(code, reason), now)
 
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
@@ -267,7 +261,7 @@ class SafetyMachine:
         for name, power, joint in motors:
             if power.state is Power.ON and power.is_told_off:
                 why = f": {joint.trouble}" if joint.trouble else ""
-                return Fault(FaultCode.TORQUE_NOT_DELIVERED, f"{name}: its motor says that it is off{why}", name)
+                return Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, name, f"its motor says that it is off{why}")
         return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
@@ -455,7 +449,15 @@ class SafetyMachine:
 
     def _trip(self, fault: Fault | None) -> None:
         if fault:
-            self.trip(fault.code, fault.reason, self._now, fault.joint)
+            self._latch(fault, self._now)
+
+    def _latch(self, fault: Fault, now: float) -> None:
+        if fault.code.needs_recheck:
+            self._readings.doubt()
+        if self.state is State.FAULT or (self.state is State.DISABLED and fault.code is not FaultCode.FOREIGN_COMMAND):
+            return
+        self.fault = self.fault or fault
+        self._on(StateEvent.FAULT, now)
 
     def _change_power(self, change: PowerChange) -> None:
         for power in self.power:

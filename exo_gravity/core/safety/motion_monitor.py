@@ -111,11 +111,7 @@ class MotionMonitor:
                 reason = f"{torque:.2f} Nm asked for, gravity explains {low:.2f} to {high:.2f} Nm"
                 if low <= torque <= high:
                     reason = f"{change:+.2f} Nm asked for in {MOTION.slow:g} s, in which the arm hardly moved"
-                fault = Fault(
-                    FaultCode.UNEXPLAINED_TORQUE,
-                    f"{self._limits.joint_names[i]}: {reason}",
-                    self._limits.joint_names[i],
-                )
+                fault = Fault.of_joint(FaultCode.UNEXPLAINED_TORQUE, self._limits.joint_names[i], reason)
         return passed, fault
 
     def explained(self, theta: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -173,23 +173,23 @@ class Readings:
         was_short = limits.reply_timeout < silence and (is_known or silence <= restart)
         if is_jump or (is_turn and was_short):
             what = f"from {last.position:.3f} to {joint.position:.3f} rad in {1000.0 * (joint.time - last.time):.0f} ms"
-            faults.append(Fault(FaultCode.POSITION_JUMP, f"{limits.joint_names[i]}: {what}", limits.joint_names[i]))
+            faults.append(Fault.of_joint(FaultCode.POSITION_JUMP, limits.joint_names[i], what))
         return sorted(faults, key=lambda fault: fault.code is FaultCode.OUTSIDE_LIMITS)  # what a jump explains
 
     def _contradiction(self, i: int) -> Fault:
         slip = self._slips[i]
         reason = (
-            f"{self._limits.joint_names[i]}: its angle has turned by {slip.turned:+.2f} rad, but its velocity says "
+            f"its angle has turned by {slip.turned:+.2f} rad, but its velocity says "
             f"{slip.turned - slip.difference:+.2f}: check velocity_range, and whether the encoder slips"
         )
-        return Fault(FaultCode.READINGS_CONTRADICT, reason, self._limits.joint_names[i])
+        return Fault.of_joint(FaultCode.READINGS_CONTRADICT, self._limits.joint_names[i], reason)
 
     def _silence(self) -> Fault:
         limits = self._limits
         name, buses = limits.joint_names[self.silent.index(True)], set(limits.channels)
         columns = zip(limits.channels, self._missed, strict=True)
         replying = {bus for bus, missed in columns if missed < READING.missed}
-        reason = f"{name}: no reply for more than {limits.reply_timeout * 1000:.0f} ms"
+        reason = f"no reply for more than {limits.reply_timeout * 1000:.0f} ms"
         if len(buses) > 1 and (dead := buses - replying):
             reason += f"; no motor on {' and '.join(sorted(dead))} replies: the bus is lost, or the supply is cut"
-        return Fault(FaultCode.MOTOR_SILENT, reason, name)
+        return Fault.of_joint(FaultCode.MOTOR_SILENT, name, reason)
