@@ -151,7 +151,7 @@ def test_one_press_lets_both_arms_down(page, stage, means):
     assert stage.arms.calls == BOTH_DOWN and not page.is_visible("#ask")
 
 
-# The right arm's state, what its bridge reports besides, and whether Let down could do something: it is red then.
+# The right arm's state, what else its bridge reports, and whether Let down can act: then it is red.
 UNREACHED = {"right": {"motors": "unreached"}}
 RED = [
     ("disabled", {}, False),

@@ -578,7 +578,7 @@ def test_registers_are_told_and_what_is_written_counts_until_the_power_goes(benc
     assert [struct.unpack("<I", bench.ask(number)[4:])[0] for number in (7, 9, 10)] == [0x13, 4000, 1]
     assert [bench.ask_float(number) for number in (20, 21, 22, 23)] == [10.0, 12.5, 30.0, 10.0]
     assert bench.ask(99) is None
-    assert bench.motor.receive(bytes((4, 0, 0x33, 21, 0, 0, 0, 0)), 0.0, 0.0, 0.0, REGISTERS) is None  # another's
+    assert bench.motor.receive(bytes((4, 0, 0x33, 21, 0, 0, 0, 0)), 0.0, 0.0, 0.0, REGISTERS) is None  # another motor's
     bench.ask(TMAX, 0x55, struct.pack("<f", 20.0))
     bench.ask(TIMEOUT, 0x55, struct.pack("<I", 0))
     bench.state(ENTER)

@@ -173,7 +173,7 @@ def test_a_simulation_that_dies_starts_again_three_times_and_a_real_arm_never(mo
     ran: list[None] = []
     died = "/right/can_bridge", code
     monkeypatch.setattr(Launcher, "run", lambda self, _stopping: ran.append(self.stop()) or died)
-    monkeypatch.setattr(launcher, "check_start", lambda nodes: None)  # whoever holds the bus
+    monkeypatch.setattr(launcher, "check_start", lambda nodes: None)  # another process may hold the bus
     ended = run_tool("launcher", "--params", CONFIG / file)
     assert ended.code == 1 and len(ran) == runs
     assert ended.out.count("right/can_bridge ended with exit code -9: the simulation starts again") == runs - 1
