@@ -168,7 +168,8 @@ class Markers {
   }
 
   async mark(text) {
-    if (await this.send({ do: "marker", text })) say(t("marker_set", text ? markerText(text) : t("markers")));
+    this.newest = text; // answers may come in another order: what is said is of the newest
+    if ((await this.send({ do: "marker", text })) && this.newest === text) say(t("marker_set", text ? markerText(text) : t("markers")));
   }
 
   show(recording, isOff) {
