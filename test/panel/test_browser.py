@@ -18,7 +18,7 @@ from ..support.panel_stage import LEAVES, WEARER_FILE, Stage
 pytest.importorskip("playwright", reason="no browser driver: install the extra test")
 
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Page
+from playwright.sync_api import Page, Route
 
 from exo_gravity.panel import control
 
@@ -29,6 +29,8 @@ pytestmark = IN_BROWSER
 BOTH_DOWN = [("let_down", "right"), ("let_down", "left")]
 BOTH_ACTIVE = {"right": "active", "left": "active"}
 MARK = of_arm(".mark:not([hidden])")
+# What the page sent before has arrived then, and the answers that had come are shown.
+HANDLED = "fetch('/strings').then((answer) => answer.text())"
 
 
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
@@ -46,6 +48,12 @@ def confirm(page: Page, *words: str) -> None:
     page.wait_for_selector("#ask:visible")
     assert all(text in page.inner_text("#ask-text") for text in words)
     page.click("#ask-yes")
+
+
+def places(page: Page, *selectors: str) -> list[tuple[float, float]]:
+    """Return where the elements are on the page, however far it is scrolled: a click scrolls to its button."""
+    boxes, scrolled = [page.locator(each).bounding_box() for each in selectors], page.evaluate("scrollY")
+    return [(box["x"], box["y"] + scrolled) for box in boxes]
 
 
 # 1. Enable
@@ -76,7 +84,7 @@ def test_an_arm_is_enabled_after_one_question_about_the_settings_in_force(page, 
     page.click("#ask-yes")
     page.keyboard.press("Space")
     wait_until(page, lambda: stage.arms.reads > reads)
-    page.evaluate("fetch('/strings').then((answer) => answer.text())")  # what the page sends at once has arrived then
+    page.evaluate(HANDLED)
     assert stage.arms.calls == BOTH_DOWN and not page.is_visible("#ask")
     stage.arms.delay = 0.0
     enable(page)
@@ -219,12 +227,12 @@ def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_clear
     stage.arms.settings["right"].update({"mode": "zero_g", "support": 0.05})
     stage.arms.states["right"] = "active"
     page = visit()
-    buttons = [page.locator(of_arm(name)) for name in (".enable", '[data-mode="zero_g"]')]
+    buttons = of_arm(".enable"), of_arm('[data-mode="zero_g"]')
     wait_for_state(page, "active")
-    before = [button.bounding_box() for button in buttons]
+    before = places(page, *buttons)
     stage.arms.fail("right", "over_temperature")
     wait_for_state(page, "fault")
-    assert [button.bounding_box() for button in buttons] == before
+    assert places(page, *buttons) == before
     assert page.is_disabled(of_arm(".enable")) and not page.is_visible(of_arm(".resume"))
     page.click(of_arm(".clear"))
     wait_for_state(page, "disabled")
@@ -235,7 +243,7 @@ def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_clear
     stage.arms.fail("right", "over_speed")
     change = "the support was changed from 5.0 % to 65.0 %"
     wait_for_text(page, of_arm(".tell"), "A joint moved too fast", change, "Set it back")
-    assert [button.bounding_box() for button in buttons] == before
+    assert places(page, *buttons) == before
     page.reload()
     wait_for_text(page, of_arm(".tell"), change)
     stage.arms.fail("right", "command_stale")  # it leaves nothing to repair
@@ -492,9 +500,16 @@ def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_
     page.keyboard.press("m")  # nothing is recorded yet
     page.click("#record")
     page.click("#presets button:has-text('Task begins')")
+    held: list[Route] = []
+    page.route("**/action", lambda route: held.append(route) if "end" in route.request.post_data else route.continue_())
     page.keyboard.press("2")
     page.keyboard.press("m")
     wait_for_text(page, "#message", "cramp at 3")
+    with page.expect_response("**/action"):  # the answer to an earlier press comes last
+        held[0].continue_()
+    page.unroute("**/action")
+    page.evaluate(HANDLED)
+    assert "cramp at 3" in page.inner_text("#message")
     page.click('#presets button:has-text("a text of one\'s own")')
     wait_until(page, lambda: len(stage.files.calls) == 5)
     watching = visit()
@@ -505,7 +520,7 @@ def test_recording_trial_and_parameters_are_asked_for_and_markers_set_by_button_
     page.click("#trial-start")
     page.click("#save")
     wait_until(page, lambda: "save" in stage.files.calls)
-    markers = ["marker begin", "marker end", "marker cramp at 3", "marker a text of one's own", "marker "]
+    markers = ["marker begin", "marker cramp at 3", "marker end", "marker a text of one's own", "marker "]
     assert stage.files.calls == ["record", *markers, "stop_recording", "trial two_poses", "save"]
     page.keyboard.press("Space")
     wait_for_state(page, "letting down")
@@ -542,13 +557,13 @@ def test_on_every_screen_let_down_stays_in_sight_nothing_is_cut_off_and_no_state
         settings.update(mode="zero_g", support=1.0)
     page = visit(width=width, height=height)
     page.select_option("#language", language)
-    places = set()
+    seen = set()
     for state in ("disabled", "checking", "active", "letting down"):
         stage.arms.states = dict.fromkeys(BOTH_ACTIVE, state)
         for arm in BOTH_ACTIVE:
             wait_for_state(page, state, arm)
-        places.add(str([page.locator(of_arm(part)).bounding_box() for part in (".down", ".support input", ".weigh")]))
-    assert len(places) == 1
+        seen.add(tuple(places(page, *map(of_arm, (".down", ".support input", ".weigh")))))
+    assert len(seen) == 1
     stage.arms.states["right"] = "ramping in"  # the longest name of a state
     stage.arms.fail("left", "implausible_zero")
     stage.files.content["recording"] = LONG

@@ -54,9 +54,15 @@ document.addEventListener("keyup", (event) => event.code === "Space" && event.pr
 
 // What the arms' cards ask for
 
-async function send(body) {
+let sent = 0; // how many requests were sent
+
+// done: what is said once it is carried out. Answers may come in another order: only that of the newest request takes
+// away what is said, but each refusal is said.
+async function send(body, done = "") {
+  sent += 1;
+  const turn = sent;
   const problem = await request(body);
-  say(problem === null ? t("unsent") : problem ? t("refused", problem) : "");
+  if (problem !== "" || turn === sent) say(problem === null ? t("unsent") : problem ? t("refused", problem) : done);
   return problem === "";
 }
 

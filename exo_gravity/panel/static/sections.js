@@ -167,9 +167,8 @@ class Markers {
     else if (event.code === "KeyM") this.mark(this.own);
   }
 
-  async mark(text) {
-    this.newest = text; // answers may come in another order: what is said is of the newest
-    if ((await this.send({ do: "marker", text })) && this.newest === text) say(t("marker_set", text ? markerText(text) : t("markers")));
+  mark(text) {
+    this.send({ do: "marker", text }, t("marker_set", text ? markerText(text) : t("markers")));
   }
 
   show(recording, isOff) {
