@@ -45,7 +45,7 @@ ROOMS = {
         "trunk_estimator",
         "imu_sources",
         "urdf_checks",
-        "urdf_shape",
+        "urdf_model",
         "urdf_links",
         "urdf_held",
         "urdf_arm",

@@ -28,10 +28,10 @@ from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector, floats, one_float
-from exo_gravity.hardware.urdf_checks import check_masses, check_size, usable_efforts
+from exo_gravity.hardware.urdf_checks import checked, unused_efforts
 from exo_gravity.hardware.urdf_held import Bodies, Held
 from exo_gravity.hardware.urdf_links import UrdfLinks
-from exo_gravity.hardware.urdf_shape import LEAST_LENGTH, UrdfShape
+from exo_gravity.hardware.urdf_model import LEAST_LENGTH, UrdfShape
 
 PACKAGE = "package://"
 # The compensator's parameters.
@@ -115,9 +115,10 @@ class UrdfArm(UrdfShape):
         joints, supports = {*self._joints}, self._model.supports
         first = [n for n, joint in enumerate(self._joints) if not joints & {*supports[joint]} - {joint}]
         self._own_mass = float(np.sum(self.masses[first]))
-        check_size(self._moves, self._own_mass, self.length)
-        self.max_effort, unused = usable_efforts(self._moves)
-        self.notes = (*check_masses(self._moves), *unused, *self._moves.notes)
+        self.notes = checked("arm", self)
+        unused = {name for name, *_ in unused_efforts(self)}
+        efforts = zip(names, self.moves.efforts, strict=True)
+        self.max_effort = tuple(0.0 if name in unused else effort for name, effort in efforts)
         self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
 
     def __eq__(self, other: object) -> bool:
@@ -164,7 +165,7 @@ class UrdfArm(UrdfShape):
     @cached_property
     def links(self) -> UrdfLinks:
         """The inertia of links, load, wearer and rotors."""
-        return UrdfLinks(self._pin, self._by_mass, self._moves, self._rotors)
+        return UrdfLinks(self._pin, self._by_mass, self.moves, self._rotors)
 
     def worn_links(self, mass: Vector, cog: Vector) -> UrdfLinks:
         """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""
@@ -173,14 +174,14 @@ class UrdfArm(UrdfShape):
     @property
     def fixed(self) -> tuple[str, ...]:
         """The joints that are not the arm's, change its torque, and are taken to be at 0: none is reported."""
-        return self._moves.fixed
+        return self.moves.fixed
 
     def follow(self, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take the positions (m,) of all joints that are reported, by their names (m,), for all copies of this arm.
 
         Raises ParameterError if one that changes the torque is missing or not finite.
         """
-        self._moves.follow(names, positions)
+        self.moves.follow(names, positions)
 
     def torque(self, theta: Sequence[float], tilt: Tilt) -> Torque:
         """Return the torque (n,) in Nm that holds the arm at `theta` (n,) rad.
@@ -234,7 +235,7 @@ class UrdfArm(UrdfShape):
         """
         if np.array_equal(turn, self._turn):
             return self
-        arm, _ = copy.copy(self), self.base
+        _, arm = self.base, copy.copy(self)  # the copy keeps the base, which is computed before
         arm._bare = self._bare.copy()
         for joint, old, new in zip(self._joints, self._turn, turn, strict=True):
             place = arm._bare.jointPlacements[joint]
@@ -294,7 +295,7 @@ class UrdfArm(UrdfShape):
 
         def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
             gravity = self.gravity * tilt.magnitude * np.array(tilt.gravity_in_trunk)
-            rows = rows_at(self._moves.configuration(theta), gravity)
+            rows = rows_at(self.moves.configuration(theta), gravity)
             return tuple(np.einsum("jk,jk->j", rows, moments).tolist())
 
         return torque
@@ -318,16 +319,16 @@ class UrdfArm(UrdfShape):
         model, data = self._model.copy(), self._model.createData()  # its own gravity: another thread may use the arm
         model.gravity.angular = np.zeros(3)
         torques = np.empty((len(theta), model.nv))
-        for row, down, at in zip(torques, gravity, self._moves.configurations(theta), strict=True):
+        for row, down, at in zip(torques, gravity, self.moves.configurations(theta), strict=True):
             model.gravity.linear = down
             row[:] = self._pin.computeGeneralizedGravity(model, data, at)
-        return self._moves.folded(torques.T).T
+        return torques @ self.moves.own
 
     def _rows(self, theta: np.ndarray, gravity: np.ndarray, base: Base) -> np.ndarray:
         """Return the torque (m, n, k) in Nm of moments of 1 kg m at `theta` (m, n) rad. gravity: (m, 3) m/s^2."""
         rows_at, rows = self._rows_at(base), np.empty((len(theta), len(self.names), len(base)))
         downs = np.broadcast_to(gravity, (len(theta), 3))
-        for row, down, at in zip(rows, downs, self._moves.configurations(theta), strict=True):
+        for row, down, at in zip(rows, downs, self.moves.configurations(theta), strict=True):
             row[:] = rows_at(at, down)
         return rows
 
@@ -344,7 +345,7 @@ class UrdfArm(UrdfShape):
         def rows_at(at: np.ndarray, gravity: np.ndarray) -> np.ndarray:
             model.gravity.linear = gravity
             rows = self._pin.computeJointTorqueRegressor(model, data, at, still, still).reshape(model.nv, -1)
-            parts = self._moves.folded(rows).reshape(shape)[..., MOMENT]
+            parts = (self.moves.own.T @ rows).reshape(shape)[..., MOMENT]
             return np.einsum("nka,ka->nk", parts[:, columns], along)
 
         return rows_at
@@ -416,5 +417,5 @@ class UrdfArm(UrdfShape):
         """
         model = self._model
         model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
-        torque = self._pin.computeGeneralizedGravity(model, self._data, self._moves.configuration(theta))
-        return tuple((self.gain * self._moves.folded(torque)).tolist())
+        torque = self._pin.computeGeneralizedGravity(model, self._data, self.moves.configuration(theta))
+        return tuple((self.gain * (self.moves.own.T @ torque)).tolist())

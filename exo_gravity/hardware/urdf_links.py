@@ -12,7 +12,7 @@ import numpy as np
 
 from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
-from exo_gravity.hardware.urdf_checks import UrdfJoints
+from exo_gravity.hardware.urdf_model import UrdfJoints
 
 POSES = 500  # at random, for the least inertia
 
@@ -31,9 +31,9 @@ class UrdfLinks:
     def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
         self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
-        rates = (self._moves.spread(values) for values in (velocity, acceleration))
+        rates = (self._moves.own @ values for values in (velocity, acceleration))
         torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
-        return tuple((self._moves.folded(torque) + self._rotors * acceleration).tolist())
+        return tuple((self._moves.own.T @ torque + self._rotors * acceleration).tolist())
 
     def momentum(
         self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
@@ -42,15 +42,16 @@ class UrdfLinks:
 
         turning: angular velocity of the base, (3,) rad/s, whose part is neglected.
         """
-        speed, at = self._moves.spread(velocity), self._moves.configuration(theta)
+        speed, at = self._moves.own @ velocity, self._moves.configuration(theta)
         momentum = self.matrix(theta) @ np.asarray(velocity)
         coriolis = self._pin.computeCoriolisMatrix(self._model, self._data, at, speed)
-        return tuple(momentum.tolist()), tuple(self._moves.folded(coriolis.T @ speed).tolist())
+        return tuple(momentum.tolist()), tuple((self._moves.own.T @ (coriolis.T @ speed)).tolist())
 
     def matrix(self, theta: Sequence[float]) -> np.ndarray:
         """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
         upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
-        return np.asarray(self._moves.folded_matrix(upper + np.triu(upper, 1).T) + np.diag(self._rotors))
+        own = self._moves.own
+        return np.asarray(own.T @ (upper + np.triu(upper, 1).T) @ own + np.diag(self._rotors))
 
     @cached_property
     def least(self) -> tuple[float, ...]:

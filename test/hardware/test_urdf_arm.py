@@ -136,6 +136,12 @@ def test_the_exoskeletons_own_description_gives_the_torques_of_the_exact_law_bar
     (ONE_LINK.format(mass=0, kind="revolute"), "j", "0.05 to 40 kg in all"),
     (ONE_LINK.format(mass=-1, kind="revolute"), "j", "mass of the link link = -1.0: must be 0 kg or more"),
     (ONE_LINK.format(mass=" 1.2 ", kind="revolute"), "j", "it reads 0 kg"),  # as urdfdom drops the inertial
+    (ONE_LINK.format(mass=1, kind="revolute").replace('parent link="base"', 'parent link="link"'), "j",
+     "parent of link = 'link': must be a link that it does not carry in turn"),
+    (ONE_LINK.format(mass=1, kind="revolute").replace("<axis", "<mimic joint='j'/><axis"), "j", "mimic of j = 'j'"),
+    (ONE_LINK.format(mass=1, kind="revolute").replace("</robot>", "<joint name='k' type='fixed'><parent link='base'/>"
+     "<child link='link'/></joint></robot>"), "j", "joints that move link = 2: must be 1"),
+    (ONE_LINK.replace('<axis xyz="0 1 0"/>', "<axis/>").format(mass=1, kind="revolute"), "j", "axis of j = None"),
     (ONE_LINK.format(mass=1e3, kind="revolute"), "j", "0.05 to 40 kg in all"),  # g
     (ONE_LINK.format(mass=1e-3, kind="revolute"), "j", "0.05 to 40 kg in all"),  # t
     (ONE_LINK.replace('child link="link"', 'child link="x"').format(mass=1, kind="revolute"), "j", "Pinocchio reads"),
@@ -240,6 +246,12 @@ def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
             place = data.oMi[model.parents[joint]].rotation @ model.jointPlacements[joint].rotation
             assert np.allclose(own, place, rtol=0.0, atol=1e-12)
         assert np.allclose(arm.pose(one[0].tolist())[0], places[n], rtol=0.0, atol=1e-12)
+
+
+def test_an_arm_that_is_turned_keeps_the_base_of_the_urdf():
+    arm = branched()
+    turned = arm.turned(np.full((3, 3), 0.01))
+    assert turned.base is arm.base
 
 
 def test_a_missing_joint_leaves_the_others_where_they_were():
