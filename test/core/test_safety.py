@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core.arm.gravity import NO_TORQUE
@@ -446,6 +446,8 @@ EVENTS = st.one_of(*(st.tuples(st.just(name), values) for name, values in VALUES
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(EVENTS, max_size=25), st.sampled_from([0.0, 1.5]))
+@example([("enable", None), ("time", 1.125), ("disable", None)], 0.0)  # a push of 0.4 Nm ended in one cycle
+@example([("enable", None), ("time", 1.9), ("trip", None)], 1.5)
 def test_no_sequence_of_events_lets_torque_flow_without_fresh_input_or_step(events, sign_check_torque):
     arm = SafetyRun(sign_check_torque=sign_check_torque)
     for event, value in events:

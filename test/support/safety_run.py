@@ -66,7 +66,7 @@ class SafetyRun:
                     damped = self.applied[i] - self.drive.damping[i] * change.get("velocity", 0.0)
                     torque = 0.0 if i in self.off else damped
                     self.joints[i] = reading(**{"time": self.now - 0.001, "effort": torque, **change})
-            before, was_proving = list(self.applied), self.machine.state is State.PROVING
+            before = list(self.applied)
             hangs = self.effort is not None and self.machine.state is State.CHECKING
             effort = self.while_hanging if hangs else self.effort
             efforts = Efforts(effort, self.now - self.effort_age, self.damped, self.held)
@@ -74,9 +74,8 @@ class SafetyRun:
             for i in {0, 1, 2, 3} - self.silent:
                 self.applied[i] = 0.0 if i in self.off else self.drive.effort[i]
             self.off -= {i for i in self.off if self.drive.send[i] is Send.ENTER}
-            if not was_proving:  # its small pushes end at once
-                own = {0, 1, 2, 3} - self.off
-                self.steps.append(max((abs(self.applied[i] - before[i]) for i in own), default=0.0))
+            own = {0, 1, 2, 3} - self.off
+            self.steps.append(max((abs(self.applied[i] - before[i]) for i in own), default=0.0))
         return self
 
     def until(self, state: State, limit: float = 10.0) -> SafetyRun:

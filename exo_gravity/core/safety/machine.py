@@ -6,7 +6,8 @@
 - CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
   person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
 - PROVING switches the motors on one by one (power.py). Each must show in its replies that it is on. If signs are not
-  trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault switches the motors off.
+  trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault, and `disable`, takes the
+  push back without a step and without damping, and switches the motors off.
 - RAMPING_IN: the torque begins as a guided motion (guidance.py), which ends at the full torque.
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that does not reply is taken to obey, and is still watched for: if it replies
@@ -25,6 +26,7 @@ from collections.abc import Iterable, Sequence
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
+from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.barrier import Barrier
 from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
@@ -41,7 +43,7 @@ from exo_gravity.core.safety.gate import (
     torque_while_hanging,
 )
 from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
-from exo_gravity.core.safety.limits import CONFIRM, DAMPING, Limits
+from exo_gravity.core.safety.limits import CONFIRM, DAMPING, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.monitors import REST, RestTracker, RideThrough
 from exo_gravity.core.safety.motion_monitor import MotionMonitor
 from exo_gravity.core.safety.power import POWER, MotorPower, Power, PowerChange, SwitchingOn
@@ -413,6 +415,11 @@ class SafetyMachine:
                 self.refusal = Reason(Wait.MOTOR_ON, "a motor was still on: it is let down")
             self._on(StateEvent.FOUND_ON)
             return self._descend()
+        if any(power.state is Power.ENTERING for power in self.power):  # the proof has ended
+            pushed = [limited(0.0, push, MAX_EFFORT_RATE * self._dt) for push in self._sent.effort]
+            if any(pushed):
+                return self._powered(pushed, self._none, self._commands)
+            self._change_power(PowerChange.SWITCH_OFF)
         if self._all_off:
             return self._off._replace(send=tuple(self._sends()))
         self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
@@ -474,8 +481,6 @@ class SafetyMachine:
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:
             self._change_power(PowerChange.SWITCH_ON)
-        elif before is State.PROVING and after is not State.RAMPING_IN:
-            self._change_power(PowerChange.SWITCH_OFF)
         elif after is State.RAMPING_IN:
             self._change_power(PowerChange.SHOWN_ON)
         elif after is State.LETTING_DOWN and before in CARRIED:
