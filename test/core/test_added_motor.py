@@ -16,30 +16,15 @@ from typing import Any
 
 import pytest
 
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.families import others
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.sim.params import SIMULATOR, device_of
-from exo_gravity.sim.virtual_arm import VirtualArm
+from exo_gravity.sim.rig import Rig
 
 from ..support import ROOT
-
-
-class Holding:
-    """A controller that asks for what holds a simulated device where it is."""
-
-    def __init__(self, device: Any) -> None:
-        self.arm, self.answered = device.arm, 0.0
-
-    def efforts(self, latest: float) -> Efforts:
-        held = gravity_torque(self.arm.config.links, self.arm.positions)
-        return Efforts(tuple(held), self.answered, damped=False, held=False)
-
-    def take(self, now: float, samples: Any) -> None:
-        self.answered = now
 
 
 def carry(**given: Any) -> dict[str, Any]:
@@ -50,17 +35,12 @@ def carry(**given: Any) -> dict[str, Any]:
     motors, limits = motors_of(values), limits_of(values)
     check_bridge(values["rate"], motors, limits)
     device = device_of(values_of(SIMULATOR, given))
-    arm = VirtualArm(device, Holding(device), motors, limits, values["rate"])
-    arm.enable()
-    is_carried = arm.run_until(lambda: arm.safety.state is State.ACTIVE, 5.0)
-    is_on = [motor.entered for motor in device.motors]
-    arm.safety.disable(arm.now)
-    arm.run_until(lambda: arm.loop.is_off, 20.0)
-    arm.bus.stop()
+    settings = Settings(device.side, device.arm.config.links, max_effort=bridge["max_effort"])
+    arm = Rig(device, settings, motors, limits, values["rate"])
+    arm.carry()
     return {
-        "is_carried": is_carried and not arm.safety.fault,
-        "on": is_on,
-        "off": arm.loop.is_off and not device.powered,
+        "on": [motor.entered for motor in device.motors],
+        "off": arm.let_down(),
         "ignored": dict(arm.bus.ignored),
         "home_tolerance": limits.home_tolerance,
         "peak": [motor.peak_effort for motor in motors],
@@ -75,7 +55,6 @@ def test_a_laboratory_s_own_motor_needs_no_fork_and_all_its_bounds_follow_from_i
     command, environment = [sys.executable, "-m", __name__], {**os.environ, "PYTHONPATH": path}
     output = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
     assert json.loads(output) == {
-        "is_carried": True,
         "on": [True] * 4,
         "off": True,
         "ignored": {},

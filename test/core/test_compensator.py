@@ -12,8 +12,6 @@ from exo_gravity.core import gravity_torque
 from exo_gravity.core.arm.kinematics import turning_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
-from exo_gravity.core.compensation.terms.catalogue import Spring
-from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.trunk.inputs import TILT
@@ -27,23 +25,20 @@ def test_every_answer_is_the_torque_of_the_law_from_the_first_one_on():
     np.testing.assert_allclose(run.efforts, [gravity_torque(ROBOT, THETA)] * len(run.efforts), rtol=1e-12)
 
 
-def test_without_a_fresh_tilt_by_its_stamp_there_is_a_reason_instead_of_a_torque():
+def test_without_a_fresh_tilt_by_arrival_and_by_stamp_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")
+    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-TILT.lead)
+    assert run.cycle(0.078).held == ""
+    assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
+    assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
+    run = CompensatorRun(use_imu=True)
     for age, count in ((0.07, 100), (0.09, 20)):
         for _ in range(count):
             run.compensator.tilt.set_tilt(run.now, 0.1, 0.0, age)
             answer = run.cycle()
             assert age > 0.08 or answer.effort is not None
     assert answer.reason == "trunk tilt older than 80 ms by its stamp: the IMU driver lags, or its clock differs"
-
-
-def test_a_stamp_ahead_of_the_clock_makes_a_tilt_no_younger_than_its_arrival():
-    run = CompensatorRun(use_imu=True)
-    run.compensator.tilt.set_tilt(run.now, 0.0, 0.0, age=-TILT.lead)
-    assert run.cycle(0.078).held == ""
-    assert run.cycle(0.004).held.startswith("trunk tilt older than 80 ms: held on")
-    assert run.cycle(0.02).reason == "trunk tilt older than 80 ms"
 
 
 @pytest.mark.parametrize("acceleration", [-4.0, 0.0, 4.0])
@@ -118,22 +113,6 @@ def test_a_change_of_mode_reaches_the_arm_without_a_step():
     assert run.largest_step <= GUIDANCE.rate * PERIOD * 1.001
 
 
-SPRING = TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4))
-
-
-def test_springs_and_limits_are_switched_on_and_off_without_a_step_also_during_another_change():
-    run = CompensatorRun()
-    run.cycle(1.5)
-    run.efforts.clear()
-    changes = ({"terms": SPRING}, {"max_effort": (0.5,) * 4}, {}, {"mode": "zero_g", "terms": SPRING}, {})
-    for seconds in (GUIDANCE.time + 1.0, 0.6):
-        for change in changes:
-            run.compensator.apply(settings_with(**change))
-            run.cycle(seconds)
-    assert run.largest_step <= GUIDANCE.rate * PERIOD * 1.001
-    assert run.cycle(GUIDANCE.time + 1.0).effort == pytest.approx(gravity_torque(ROBOT, THETA))
-
-
 def test_a_joint_that_the_change_drives_gets_its_old_torque_back_until_it_is_calm():
     run = CompensatorRun(mode="zero_g")
     run.cycle(1.5)
@@ -197,61 +176,36 @@ DOWN = np.array((2.0, -1.0, 11.0))  # the same as gravity in the left arm's base
 STILL = (0.0, 0.0, 0.0)
 
 
-def run_with(force, spin_up=STILL, seconds=1.3, **changes):
-    """Run a compensator on an upright trunk that feels `force` and turns faster by `spin_up`; samples at 100 Hz."""
-    run = CompensatorRun(**{"use_imu": True, **changes})
-    for cycle in range(round(seconds / PERIOD)):
-        if cycle % 5 == 0:
-            turning = [run.now * component for component in spin_up]
-            run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
-            if force is not None:
-                run.compensator.motion.add(run.now, force, turning)
-        run.cycle()
-    return run
-
-
-def test_the_specific_force_replaces_gravity():
-    size = np.linalg.norm(DOWN)
-    expected = gravity_torque(ROBOT, THETA, DOWN / size) * size / 9.80665
-    np.testing.assert_allclose(run_with(FORCE, inertial=True).efforts[-1], expected, rtol=1e-6)
-
-
-def test_the_arm_turns_with_a_trunk_that_turns_faster_and_faster():
-    spin_up = (1.0, 2.0, -0.5)
-    expected = gravity_torque(ROBOT, THETA) + turning_torque(ROBOT, "left", THETA, spin_up)
-    run = run_with((0.0, 0.0, 9.80665), spin_up, inertial=True)
-    np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-5)
+MEASURED, SPIN_UP = {"use_imu": True, "inertial": True}, (1.0, 2.0, -0.5)  # and rad/s^2
+FELT = np.linalg.norm(DOWN) / 9.80665 * np.array(gravity_torque(ROBOT, THETA, DOWN / np.linalg.norm(DOWN)))
+TURNED = np.add(gravity_torque(ROBOT, THETA), turning_torque(ROBOT, "left", THETA, SPIN_UP))
 
 
 @pytest.mark.parametrize(
-    ("force", "changes"),
-    [(FORCE, {}), (FORCE, {"inertial": True, "use_imu": False}), (None, {"inertial": True})],
-    ids=["not inertial", "without an IMU", "no motion measured"],
+    ("force", "spin_up", "changes", "expected"),
+    [
+        (FORCE, STILL, MEASURED, FELT),
+        ((0.0, 0.0, 9.80665), SPIN_UP, MEASURED, TURNED),
+        (FORCE, SPIN_UP, {"use_imu": True}, gravity_torque(ROBOT, THETA)),
+        (FORCE, SPIN_UP, {"inertial": True}, gravity_torque(ROBOT, THETA)),
+        (None, SPIN_UP, MEASURED, gravity_torque(ROBOT, THETA)),
+    ],
+    ids=["a force", "a trunk that turns faster and faster", "not inertial", "without an IMU", "no motion measured"],
 )
-def test_without_inertial_an_imu_or_measured_motion_only_the_tilt_counts(force, changes):
-    run = run_with(force, (1.0, 2.0, 3.0), **changes)
-    np.testing.assert_allclose(run.efforts[-1], gravity_torque(ROBOT, THETA), rtol=1e-9)
-
-
-def test_switching_it_on_does_not_step_the_torque():
-    run = run_with(FORCE, inertial=False)
-    settings = settings_with(use_imu=True, inertial=True)
-    run.compensator.apply(settings)
-    before = len(run.efforts)
-    for _ in range(1200):
-        run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
-        run.compensator.motion.add(run.now, FORCE, STILL)
+def test_the_specific_force_replaces_gravity_and_the_arm_turns_with_the_trunk(force, spin_up, changes, expected):
+    """On an upright trunk that feels `force` and turns faster by `spin_up`, in samples at 100 Hz."""
+    run = CompensatorRun(**changes)
+    for cycle in range(650):
+        if cycle % 5 == 0:
+            run.compensator.tilt.set_tilt(run.now, 0.0, 0.0)
+            if force is not None:
+                run.compensator.motion.add(run.now, force, [run.now * component for component in spin_up])
         run.cycle()
-    assert np.abs(np.diff(run.efforts[before - 1 :], axis=0)).max() < 0.01
-    assert np.abs(np.subtract(run.efforts[-1], run.efforts[before - 1])).max() > 0.1
-
-
-def test_with_a_tilt_that_is_too_old_there_is_no_torque_whatever_the_motion():
-    run = run_with(FORCE, inertial=True)
-    run.compensator.motion.add(run.now, FORCE, STILL)
+    np.testing.assert_allclose(run.efforts[-1], expected, rtol=1e-5)
     run.cycle(0.1)
-    run.compensator.motion.add(run.now, FORCE, STILL)
-    assert "older than 80 ms" in run.cycle().reason
+    if changes.get("use_imu"):  # whatever the motion, a tilt is too old
+        run.compensator.motion.add(run.now, FORCE, STILL)
+        assert "older than 80 ms" in run.cycle().reason
 
 
 EFFORT = (2.0, -4.0)
@@ -267,23 +221,19 @@ def active(now: float = 10.0) -> CommandFade:
     return fade
 
 
-def test_late_input_fades_the_last_effort_to_zeros_that_go_on_until_an_operator_cleared_the_fault():
+@pytest.mark.parametrize("reason", ["no joint_states younger than 50 ms", "trunk tilt older than 80 ms"])
+def test_late_or_withdrawn_efforts_fade_to_zeros_that_go_on_until_an_operator_cleared_the_fault(reason):
     fade = active()
+    if reason.startswith("trunk"):
+        fade.withdraw(10.06, reason)
+        fade.withdraw(10.5, "another")
     assert fade.tick(10.06) == EFFORT
     assert not fade.take(10.1, EFFORT, NOTHING, NOTHING) and not fade.clear()
     assert fade.tick(11.06) == pytest.approx((1.0, -2.0))
     assert fade.tick(12.07) == fade.tick(100.0) == NOTHING
-    assert fade.problem == "no joint_states younger than 50 ms: zero, call clear_fault"
+    assert fade.problem == f"{reason}: zero, call clear_fault"
     assert not fade.take(100.0, EFFORT, NOTHING, NOTHING) and fade.state == "zero"
     assert fade.clear() and fade.take(100.1, EFFORT, NOTHING, NOTHING)
-
-
-def test_withdrawn_efforts_fade_at_once_and_the_first_reason_stays():
-    fade = active()
-    fade.withdraw(10.01, "trunk tilt older than 80 ms")
-    fade.withdraw(10.5, "another")
-    assert fade.tick(11.01) == pytest.approx((1.0, -2.0))
-    assert fade.reason == "trunk tilt older than 80 ms"
 
 
 @pytest.mark.parametrize("period", [0.01, 0.3])
@@ -300,15 +250,12 @@ def test_no_message_of_a_fade_steps_by_more_than_the_fade_itself(period):
 
 def test_the_first_efforts_begin_from_what_a_controller_holds_since_its_last_sender_died():
     fade, held, last = CommandFade(0.05), (3.59, -1.0), (3.59, -1.0)
+    early = CommandFade(0.05)
+    assert early.take(10.0, NOTHING, held, NOTHING) == held
+    early.withdraw(10.01, "no trunk tilt")
+    assert early.tick(10.01) == held and early.tick(12.1) == NOTHING
     for cycle in range(151):  # 1.5 s at 100 Hz
         effort = fade.take(10.0 + 0.01 * cycle, EFFORT, held, NOTHING)
         assert max(abs(a - b) for a, b in zip(effort, last, strict=True)) <= 0.01 * GUIDANCE.rate + 1e-9
         last = effort
     assert last == EFFORT
-
-
-def test_a_fade_in_the_first_second_begins_from_what_was_sent():
-    fade = CommandFade(0.05)
-    assert fade.take(10.0, NOTHING, (3.59, 0.0), NOTHING) == (3.59, 0.0)
-    fade.withdraw(10.01, "no trunk tilt")
-    assert fade.tick(10.01) == (3.59, 0.0) and fade.tick(12.1) == NOTHING

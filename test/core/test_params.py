@@ -21,7 +21,6 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.lab.bag.content import RECORDER
 from exo_gravity.lab.calibration.tour import CALIBRATOR
-from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.view.urdf import ROBOT_MODEL
 from exo_gravity.panel.view import PANEL
 from exo_gravity.sim.params import SIMULATOR
@@ -61,7 +60,7 @@ def test_hundreds_of_valid_and_invalid_changes_are_applied_or_rejected_and_never
     compensator = Compensator(settings_of(values))
     now, refused, moved = 100.0, 0, 0.0
     last = np.array(compensator.step(now, (0.0,) * 4).effort)
-    for _ in range(300):
+    for _ in range(200):
         changed = {p.name: possible(p, rng) for p in rng.sample(LIVE, rng.choice([1, 1, 2, 5]))}
         if rng.random() < 0.4:
             changed[rng.choice([*LIVE]).name if rng.random() < 0.9 else "suport"] = rng.choice(WRONG)
@@ -80,27 +79,13 @@ def test_hundreds_of_valid_and_invalid_changes_are_applied_or_rejected_and_never
             step = np.abs(effort - last).max()
             assert step <= values["max_effort_rate"] * min(period, LONGEST_STEP) * (1 + 1e-9)
             last, moved = effort, moved + step
-    assert 90 < refused < 210
-    assert moved > 100.0  # Nm; the torque followed the changes
+    assert 60 < refused < 140
+    assert moved > 60.0  # Nm; the torque followed the changes
 
 
 def test_parameters_that_ros_declares_on_every_node_are_ignored():
     for name in ("use_sim_time", "start_type_description_service", "qos_overrides./tf.publisher.depth"):
         assert name not in values_of(COMPENSATOR, {name: True})
-
-
-def test_a_list_of_whole_and_other_numbers_which_ros_cannot_load_is_refused_by_name(tmp_path: Path):
-    path = tmp_path / "params.yaml"
-    path.write_text("/right/compensator: {ros__parameters: {robot: {mass: [0.6, 1, 0.6, 0.2]}}}")
-    with pytest.raises(ParameterError, match=r"robot.mass = \[0.6, 1, 0.6, 0.2\]: must be a list of one type"):
-        load(path)
-
-
-def test_the_wearers_arm_follows_from_the_body_mass():
-    wearer = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": 1.0}
-    assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(5.559, abs=1e-3)
-    half = values_of(COMPENSATOR, {**wearer, "support": 0.5})
-    assert settings_of(half).arm.total_mass == pytest.approx(3.707, abs=1e-3)
 
 
 def test_every_name_of_a47959f4_is_still_declared_or_refused_with_what_to_write():
@@ -134,18 +119,19 @@ def test_what_is_written_for_a_parameter_that_is_gone_has_its_value():
     assert not in_force("inertial.shoulder_from_imu", [0.0] * 3)["inertial"]
 
 
-def test_first_moments_replace_masses_and_centres_of_gravity():
-    across = {"robot.off_axis": [0.0, 0.01, 0.0, 0.0]}
-    plain = settings_of(values_of(COMPENSATOR, across)).robot
-    given = {"robot.first_moment": list(plain.first_moment), "robot.mass": [9.0] * 4, **across}
+def test_first_moments_replace_masses_and_centres_of_gravity_and_the_body_mass_those_of_the_wearer():
+    plain = settings_of(values_of(COMPENSATOR, {})).robot
+    given = {"robot.first_moment": list(plain.first_moment), "robot.mass": [9.0] * 4}
     moments = settings_of(values_of(COMPENSATOR, given)).robot
-    assert moments.by_moments and not plain.by_moments
-    assert (moments.first_moment, moments.off_axis) == (plain.first_moment, (0.0, 0.01, 0.0, 0.0))
+    assert moments.by_moments and not plain.by_moments and moments.first_moment == plain.first_moment
+    for support, mass in ((1.0, 5.559), (0.5, 3.707)):
+        wearer = {"wearer.body_mass": 75.0, "mode": "zero_g", "support": support}
+        assert settings_of(values_of(COMPENSATOR, wearer)).arm.total_mass == pytest.approx(mass, abs=1e-3)
 
 
+ARM = {"can.interface": "virtual", "can.channel": "arm"}
 ELBOW = {
-    "can.interface": "virtual",
-    "can.channel": "arm",
+    **ARM,
     "joint_names": ["elbow"],
     "motor": ["AK80-64"],
     "can_id": [7],
@@ -158,15 +144,21 @@ ELBOW = {
 def test_an_arm_of_one_joint_has_the_defaults_that_are_the_same_for_all_joints():
     values = values_of(CAN_BRIDGE, ELBOW)
     assert values["direction"] == [1] and values["zero"] == values["home"] == values["largest_moment"] == [0.0]
-    assert limits_of(values).home_tolerance == (pytest.approx(0.048, abs=1e-3),)
     assert motors_of(values)[0].spec.gear_ratio == 64
 
 
-def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
+@pytest.mark.parametrize(
+    ("given", "tolerance"),
+    [
+        (ELBOW, (0.048,)),
+        ({**ARM, "motor": ["AK80-9"] * 4}, (0.34,) * 4),
+        ({**ARM, "motor": ["DM-J4310"] * 4, "motor_timeout": [0.2] * 4}, (0.5,) * 4),
+    ],
+)
+def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero(given, tolerance):
+    assert limits_of(values_of(CAN_BRIDGE, given)).home_tolerance == pytest.approx(tolerance, abs=1e-3)
     for motor in (motor for motor in MOTORS.values() if not motor.output_encoder):
         assert motor.home_tolerance < math.pi / motor.gear_ratio
-    values = values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "arm", "motor": ["AK80-9"] * 4})
-    assert limits_of(values).home_tolerance == (0.34,) * 4
 
 
 @pytest.mark.parametrize(
@@ -176,6 +168,5 @@ def test_a_joint_that_is_off_by_a_turn_of_its_rotor_is_never_near_its_zero():
 def test_a_motor_is_silent_after_50_ms_or_7_cycles_up_to_100_ms_or_as_long_as_a_simulated_bridge_may_freeze(
     rate, frozen, timeout
 ):
-    given = {"can.interface": "virtual", "can.channel": "arm", "rate": rate, "frozen_timeout": frozen}
-    values = values_of(CAN_BRIDGE, given)
+    values = values_of(CAN_BRIDGE, {**ARM, "rate": rate, "frozen_timeout": frozen})
     assert limits_of(values).reply_timeout == pytest.approx(timeout)

@@ -122,6 +122,7 @@ def compensator(**given):
 
 
 HEAVY, WHOLE = (0.0, 0.0, 5.0, 4.0), {"support": 1.0, "mode": "zero_g"}  # kg, with 1.854 kg of robot
+ADAPTIVE = {"mode": "zero_g", "support": 0.4, "support_adapts": True}
 BY_MOMENTS = ArmModel.from_moments(ROBOT.length, ROBOT.first_moment)
 SETTINGS = [
     row(settings_with, "^side = ", side="both"),
@@ -138,6 +139,7 @@ SETTINGS = [
         row(gained, r"gain times gravity = .*: must be at most 20 m/s\^2", gain, gravity)
         for gain, gravity in ((2.0, 25.0), (2.0, 10.01), (0.9, 25.0), (1.3, 16.0))
     ),
+    row(settings_with, "total mass", **ADAPTIVE, wearer_mass=(0.0, 0.0, 5.4, 4.2)),  # at full support
     row(settings_with, "anfis_file", law="anfis"),
     row(settings_with, "robot.first_moment = .*0 for law anfis", law="anfis", anfis=learned(), robot=BY_MOMENTS),
     row(Settings, "joint_stiffness", "left", DEFAULT_LINKS, joint_stiffness=(0.0, 2.6, 0.0, 0.0)),  # Nm per degree
