@@ -128,36 +128,45 @@ def test_typical_bits_of_can_fd_are_the_mean_of_a_carried_arm():
     assert np.all(np.max([*commands, *replies], axis=0) <= (FD_BITS.most, FD_COMMAND_BITS.most))
 
 
-def test_the_load_of_replying_and_reporting_motors():
-    assert Traffic(4).load(500.0) == pytest.approx(0.48, abs=0.01)
-    assert Traffic(4).load(500.0, worst=True) == pytest.approx(0.54)
-    assert Traffic(4).load(926.0, worst=True) == pytest.approx(1.0, abs=0.001)
-    assert Traffic(4).load(Traffic(4).largest_rate) == pytest.approx(1.0)
-    fast, slow = Traffic(0, 4), Traffic(0, 4, bitrate=250_000)
-    assert (fast.status_rate, slow.status_rate) == (500.0, 200.0)
-    assert BITRATE * fast.load(250.0) == pytest.approx(
-        4 * (500.0 * STATUS_BITS.typical + 250.0 * V3_COMMAND_BITS.typical)
-    )
-    slow.check(160.0)
+REPORTED = 4 * (500.0 * STATUS_BITS.typical + 250.0 * V3_COMMAND_BITS.typical) / BITRATE
+LOADS = [  # motors, Hz, whether with the most stuffing, and the load
+    (Traffic(4), 500.0, False, 0.48),
+    (Traffic(4), 500.0, True, 0.54),
+    (Traffic(4), 926.0, True, 1.0),
+    (Traffic(4), Traffic(4).largest_rate, False, 1.0),
+    (Traffic(0, 4), 250.0, False, REPORTED),
+    (Traffic(8), 500.0, False, 0.97),
+    (Traffic(8, data_bitrate=5_000_000), 1000.0, False, 0.84),
+]
 
 
-def test_a_rate_that_crowds_the_bus_is_known():
+@pytest.mark.parametrize(("motors", "rate", "worst", "load"), LOADS)
+def test_the_load_of_replying_and_reporting_motors(motors, rate, worst, load):
+    assert motors.load(rate, worst) == pytest.approx(load, abs=0.01)
+
+
+def test_a_rate_that_crowds_the_bus_is_known_and_a_slow_bus_gets_fewer_reports():
     Traffic(4).check(1000.0)
+    Traffic(0, 4, bitrate=250_000).check(160.0)
     slow = Traffic(4, bitrate=250_000)
-    assert not Traffic(4, bitrate=500_000).is_crowded(250.0)
     assert slow.is_crowded(240.0) and not slow.is_crowded(206.0) and slow.is_crowded(207.0)
 
 
-def test_each_bus_has_the_load_of_its_own_motors():
-    values = {"can.interface": "socketcan", "wire_format": ["mit"] * 4, **AK}
-    two = traffic_of({**values, "can.channel": "can0,can0,can1,can1"}, {})
-    assert two == {"can0": Traffic(2), "can1": Traffic(2)}
-    values = {
-        "can.interface": "slcan",
-        "can.channel": "a, b,b, b",
-        "wire_format": ["mit", "mit", "mit_v3", "mit_v3"],
-        **AK,
-    }
-    assert traffic_of({**values, "can.channel": "c"}, {"bitrate": 250_000}) == {"c": Traffic(2, 2, 250_000)}
-    slow_and_fast = {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]}
-    assert traffic_of(values, slow_and_fast) == {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)}
+SLCAN = {"can.interface": "slcan", "wire_format": ["mit", "mit", "mit_v3", "mit_v3"], **AK}
+SOCKETCAN = {"can.interface": "socketcan", "wire_format": ["mit"] * 4, **AK}
+FD = {**SOCKETCAN, "can.channel": "c", "motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"]}
+BUSES = [  # parameters, options, and the traffic of each bus
+    ({**SOCKETCAN, "can.channel": "can0,can0,can1,can1"}, {}, {"can0": Traffic(2), "can1": Traffic(2)}),
+    ({**SLCAN, "can.channel": "c"}, {"bitrate": 250_000}, {"c": Traffic(2, 2, 250_000)}),
+    (
+        {**SLCAN, "can.channel": "a, b,b, b"}, {"bitrate": [250_000, 1_000_000, 1_000_000, 1_000_000]},
+        {"a": Traffic(1, 0, 250_000), "b": Traffic(1, 2, 1_000_000)},
+    ),
+    (FD, {"fd": True}, {"c": Traffic(4, data_bitrate=5_000_000)}),
+    (FD, {"fd": True, "data_bitrate": 2_000_000}, {"c": Traffic(4, data_bitrate=2_000_000)}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("values", "options", "traffic"), BUSES)
+def test_each_bus_has_the_load_of_its_own_motors(values, options, traffic):
+    assert traffic_of(values, options) == traffic

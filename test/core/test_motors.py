@@ -45,7 +45,7 @@ from exo_gravity.core.motors.frames import (
     pack_command,
     unpack_command,
 )
-from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, JointSample, Traffic, motors_of, traffic_of
+from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, JointMotor, JointSample, motors_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 
@@ -174,19 +174,6 @@ def test_any_bytes_decode_to_a_reply_within_range_or_an_error_that_shows_them(mo
 
 
 @seeded
-@given(boards(), BYTES | st.sampled_from(SPECIAL_FRAMES))
-def test_any_bytes_decode_to_a_command_within_range_or_an_error_that_shows_them(board, data):
-    wire_format, spec = board
-    try:
-        command = wire_format.unpack_command(spec, data)
-    except FrameError as error:
-        assert (len(data) != 8 or (wire_format is MIT and data in SPECIAL_FRAMES)) and error.data == data
-        return
-    assert len(data) == 8
-    assert_within(spec, OF_COMMAND, command)
-
-
-@seeded
 @given(
     boards(),
     st.integers(0, 2047) | st.integers(0, 0x2FFF).map(lambda i: i | EXTENDED),
@@ -228,12 +215,6 @@ def test_a_reversed_motor_has_reversed_angle_and_torque():
     assert reply[:3] == pytest.approx((0.3, -1.0, 1.5), abs=0.02)
 
 
-@SPECS
-def test_damping_alone_does_not_push_an_arm_at_rest(spec):
-    command = unpack_command(spec, JointMotor(spec, 1).command(0.0, 5.0))
-    assert abs(command.torque + command.kd * command.velocity) < spec.torque_range / 4095 * 1.01
-
-
 @pytest.mark.parametrize("codes_below_top", range(20))
 def test_a_command_that_would_spell_a_special_frame_gets_a_slightly_lower_torque(codes_below_top):
     code = 30.0 / 4095
@@ -255,25 +236,24 @@ def test_every_frame_that_some_firmware_takes_for_another_is_special():
 
 
 @pytest.mark.parametrize(
-    ("frame_id", "length", "is_remote"),
-    [(3, 6, False), (3, 1, False), (3, 0, False), (3, 0, True), (0x83, 8, False), (0x703, 1, False), (0x103, 0, True)],
+    ("board", "frame_id", "data", "is_remote", "expected"),
+    [
+        *((MIT, 3, b"\xff" * length, remote, (COMMAND, 3)) for length, remote in ((6, 0), (1, 0), (0, 0), (0, 1))),
+        *((MIT, frame_id, b"\xff", frame_id == 0x103, (ALIAS, 3)) for frame_id in (0x83, 0x703, 0x103)),
+        *((MIT, frame_id, b"\xff", False, (OTHER, 0)) for frame_id in (4, 0x84, 0x704, 0x104)),
+        *((MIT, 0, bytes((3,)) + bytes(length - 1), False, (MALFORMED, 3)) for length in (1, 5)),
+        (MIT, EXTENDED | 0x2903, bytes(8), False, (SERVO, 3)),  # a status frame is no reply of a V1 board
+        (MIT, EXTENDED | 0x2904, bytes(8), False, (OTHER, 0)),
+        *((MIT_V3, EXTENDED | mode << 8 | 2, bytes(4), False, (COMMAND, 2)) for mode in range(16)),
+        *((MIT_V3, EXTENDED | mode << 8 | 9, bytes(4), False, (OTHER, 0)) for mode in range(16)),
+        *((MIT_V3, EXTENDED | mode << 8 | 0xFF, bytes(4), False, (COMMAND, BROADCAST_ID)) for mode in range(16)),
+        *((MIT_V3, MIT_V3.reply_id(1), bytes(length), False, (MALFORMED, 1)) for length in (0, 7, 9)),
+    ],
 )
-def test_a_motor_may_obey_short_and_remote_frames_and_ids_whose_lowest_7_bits_are_its_own(frame_id, length, is_remote):
-    kind = COMMAND if frame_id == 3 else ALIAS
-    assert MIT.classify(frame_id, b"\xff" * length, IDS, is_remote) == (kind, 3)
-    assert MIT.classify(frame_id + 1, b"\xff" * length, IDS, is_remote) == (OTHER, 0)
-
-
-def test_a_reply_of_another_length_is_malformed_and_a_status_frame_is_no_reply_of_a_v1_board():
-    for length in (1, 5):
-        assert MIT.classify(0, bytes((3,)) + bytes(length - 1), IDS) == (MALFORMED, 3)
-    assert MIT.classify(EXTENDED | 0x2903, bytes(8), IDS) == (SERVO, 3)
-    assert MIT.classify(EXTENDED | 0x2904, bytes(8), IDS) == (OTHER, 0)
-
-
-def test_the_seventh_byte_of_the_open_drive_is_no_temperature():
-    reply = unpack_reply(AK60, pack_reply(AK60, 3, 0.5, 0.0, 0.0) + b"\x4d")
-    assert reply[:2] == (3, pytest.approx(0.5, abs=0.001)) and reply[4:] == (None, None)
+def test_an_ak_motor_may_obey_short_and_remote_frames_other_modes_and_ids_with_its_lowest_7_bits(
+    board, frame_id, data, is_remote, expected
+):
+    assert board.classify(frame_id, data, IDS, bool(is_remote)) == expected
 
 
 @pytest.mark.parametrize(
@@ -288,57 +268,16 @@ def test_an_error_byte_is_printed_with_both_readings(byte, text):
     assert error_text(byte) == text
 
 
-def test_a_reply_has_any_temperature_of_a_byte_and_no_angle_beyond_its_range():
-    for temperature in (-40, 215):
-        assert unpack_reply(AK60, pack_reply(AK60, 255, 0.0, 0.0, 0.0, temperature, 0)).temperature == temperature
-    for value in (math.nan, math.inf, 99.0):
-        with pytest.raises(ParameterError):
-            pack_reply(AK60, 1, value, 0.0, 0.0)
-
-
-def test_a_v3_board_is_switched_off_by_a_current_of_0_and_obeys_every_control_mode():
+def test_a_v3_board_is_switched_off_by_a_current_of_0():
     motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)
     assert motor.exit == ((EXTENDED | 0x105, bytes(4)),)
     assert motor.enter == motor.set_zero == ()
-    for mode in range(16):
-        assert MIT_V3.classify(EXTENDED | mode << 8 | 2, bytes(4), IDS) == (COMMAND, 2)
-        assert MIT_V3.classify(EXTENDED | mode << 8 | 9, bytes(4), IDS) == (OTHER, 0)
-        assert MIT_V3.classify(EXTENDED | mode << 8 | 0xFF, bytes(4), IDS) == (COMMAND, BROADCAST_ID)
-    for length in (0, 7, 9):  # of a status frame
-        assert MIT_V3.classify(MIT_V3.reply_id(1), bytes(length), IDS) == (MALFORMED, 1)
 
 
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():
     for board in FORMATS.values():
         motor = JointMotor(board.ranged(MOTORS["AK80-9"]), 4, wire_format=board)
         assert pickle.loads(pickle.dumps(motor)) == motor
-
-
-def parameters(**given: object) -> dict[str, object]:
-    return values_of(CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "c", **given})
-
-
-def test_each_joint_has_the_ranges_of_its_own_wire_format():
-    motors = motors_of(parameters(wire_format=["mit", "mit_v3", "mit_v3", "mit"]))
-    assert [motor.wire_format.name for motor in motors] == ["mit", "mit_v3", "mit_v3", "mit"]
-    assert [motor.spec.torque_range for motor in motors] == [15.0, 18.0, 12.0, 15.0]
-    assert [motor.spec.velocity_range for motor in motors] == [45.0, 65.0, 60.0, 45.0]
-
-
-def test_each_motor_has_the_time_out_and_position_range_of_its_own_firmware():
-    motors = motors_of(parameters(motor_timeout=[0.0, 0.15, 0.5, 0.3], position_range=[12.56, 0.0, 12.5, 12.566]))
-    assert [motor.timeout for motor in motors] == [0.0, 0.15, 0.5, 0.3]
-    assert [motor.spec.position_range for motor in motors] == [12.56, 12.5, 12.5, 12.566]
-    quarter_turn = pack_reply(motors[0].spec, 1, math.pi / 2, 0.0, 0.0)
-    assert motors[0].sample(quarter_turn, 0.0).position == pytest.approx(math.pi / 2, abs=0.001)
-    assert motors[1].sample(quarter_turn, 0.0).position == pytest.approx(math.radians(90.0 - 0.43), abs=0.001)
-
-
-def test_the_torque_of_a_v3_board_is_its_current_times_the_torque_per_ampere_of_its_firmware():
-    given = {"wire_format": ["mit_v3"] * 4, "torque_per_ampere": [0.0, 0.0, 0.45, 0.0]}
-    data = bytes.fromhex("0000 0000 03e8 19 00")  # 10 A
-    efforts = [motor.sample(data, 0.0).effort for motor in motors_of(parameters(**given))]
-    assert efforts == pytest.approx([2.997, 10.0 * 9.0 / 10.3, 4.5, 2.997])
 
 
 PUBLIC = json.loads((Path(__file__).parents[1] / "data" / "motor_frames.json").read_text())
@@ -390,6 +329,8 @@ REPLIES = [
     # motor 7, position 0xffff -> 12.5, velocity 0 -> -45, torque 2457 -> 3, 70 - 40 degC, error 2
     (MIT, AK60, 7, "07 ffff 000999 46 02", (12.5, -45.0, 3.0, 30, 2)),
     # 90.0 deg, 100 rpm, -2 A x 0.2997 Nm/A, -5 degC, error 7
+    (MIT, AK60, 255, "ff ffff 000999 00", (12.5, -45.0, 3.0, None, None)),  # the open drive's seventh byte
+    (MIT, AK60, 255, "ff ffff 000999 00 00", (12.5, -45.0, 3.0, -40, 0)),
     (MIT_V3, V3_AK60, 3, "0384 0348 ff38 fb 07", (math.pi / 2, SPEED, -2.0 * 0.2997, -5, 7)),
     (MIT_V3, V3_AK80, 3, "0384 0348 ff38 fb 07", (math.pi / 2, SPEED * 14 * 6 / 21 / 9, -2.0 * 9.0 / 10.3, -5, 7)),
     # on (1), motor 3, position 0xffff -> 12.5, velocity 0 -> -30, torque 4095 -> 10, MOSFET 40, coil 55 degC
@@ -411,11 +352,6 @@ def test_a_reply_says_whether_the_motor_is_on_and_a_lost_command_is_no_defect(st
     sample = damiao(can_id=2, direction=-1).sample(bytes((state << 4 | 2, 0x80, 0, 0x80, 0x08, 0, 30, 31)), 1.0)
     assert (sample.on, sample.error, sample.temperature, sample.time) == (on, error, 31, 1.0)
     assert bool(sample.trouble) == (state > 1)
-
-
-def test_a_reply_of_another_length_is_refused_with_its_bytes():
-    with pytest.raises(FrameError, match=r"frame \[01 02\]: must be a reply of 8 bytes"):
-        DAMIAO_MIT.unpack_reply(DM4310, 1, b"\x01\x02")
 
 
 STATE = bytes((0x11, 0x80, 0, 0x80, 0x08, 0, 30, 30))
@@ -450,16 +386,34 @@ def test_a_damiao_error_is_named_as_in_the_manual():
                      "coil over-temperature", "communication lost", "overload", "unknown"]  # fmt: skip
 
 
-def damiao_parameters(**given):
-    usual = {"motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"], "motor_timeout": [0.2] * 4}
-    return values_of(CAN_BRIDGE, {"can.interface": "socketcan", "can.channel": "can0", **usual, **given})
+BRIDGE = {"can.interface": "virtual", "can.channel": "c"}
+DAMIAO = {"motor": ["DM-J8009", "DM-J8009", "DM-J4340", "DM-J4310"], "motor_timeout": [0.2] * 4}
+MIXED = {"wire_format": ["mit", "mit_v3", "mit_v3", "mit"]}
+OWN = {"motor_timeout": [0.0, 0.15, 0.5, 0.3], "position_range": [12.56, 0.0, 12.5, 12.566]}
+AMPERES = {"wire_format": ["mit_v3"] * 4, "torque_per_ampere": [0.0, 0.0, 0.45, 0.0]}
+QUARTER, TEN_AMPERES = pack_reply(AK60, 1, math.pi / 2, 0.0, 0.0), bytes.fromhex("0000 0000 03e8 19 00")
+STRONG = {**DAMIAO, "motor": ["AK80-64", "DM-J10010", "AK60-6", "DM-J8009"], "can_id": [1, 2, 3, 4]}
+OF_MOTORS = [  # parameters, what of each motor, and its values
+    (MIXED, lambda motor: motor.wire_format.name, MIXED["wire_format"]),
+    (MIXED, lambda motor: motor.spec.torque_range, [15.0, 18.0, 12.0, 15.0]),
+    (MIXED, lambda motor: motor.spec.velocity_range, [45.0, 65.0, 60.0, 45.0]),
+    (OWN, lambda motor: motor.timeout, OWN["motor_timeout"]),
+    (OWN, lambda motor: motor.spec.position_range, [12.56, 12.5, 12.5, 12.566]),
+    (OWN, lambda motor: 100 * round(motor.sample(QUARTER, 0.0).position, 3), [157.8, 157.1, 157.1, 157.9]),
+    (AMPERES, lambda motor: motor.sample(TEN_AMPERES, 0.0).effort, [2.997, 10.0 * 9.0 / 10.3, 4.5, 2.997]),
+    (DAMIAO, lambda motor: motor.reply_id, [0x11, 0x12, 0x13, 0x14]),
+    (DAMIAO, lambda motor: motor.spec.torque_range, [54.0, 54.0, 28.0, 10.0]),
+]
 
 
-def test_damiao_motors_need_no_more_than_their_names_and_time_outs():
-    motors = motors_of(damiao_parameters())
-    assert [damiao.reply_id for damiao in motors] == [0x11, 0x12, 0x13, 0x14]
-    assert [damiao.spec.torque_range for damiao in motors] == [54.0, 54.0, 28.0, 10.0]
-    assert limits_of(damiao_parameters()).home_tolerance == (0.5,) * 4  # an encoder at the output: no ambiguity
+@pytest.mark.parametrize(("given", "of", "values"), OF_MOTORS)
+def test_each_motor_is_as_the_parameters_and_its_own_board_have_it(given, of, values):
+    found = [of(motor) for motor in motors_of(values_of(CAN_BRIDGE, {**BRIDGE, **given}))]
+    assert found == (pytest.approx(values) if isinstance(values[0], float) else values)
+
+
+def test_an_effort_is_impossible_beyond_what_the_own_motor_could_ever_give():
+    assert limits_of(values_of(CAN_BRIDGE, {**BRIDGE, **STRONG})).max_command == (240.0, 300.0, 40.0, 80.0)
 
 
 def test_every_motor_of_a_family_can_be_had_in_each_format_that_has_ranges_for_it():
@@ -471,14 +425,8 @@ def test_every_motor_of_a_family_can_be_had_in_each_format_that_has_ranges_for_i
     assert format_of("AK10-9", "mit_v3").ranged(MOTORS["AK10-9"]).torque_range == 54.0
 
 
-def test_an_effort_is_impossible_beyond_what_the_own_motor_could_ever_give():
-    limits = limits_of(damiao_parameters(motor=["AK80-64", "DM-J10010", "AK60-6", "DM-J8009"], can_id=[1, 2, 3, 4]))
-    assert limits.max_command == (240.0, 300.0, 40.0, 80.0)
-
-
-def told(boards, joint, number, value, now):
-    form = "<I" if number < 20 else "<f"
-    boards.told(joint, bytes((joint + 1, 0, 0x33, number)) + struct.pack(form, value), now)
+def answer(number, value):
+    return bytes((1, 0, 0x33, number)) + struct.pack("<I" if number < 20 else "<f", value)
 
 
 RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
@@ -497,10 +445,10 @@ RIGHT = {10: 1, 7: 0x11, 9: 4000, 21: 12.5, 22: 30.0, 23: 10.0}
 )
 def test_a_register_that_is_not_as_the_file_says_hinders_a_start_with_what_to_set(number, value, sentence):
     boards = Boards([damiao()])
-    boards.take(0, JointSample(0.0, 0.0, 0.0, 30, 0, 1.0, False))
+    boards.take(0, sample(1.0))
     assert boards.hindrance(1.0, 250.0) == "motor 1 to tell its CTRL_MODE"
     for register, right in (RIGHT | {number: value}).items():
-        told(boards, 0, register, right, 1.0)
+        boards.told(0, answer(register, right), 1.0)
     assert re.search(sentence, boards.hindrance(1.0, 250.0)), boards.hindrance(1.0, 250.0)
 
 
@@ -511,30 +459,11 @@ def test_settings_are_asked_for_one_by_one_and_again_after_a_while():
         ((frame_id, data),) = boards.question(0, 1.0)
         assert (frame_id, data[:3]) == (0x7FF, bytes((1, 0, 0x33)))
         asked.add(data[3])
-        told(boards, 0, data[3], RIGHT[data[3]], 1.0)
+        boards.told(0, answer(data[3], RIGHT[data[3]]), 1.0)
     assert asked == set(RIGHT) and boards.question(0, 1.0) == ()
     assert boards.question(0, 1.0 + CHECK.ask_again)
-    boards.take(0, JointSample(0.0, 0.0, 0.0, 30, 0, 2.5, False))
+    boards.take(0, sample(2.5))
     assert boards.hindrance(2.5, 250.0).startswith("motor 1 to tell its")
-
-
-def test_a_motor_that_replies_with_another_id_is_named_with_both():
-    boards = Boards([damiao(can_id=3)])
-    boards.heard(0, ELSEWHERE, (0x23, STATE), 1.0)
-    assert boards.hindrance(1.1, 250.0) == "motor 3 replies with the ID 35: set master_id = 35, or 19 on the motor"
-
-
-def test_eight_motors_fit_on_classic_can_at_500_hz_and_on_can_fd_at_1000():
-    classic, fd = Traffic(8), Traffic(8, data_bitrate=5_000_000)
-    assert classic.load(500.0) == pytest.approx(0.97, abs=0.01)
-    assert fd.load(1000.0) == pytest.approx(0.84, abs=0.01) and fd.load(1000.0, worst=True) < 1.0
-    assert Traffic(7, data_bitrate=5_000_000).load(500.0) < 0.4
-
-
-def test_can_fd_has_its_own_bit_rate():
-    fd = {"fd": True}
-    assert traffic_of(damiao_parameters(), fd)["can0"] == Traffic(4, data_bitrate=5_000_000)
-    assert traffic_of(damiao_parameters(), fd | {"data_bitrate": 2_000_000})["can0"].data_bitrate == 2_000_000
 
 
 RATE = 400.0  # Hz of the control loop
@@ -546,15 +475,6 @@ def boards_of(board):
 
 def sample(time, temperature=25):
     return JointSample(0.0, 0.0, 0.0, temperature, 0, time)
-
-
-def report(boards, rates, seconds):
-    """Let each motor send `rates` (Hz) frames a second; return what hinders a start then."""
-    times = [(count / rate, joint) for joint, rate in enumerate(rates) if rate for count in range(int(seconds * rate))]
-    boards.hindrance(0.0, RATE)
-    for time, joint in sorted(times):
-        boards.take(joint, sample(time))
-    return boards.hindrance(seconds, RATE)
 
 
 ENOUGH = (500.0, 480.0, 420.0, 500.0)
@@ -573,24 +493,35 @@ REPORTS = [  # a format, frames a second of each motor, for how many s, and what
 
 @pytest.mark.parametrize(("board", "rates", "seconds", "sentence"), REPORTS)
 def test_a_board_that_reports_too_seldom_hinders_a_start_with_what_to_set(board, rates, seconds, sentence):
-    assert re.search(sentence, report(Boards(boards_of(board)), rates, seconds))
+    """Each motor sends `rates` (Hz) frames a second."""
+    boards = Boards(boards_of(board))
+    boards.hindrance(0.0, RATE)
+    for joint, rate in enumerate(rates):
+        for count in range(int(seconds * rate)):
+            boards.take(joint, sample(count / rate))
+    assert re.search(sentence, boards.hindrance(seconds, RATE))
 
 
-def test_a_malformed_reply_is_shown_until_the_motor_replies_or_falls_silent():
+HEARD = [  # of what kind and which frame of motor 3 is no reply, and what is said of it
+    (
+        MALFORMED,
+        (3, bytes.fromhex("0380017ff8")),
+        "sent 5 bytes [03 80 01 7f f8] as its reply: must be 6, 7 or 8 bytes",
+    ),
+    (SERVO, (0x2903, bytes(8)), "does not reply, but sends status frames: set it to MIT mode"),
+    (ELSEWHERE, (0x23, STATE), "replies with the ID 35: set master_id = 35, or 3 on the motor"),
+]
+
+
+@pytest.mark.parametrize(("kind", "frame", "said"), HEARD)
+def test_a_frame_in_place_of_replies_is_shown_until_the_motor_replies_or_falls_silent(kind, frame, said):
     boards = Boards(boards_of(MIT))
-    boards.heard(2, MALFORMED, (3, bytes.fromhex("0380017ff8")), 1.0)
-    expected = "motor 3 sent 5 bytes [03 80 01 7f f8] as its reply: must be 6, 7 or 8 bytes"
-    assert boards.hindrance(1.5, RATE) == expected
+    boards.heard(2, kind, frame, 1.0)
+    assert boards.hindrance(1.5, RATE).startswith(f"motor 3 {said}")
     assert boards.hindrance(2.1, RATE) == ""
-    boards.heard(2, MALFORMED, (3, b"\x03"), 3.0)
+    boards.heard(2, kind, frame, 3.0)
     boards.take(2, sample(3.1))
     assert boards.hindrance(3.2, RATE) == ""
-
-
-def test_a_motor_that_sends_status_frames_in_place_of_replies_is_told_what_to_set():
-    boards = Boards(boards_of(MIT))
-    boards.heard(0, SERVO, (0x2901, bytes(8)), 1.0)
-    assert boards.hindrance(1.1, RATE).startswith("motor 1 does not reply, but sends status frames: set it to MIT mode")
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 """The states of an arm between off and carried: every transition, and what each state sends.
 
 Two states are safe. While nothing is proven (checking, proving), any fault switches the motors off, as soon as their
-push is taken back (3 Nm in 60 ms): the arm hangs, and a motor that damps with the wrong sign would drive it. Once the arm is carried, it is lowered under damping.
+push is taken back (3 Nm in 60 ms): the arm hangs, and a motor that damps with the wrong sign would drive it. Once the
+arm is carried, it is lowered under damping.
 A fault is latched in `FAULT`, which only the operator leaves, and only to `DISABLED`: that never enables the arm.
 """
 
