@@ -24,7 +24,7 @@ from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.control_loop import Controller, ControlLoop
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
-from exo_gravity.sim.virtual_time import Wire
+from exo_gravity.sim.virtual_time import Played, Wire
 
 
 class TrunkReading(NamedTuple):
@@ -53,7 +53,7 @@ class VirtualArm:
     motors, limits: the arm as the controller's side assumes it; whoever starts a simulated arm has seen it hang.
     rate: cycles of the loop per s.
     wire: the bus; by default one of its own, whose clock is at 0 s.
-    ports: of each joint's motor, if the caller has connected the device; by default one port for all of them.
+    ports, played: of each joint's motor, and how the device is connected; by default one port for all, on `wire`.
     look: called after every step of the device, at least every 2 ms.
     note, hand_over: those of `MotorBus` and `ControlLoop`.
 
@@ -69,6 +69,7 @@ class VirtualArm:
         rate: float,
         wire: Wire | None = None,
         ports: Sequence[CanPort | None] | None = None,
+        played: Played | None = None,
         look: Callable[[], None] | None = None,
         note: Callable[[Drive], None] = lambda drive: None,
         hand_over: Callable[[str], bool] = lambda reason: False,
@@ -76,8 +77,8 @@ class VirtualArm:
         self.device = device
         self.wire = wire or Wire(start=0.0)
         self.clock = self.wire.clock
+        self._played = played or (self.wire.play(device, look) if look else self.wire.play(device, tick=None))
         if ports is None:
-            self._played = self.wire.play(device, look) if look else self.wire.play(device, tick=None)
             ports = [CanPort(self.wire.open(), self.clock, self.wire.open, any(device.is_fd))] * len(motors)
         self.bus = MotorBus(ports, motors, note=note, clock=self.clock)
         self.safety = SafetyMachine(replace(limits, start_pose=HANGING), 1.0 / rate, motors)

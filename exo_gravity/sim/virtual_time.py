@@ -12,7 +12,7 @@ import heapq
 import math
 import random
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import partial
 from typing import Protocol
 
@@ -157,18 +157,29 @@ class Played:
 
     look: called after every step of the device.
     tick: s between two steps at most; None to step only before a frame is answered.
+    joints: whose motors are on this wire, from 0 on; () for all.
+    first: what plays the device's other motors on another wire, and lets its time pass.
     """
 
-    def __init__(self, wire: Wire, device: SimulatedDevice, look: Callable[[], None], tick: float | None) -> None:
-        self._wire, self._device, self._look = wire, device, look
+    def __init__(
+        self,
+        wire: Wire,
+        device: SimulatedDevice,
+        look: Callable[[], None],
+        tick: float | None,
+        joints: Sequence[int] = (),
+        first: Played | None = None,
+    ) -> None:
+        self._wire, self._device, self._look, self._first = wire, device, look, first
+        self._joints = joints or range(len(device.motors))
         self._last = wire.clock.monotonic()
         self._random = random.Random(0)
         wire.ends.append(self)
         if tick:
             wire.clock.every(tick, self.catch_up)
-        for joint, motor in enumerate(device.motors):
-            if not motor.joint.wire_format.replies:
-                wire.clock.every(1.0 / motor.firmware.status_rate, partial(self._report, joint))
+        for joint in self._joints:
+            if not device.motors[joint].joint.wire_format.replies:
+                wire.clock.every(1.0 / device.motors[joint].firmware.status_rate, partial(self._report, joint))
 
     def deliver(self, message: can.Message) -> None:
         """Let the device receive a frame, and send its reply."""
@@ -176,14 +187,16 @@ class Played:
         if command is None:
             return
         self.catch_up()
-        for joint, reply in self._device.replies(*command):
+        for joint, reply in self._device.replies(*command, self._joints):
             delay = self._random.uniform(*self._device.motors[joint].firmware.reply_delay)
             self._wire.clock.later(delay, partial(self._send, joint, reply))
 
     def catch_up(self) -> None:
         """Let the device's time pass until now."""
         now = self._wire.clock.monotonic()
-        if now > self._last:
+        if self._first:
+            self._first.catch_up()
+        elif now > self._last:
             self._device.advance(now - self._last)
             self._last = now
             self._look()
@@ -251,10 +264,15 @@ class Wire:
         return bus
 
     def play(
-        self, device: SimulatedDevice, look: Callable[[], None] = lambda: None, tick: float | None = TICK
+        self,
+        device: SimulatedDevice,
+        look: Callable[[], None] = lambda: None,
+        tick: float | None = TICK,
+        joints: Sequence[int] = (),
+        first: Played | None = None,
     ) -> Played:
         """Connect a simulated device; see `Played`."""
-        return Played(self, device, look, tick)
+        return Played(self, device, look, tick, joints, first)
 
     def break_down(self, error: Exception) -> None:
         """Let every end that is open now raise `error` from now on."""

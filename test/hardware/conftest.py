@@ -9,7 +9,7 @@ import pytest
 
 from exo_gravity.hardware.ownership import bus_lock, owned_bus
 
-from .simulated_rig import NoWatchdog
+from .arms import NoWatchdog
 
 
 @pytest.fixture

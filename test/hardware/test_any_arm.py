@@ -9,7 +9,6 @@ MuJoCo's model of the same URDF says what gravity needs, and the simulated devic
 from __future__ import annotations
 
 import ctypes
-import functools
 import math
 from collections.abc import Sequence
 
@@ -25,7 +24,7 @@ from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.params import values_of
-from exo_gravity.core.safety.drive import Drive, Efforts, FaultCode, Send
+from exo_gravity.core.safety.drive import Drive, FaultCode, Send
 from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.motion_monitor import GRAVITY, MotionMonitor
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
@@ -40,7 +39,7 @@ from exo_gravity.sim.urdf import UrdfConfig
 from ..support.chains import random_chain
 from ..support.thorough import quick
 from ..support.urdf_oracle import MujocoArm
-from .carried_arm import DRIVEN, JudgedArm
+from .arms import DRIVEN, JudgedArm
 
 COUNTS = (1, 2, 3, 5, 6, 7, 9)
 FEW, MANY = 3, 60  # arms at random of each number of joints
@@ -59,14 +58,6 @@ def settings_for(text: str, names: Sequence[str], **given: object) -> Settings:
     return settings_of(values_of(compensator_table(given), given), UrdfArm(text, names, "hand"))
 
 
-@functools.cache
-def hanging_chain(count: int, trunk: TrunkState) -> tuple[UrdfConfig, list[float]]:
-    """Return an arm at random with `count` joints that hangs off its stops on `trunk`, and its angles there."""
-    home = np.random.default_rng(count).uniform(-FREE, FREE, count)
-    down = hanging(chain_config(count, ()), trunk)
-    return chain_config(count, (np.array(down) - home).tolist()), home.tolist()
-
-
 def chain_config(count: int, zero: Sequence[float]) -> UrdfConfig:
     """Return the arm at random with `count` joints. zero: of `random_chain`."""
     text, names = random_chain(count, count, zero)
@@ -74,57 +65,16 @@ def chain_config(count: int, zero: Sequence[float]) -> UrdfConfig:
     return UrdfConfig(text=text, joint_names=names, hand="hand", **mechanics)
 
 
-def hanging(config: UrdfConfig, trunk: TrunkState) -> list[float]:
-    """Return the angles at which the arm comes to rest when it falls under damping, past its stops."""
+def hanging_chain(count: int, trunk: TrunkState) -> tuple[UrdfConfig, list[float]]:
+    """Return an arm at random with `count` joints that hangs off its stops on `trunk`, and its angles there."""
+    config, home = chain_config(count, ()), np.random.default_rng(count).uniform(-FREE, FREE, count)
     model, _ = config.models()
     model.dof_frictionloss[:], model.dof_damping[:], model.jnt_limited[:] = 0.0, 0.2, 0
     model.opt.gravity = config.felt("left", trunk)[0]
     data = mujoco.MjData(model)
-    while data.time == 0.0 or np.abs(data.qvel).max() > 1e-4:
+    while data.time == 0.0 or np.abs(data.qvel).max() > 1e-4:  # it falls under damping, past its stops
         mujoco.mj_step(model, data, 5_000)
-    return list(data.qpos.tolist())
-
-
-class CarriedChain(JudgedArm):
-    """An arm at random of `count` joints with AK80-9 that hangs, and a compensator that carries it."""
-
-    def __init__(self, count: int, trunk: TrunkState = UPRIGHT) -> None:
-        config, self.home = hanging_chain(count, trunk)
-        text, self.names = config.text, config.joint_names
-        self.oracle = MujocoArm(text, self.names)
-        joints = [JointMotor(SPEC, 1 + n, wire_format=MIT) for n in range(count)]
-        device = SimulatedDevice(SimulatedArm(config), [simulated(joint) for joint in joints])
-        device.arm.reset(self.home)
-        device.pitch, device.roll = trunk.pitch, trunk.roll
-        span = [(max(-3.1, angle - 1.0), min(3.1, angle + 1.0)) for angle in self.home]
-        low, high = zip(*span, strict=True)
-        limits = Limits(
-            tuple(self.names),
-            low,
-            high,
-            max_effort=(SPEC.peak_torque,) * count,
-            home=tuple(self.home),
-        )
-        settings = settings_for(text, self.names, max_effort=[SPEC.peak_torque] * count, use_imu=trunk is not UPRIGHT)
-        self.answers: list[tuple[tuple[float, ...], tuple[float, ...]]] = []
-        super().__init__(device, settings, joints, limits, RATE)
-        self.controller.change = self._note
-
-    def _note(self, efforts: Efforts) -> Efforts:
-        """Note positions (n,) rad and efforts (n,) Nm of an answer."""
-        if efforts.effort:
-            self.answers.append((tuple(sample.position for sample in self.loop.samples), tuple(efforts.effort)))
-        return efforts
-
-    def raise_it(self) -> None:
-        """Let the wearer raise the arm, and let go."""
-        goal = [angle - math.copysign(LIFT, angle) for angle in self.home]  # away from the stops
-        self.raise_to(goal, LIFTED, HOLD)
-        self.check_controller()
-
-    def needed(self, theta: Sequence[float]) -> np.ndarray:
-        """What gravity needs at `theta` (n,) rad, (n,) Nm."""
-        return self.oracle.torque(theta, 9.80665 * gravity_in_trunk(self.device.pitch, self.device.roll))
+    return chain_config(count, (data.qpos - home).tolist()), home.tolist()
 
 
 @pytest.mark.parametrize(
@@ -147,14 +97,23 @@ PLAYED = [(count, UPRIGHT) for count in COUNTS] + [(3, TILTED)]
 
 @pytest.mark.parametrize(("count", "trunk"), quick([(1, UPRIGHT), (3, TILTED)], PLAYED))
 def test_an_arm_is_proven_carried_raised_and_let_down_by_its_own_gravity(count: int, trunk: TrunkState) -> None:
-    arm = CarriedChain(count, trunk=trunk)
+    config, home = hanging_chain(count, trunk)
+    joints = [JointMotor(SPEC, 1 + n, wire_format=MIT) for n in range(count)]
+    device = SimulatedDevice(SimulatedArm(config), [simulated(joint) for joint in joints])
+    device.arm.reset(home)
+    device.pitch, device.roll = trunk.pitch, trunk.roll
+    low, high = np.clip(home, -2.1, 3.1) - 1.0, np.clip(home, -3.1, 2.1) + 1.0
+    most, names = (SPEC.peak_torque,) * count, tuple(config.joint_names)
+    settings = settings_for(config.text, names, max_effort=list(most), use_imu=trunk is not UPRIGHT)
+    arm = JudgedArm(device, settings, joints, Limits(names, low, high, max_effort=most, home=tuple(home)), RATE)
     arm.carry()
     assert arm.fastest < DRIVEN
-    arm.raise_it()
-    (read, effort), _ = arm.answers[-2:]  # the newest one leaves with the next cycle
-    assert np.abs(effort - arm.needed(read)).max() < ANSWERED
-    applied = [motor.torque(0.0, 0.0) for motor in arm.device.motors]
-    assert np.abs(np.subtract(applied, effort)).max() <= 0.5 * CODE + 1e-9
+    arm.raise_to([angle - math.copysign(LIFT, angle) for angle in home], LIFTED, HOLD)  # away from the stops
+    effort, gravity = arm.direct.answer.effort, gravity_in_trunk(trunk.pitch, trunk.roll)
+    needed = MujocoArm(config.text, names).torque([joint.position for joint in arm.loop.samples], 9.80665 * gravity)
+    assert np.abs(effort - needed).max() < ANSWERED
+    arm.cycle()  # with which they leave
+    assert np.abs([motor.torque(0.0, 0.0) for motor in arm.motors] - needed).max() <= 0.5 * CODE + 1e-9
     assert arm.let_down()
 
 
@@ -192,13 +151,13 @@ def test_a_wearer_and_a_load_are_carried_on_any_links_under_any_tilt(held: dict[
     assert settings.mass == pytest.approx(bare.total_mass + 0.6 * sum(mass) + load[0])
 
 
-def test_inertia_momentum_and_a_base_that_turns_faster_agree_with_mujocos() -> None:
+def test_inertia_and_momentum_agree_with_mujocos() -> None:
     count = 6
     text, names = random_chain(count, seed=3)
     arm = UrdfArm(text, names, "hand").with_payload(0.8, (0.05, 0.0, 0.02))
     config = UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(0.0,) * count)
-    model, turning = config.models((0.8, 0.05, 0.0, 0.02))
-    model.opt.gravity = turning.opt.gravity = np.zeros(3)
+    model, _ = config.models((0.8, 0.05, 0.0, 0.02))
+    model.opt.gravity = np.zeros(3)
     model.dof_damping[:] = model.dof_frictionloss[:] = 0.0
     data, random = mujoco.MjData(model), np.random.default_rng(4)
     whole = np.zeros((count, count))
@@ -216,14 +175,6 @@ def test_inertia_momentum_and_a_base_that_turns_faster_agree_with_mujocos() -> N
         momentum, _ = arm.links.momentum(theta, velocity)
         np.testing.assert_allclose(momentum, whole @ velocity, rtol=0.0, atol=1e-5)
         assert np.all(1.0 / np.diag(np.linalg.inv(whole)) > 0.9 * np.array(arm.links.least))
-        spin_up = random.normal(size=3)
-        on_ball = mujoco.MjData(turning)
-        on_ball.qpos[0], on_ball.qpos[4:], on_ball.qacc[:3] = 1.0, theta, spin_up
-        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
-            compute(turning, on_ball)
-        bias = np.empty(3 + count)
-        mujoco.mj_rne(turning, on_ball, 1, bias)
-        np.testing.assert_allclose(arm.turning_torque("left", theta, spin_up), bias[3:], rtol=0.0, atol=1e-5)
 
 
 def test_the_exact_momentum_balance_holds() -> None:
@@ -308,14 +259,16 @@ def test_the_torque_of_a_shipped_arm_is_no_fault_and_its_opposite_is(name: str) 
         assert fault is None or fault.code is FaultCode.UNEXPLAINED_TORQUE
 
 
-def test_axes_that_are_no_directions_and_moments_without_a_link_are_refused() -> None:
-    text, names = random_chain(3, seed=3)
-    arm = UrdfArm(text, names, "hand")
-    none = (0.0,) * 3
-    with pytest.raises(ParameterError, match=r"largest_moment = .*must be zeros without axis_x"):
-        limits_of(arm, axis_x=none, axis_y=none, axis_z=none)
-    with pytest.raises(ParameterError, match=rf"axis_x, _y, _z of {names[1]} = .*must be a vector of length 1"):
-        limits_of(arm, axis_x=(*limits_of(arm).axis_x[:1], 0.0, 0.0), axis_y=(*limits_of(arm).axis_y[:1], 0.0, 1.0),
-                  axis_z=(*limits_of(arm).axis_z[:1], 0.0, 0.0))  # fmt: skip
-    with pytest.raises(ParameterError, match=rf"largest_moment of {names[0]} = .*must be 0 for a link without"):
-        limits_of(arm, link_x=none, link_y=none, link_z=none)
+NO = dict.fromkeys("xyz", (0.0,) * 3)
+AXIS, LINK = ({f"{name}_{axis}": NO[axis] for axis in NO} for name in ("axis", "link"))
+
+
+@pytest.mark.parametrize(("given", "words"), [
+    (AXIS, r"largest_moment = .*must be zeros without axis_x"),
+    ({"axis_x": (1.0, 0.0, 0.0), "axis_y": (0.0, 0.0, 1.0), "axis_z": (0.0, 0.0, 0.0)},
+     r"axis_x, _y, _z of joint_1 = .*must be a vector of length 1"),
+    (LINK, r"largest_moment of joint_0 = .*must be 0 for a link without"),
+])  # fmt: skip
+def test_axes_that_are_no_directions_and_moments_without_a_link_are_refused(given, words) -> None:
+    with pytest.raises(ParameterError, match=words):
+        limits_of(UrdfArm(*random_chain(3, seed=3), "hand"), **given)

@@ -1,12 +1,14 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The control loop on the simulated arm, in virtual time: whatever raises an exception, the arm is let down.
 
-Also where its motors are on two buses.
+Also where its motors are on two buses, and where another owner left them on.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import can
 import pytest
@@ -23,14 +25,14 @@ from exo_gravity.hardware import control_loop
 from exo_gravity.hardware.can.can_port import CanPort, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LONGEST_ABSENCE, LOWERING, ControlLoop, NoController
-from exo_gravity.sim.virtual_time import Wire
+from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LOWERING, ControlLoop, NoController
+from exo_gravity.sim.events import ACTS
 
+from ..support.simulated_device import drive_of
 from ..support.thorough import quick
-from .rig import CYCLE, FIRST, LIMITS, MOTORS_OF_ARM, SECOND, CarriedArm, TwoBusRig, VirtualRig, raised_arm
+from .arms import CYCLE, DRIVEN, FIRST, LIMITS, MOTORS_OF_ARM, ON_TWO, SECOND, CarriedArm
+from .arms import raised_arm as raised
 from .wires import Responder
-
-OPPOSED_SPEED = 0.5  # rad/s, of 6 unopposed
 
 
 def fail(*_: object) -> None:
@@ -38,71 +40,59 @@ def fail(*_: object) -> None:
 
 
 def test_stopping_lets_the_arm_down_and_switches_the_motors_off():
-    arm = raised_arm()
+    arm = raised()
     assert arm.loop.stop()
-    arm.rig.assert_let_down()
-    assert not arm.drives[-1].powered
-    assert not arm.loop.cycle()
+    arm.assert_down()
+    assert not arm.notes.drive.powered and not arm.loop.cycle()
 
 
 def test_an_arm_is_let_down_after_its_computer_was_suspended():
-    arm = raised_arm()
+    arm = raised()
     arm.clock.slept += 0.9  # less may be a thread that was not run
     arm.run(0.1)
-    assert arm.safety.state is State.ACTIVE
+    assert arm.state is State.ACTIVE
     arm.clock.slept += 3600.0
     arm.run(2 * CYCLE)
     assert arm.safety.fault[:2] == ("motor_silent", "the computer was suspended for 3601 s")
     arm.assert_let_down()
 
 
-@pytest.mark.parametrize(
-    "error", [ValueError("garbled line"), pytest.param(OSError("no device"), marks=pytest.mark.thorough)]
-)
-def test_an_exception_of_the_bus_lets_the_arm_down_on_a_bus_that_was_opened_again(error):
-    arm = raised_arm()
-    arm.wire.break_down(error)
-    arm.run_until(lambda: arm.wire.opened == 2)
-    assert arm.safety.fault.code == "bus_error"
-    assert str(error) in arm.safety.fault.reason
-    arm.assert_let_down()
-
-
-def test_a_bus_that_stays_away_is_tried_again_and_the_torque_continues_from_what_the_motors_hold():
-    arm = raised_arm()
-    held = arm.drives[-1].effort[1]
+def test_a_bus_that_fails_is_opened_again_and_the_torque_continues_from_what_the_motors_hold():
+    arm = raised()
+    held = arm.notes.drive.effort[1]
     arm.wire.refusal = BusError("no such device")
-    arm.wire.break_down(OSError("no such device"))
-    arm.run_until(lambda: arm.safety.is_unreached)
+    arm.wire.break_down(ValueError("garbled line"))
+    assert arm.run_until(lambda: arm.safety.is_unreached)
+    assert arm.fault == "bus_error" and "garbled line" in arm.safety.fault.reason
     arm.run(1.0)
-    assert arm.rig.motors_on == [True] * 4
-    assert not arm.loop.is_off
-    assert arm.drives[-1].powered
-    count = len(arm.drives)
+    assert all(arm.motors_on) and not arm.loop.is_off and arm.notes.drive.powered
     arm.wire.refusal = None
-    arm.run_until(lambda: arm.wire.opened == 2)
-    arm.run_until(lambda: len(arm.drives) > count + 10)
-    first = [drive.effort[1] for drive in arm.drives[count:]]
-    assert max(abs(effort - held) for effort in first[:5]) < 0.3
+    assert arm.run_until(lambda: arm.wire.opened == 2)
+    for _ in range(5):
+        arm.cycle()
+        assert abs(arm.notes.drive.effort[1] - held) < 0.3
     arm.assert_let_down()
 
 
 def test_a_controller_that_fails_at_samples_never_stops_the_control():
-    arm = raised_arm()
-    arm.controller.failures["take"] = ZeroDivisionError("division by zero")
-    before = arm.loop.cycles
+    arm = raised()
+    take, before = arm.controller.take, arm.loop.cycles
+
+    def take_and_fail(now, samples):
+        take(now, samples)
+        fail()
+
+    arm.controller.take = take_and_fail
     arm.run(0.2)
     assert arm.loop.cycle_errors == arm.loop.cycles - before > 20
-    assert arm.safety.state is State.ACTIVE
-    assert arm.loop.cycle_error == "ZeroDivisionError: division by zero"
+    assert arm.state is State.ACTIVE and arm.loop.cycle_error == "ZeroDivisionError: division by zero"
 
 
 def test_failing_efforts_let_the_arm_down():
-    arm = raised_arm()
-    arm.controller.failures["efforts"] = RuntimeError("no middleware")
+    arm = raised()
+    arm.controller.efforts = fail
     arm.run(2 * CYCLE)
-    assert arm.safety.fault.code == "internal_error"
-    assert "no middleware" in arm.safety.fault.reason
+    assert arm.fault == "internal_error" and "division by zero" in arm.safety.fault.reason
     arm.assert_let_down()
     assert arm.loop.failure is None
 
@@ -110,27 +100,23 @@ def test_failing_efforts_let_the_arm_down():
 def test_an_arm_whose_owner_stands_still_is_let_down(monkeypatch):
     """Services, the lease and the look at the watchdog are the owner's: without it no one could let the arm down."""
     monkeypatch.setattr(control_loop, "LONGEST_ABSENCE", 1.0)
-    arm = raised_arm()
-    for _ in range(2):
-        arm.loop.attended = arm.clock.monotonic()
-        arm.run(0.9)
-        assert arm.safety.state is State.ACTIVE
+    waiting, arm = raised(), raised()
+    waiting.safety.disable(waiting.now)  # until the arm is down, which is no fault
+    for each in (waiting, arm, arm):
+        each.loop.attended = each.now
+        each.run(0.9)
+    waiting.run(0.2)
+    assert (waiting.fault, arm.state) == ("", State.ACTIVE)
     arm.run(0.2)
     assert arm.safety.fault[:2] == ("internal_error", "no service and no timer of the node has run for 1 s")
-    arm.assert_let_down()
-
-
-def test_an_owner_that_waits_until_its_arm_is_down_causes_no_fault():
-    arm = raised_arm()
-    arm.loop.attended = arm.clock.monotonic()
-    arm.safety.disable(arm.clock.monotonic())
-    arm.assert_let_down()
-    arm.run(2.0 * LONGEST_ABSENCE)
-    assert arm.safety.fault is None
 
 
 class Killed(BaseException):
     """What the watchdog does to the process."""
+
+
+def kill() -> None:
+    raise Killed
 
 
 def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_nothing_until_it_is_killed():
@@ -142,61 +128,62 @@ def test_a_failing_state_machine_hands_the_arm_over_to_the_watchdog_and_sends_no
         arm.clock.later(HAND_OVER_TIME - 0.01, kill)
         return True
 
-    def kill() -> None:
-        raise Killed
-
-    arm = CarriedArm(hand_over=hand_over)
+    arm = raised()
+    arm.loop._hand_over = hand_over
     arm.safety.step = fail
     with pytest.raises(Killed):
         arm.run(1.0)
     assert all(len(message.data) == 8 and message.data[0] < 5 for message in listeners[0].received)  # replies
-    assert arm.rig.motors_on == [True] * 4
-    assert arm.drives[-1].powered
+    assert all(arm.motors_on) and arm.notes.drive.powered
     assert isinstance(arm.loop.failure, ZeroDivisionError)
 
 
-def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(monkeypatch):
-    monkeypatch.setattr(control_loop, "LOWERING", replace(LOWERING, fade=4.0, rest=4.0))  # the whole: test_supply
-    arm = raised_arm()
+def cut_supply(arm: CarriedArm, duration: float) -> None:
+    """Take the power of all motors away for `duration` s."""
+    for joint in range(len(arm.motors)):
+        ACTS["unplugged"](arm, joint, duration)
+
+
+@pytest.mark.parametrize("cut", [0.0, 2.0])
+def test_without_a_watchdog_a_failing_state_machine_is_replaced_by_damping_until_the_arm_is_down(cut, monkeypatch):
+    monkeypatch.setattr(control_loop, "LOWERING", replace(LOWERING, fade=4.0, rest=4.0))
+    arm = raised()
     arm.safety.step = fail
+    if cut:  # and the motors stay off when their supply returns
+        arm.clock.later(1.0, partial(cut_supply, arm, cut))
+        arm.clock.later(1.0 + cut, arm.forget)
     while arm.loop.cycle():
         pass
-    arm.rig.assert_let_down()
+    assert not cut or not arm.records["on"].any()
+    arm.assert_down()
 
 
 def test_a_failing_state_machine_ends_the_loop_of_an_arm_whose_motors_are_off():
-    rig = VirtualRig(pose=NO_TORQUE, carried=False)
-    loop = rig.loop_with().loop
-    loop.safety.step = fail
-    assert loop.cycle() and loop.cycle() and not loop.cycle()
-    assert isinstance(loop.failure, ZeroDivisionError)
-    assert rig.motors_on == [False] * 4
+    arm = CarriedArm()
+    arm.safety.step = fail
+    assert arm.cycle() and arm.cycle() and not arm.cycle()
+    assert isinstance(arm.loop.failure, ZeroDivisionError) and not arm.device.powered
 
 
 def test_a_call_runs_between_two_cycles_and_a_cancelled_one_never():
-    loop = VirtualRig(pose=NO_TORQUE, carried=False).loop_with().loop
-    calls: list[str] = []
+    loop, calls = CarriedArm().loop, []
     assert loop.call(lambda: calls.append("cancelled")).cancel()
     future, failing = loop.call(lambda: "result"), loop.call(fail)
     loop.cycle()
-    assert future.result(0.0) == "result"
-    assert isinstance(failing.exception(0.0), ZeroDivisionError)
+    assert future.result(0.0) == "result" and isinstance(failing.exception(0.0), ZeroDivisionError)
     pending = loop.call(lambda: calls.append("too late"))
     loop.stop()
-    assert pending.cancelled()
-    assert calls == []
+    assert pending.cancelled() and calls == []
 
 
 def test_a_cycle_that_took_too_long_is_counted_and_not_made_up():
-    rig = VirtualRig(pose=NO_TORQUE, carried=False)
-    loop = rig.loop_with().loop
-    loop.cycle()
-    loop.call(lambda: rig.clock.sleep(5.0 * CYCLE))
-    loop.cycle()
-    before = rig.clock.monotonic()
-    loop.cycle()
-    assert loop.late == 1
-    assert rig.clock.monotonic() - before == pytest.approx(CYCLE)
+    arm = CarriedArm()
+    arm.cycle()
+    arm.between_cycles(lambda now: arm.clock.sleep(5.0 * CYCLE))
+    arm.cycle()
+    before = arm.now
+    arm.cycle()
+    assert arm.loop.late == 1 and arm.now - before == pytest.approx(CYCLE)
 
 
 def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
@@ -209,13 +196,10 @@ def test_the_thread_runs_the_cycles_until_the_loop_is_stopped():
     assert not loop.cycle()
 
 
-@pytest.mark.parametrize("echoes", [False, True])
-def test_our_own_frames_are_never_foreign(echoes: bool):
-    arm = raised_arm(echoes)
+def test_our_own_frames_are_never_foreign():
+    arm = raised(echoes=True)
     arm.run(1.0)
-    assert arm.bus.foreign_commands == 0
-    assert arm.safety.state is State.ACTIVE
-    assert ("echo" in arm.bus.ignored) == echoes
+    assert arm.bus.foreign_commands == 0 and "echo" in arm.bus.ignored and arm.state is State.ACTIVE
 
 
 # An arm whose motors are on two buses: one safety unit.
@@ -223,94 +207,118 @@ def test_our_own_frames_are_never_foreign(echoes: bool):
 FORMATS = pytest.mark.parametrize("wire_format", quick([MIT], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
 
 
-def carried(wire_format: WireFormat = MIT) -> CarriedArm:
-    return raised_arm(wire_format=wire_format, kind=TwoBusRig)
-
-
-def silence(wire: Wire, silent: bool = True) -> None:
-    wire.loss = float(silent)
-
-
 @FORMATS
 def test_an_arm_on_two_buses_is_carried_and_each_motor_is_commanded_on_its_own(wire_format: WireFormat) -> None:
-    arm = carried(wire_format)
+    arm = raised(channel=ON_TWO, wire_format=wire_format)
     before, counted = arm.loop.incomplete, arm.loop.cycles
+    listeners = {name: Responder(wire) for name, wire in arm.wires.items()}
     arm.run(1.0)
-    assert arm.rig.is_raised and arm.loop.cycles > counted + 100
-    assert arm.loop.incomplete == before
-    assert not any(half.strays for half in arm.rig.halves)
-    arm.safety.disable(arm.clock.monotonic())
+    assert arm.fastest < 0.05 and arm.loop.cycles > counted + 100 and arm.loop.incomplete == before
+    heard = {name: {frame.arbitration_id & 0x7F for frame in end.received} - {0} for name, end in listeners.items()}
+    assert heard == {FIRST: {1, 2}, SECOND: {3, 4}}
+    arm.safety.disable(arm.now)
     arm.assert_let_down()
 
 
 def test_both_buses_are_sent_their_commands_before_the_replies_of_either_are_awaited() -> None:
     """The replies take 0.2 to 0.4 ms on each bus: awaited one after the other they take longer than together."""
-    rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
-    rig.first.batch = rig.second.batch = 0.003  # the adapters deliver both together
+    arm = CarriedArm(channel=ON_TWO)
+    for wire in arm.wires.values():
+        wire.batch = 0.003  # the adapters deliver both together
     for _ in range(20):
-        start = rig.clock.monotonic()
-        assert bus.exchange(rig.drive, start + 0.007)
-        assert rig.clock.monotonic() - start < 0.005
+        start = arm.now
+        assert arm.bus.exchange(drive_of(NO_TORQUE), start + 0.007)
+        assert arm.now - start < 0.005
 
 
-@FORMATS
-@pytest.mark.parametrize("dead", quick([SECOND], [FIRST, SECOND]), ids=["first", "second"])
-def test_a_silent_bus_lets_the_whole_arm_down_and_its_motors_once_they_reply(
-    wire_format: WireFormat, dead: str
+def silence(arm: CarriedArm, name: str) -> None:
+    arm.wires[name].loss = 1.0
+
+
+def break_down(arm: CarriedArm, name: str) -> None:
+    arm.wires[name].refusal = BusError("no such device")
+    arm.wires[name].break_down(can.CanOperationError("No buffer space available"))
+
+
+def plug_in(arm: CarriedArm, name: str) -> None:
+    arm.wires[name].loss, arm.wires[name].refusal, arm.wires[name].broken = 0.0, None, set()
+
+
+SILENT = (silence, FaultCode.MOTOR_SILENT, "no motor on {} replies: the bus is lost, or the supply is cut")
+BROKEN = (break_down, FaultCode.BUS_ERROR, "No buffer space available")
+LOST = [(MIT, SECOND, *SILENT), (MIT, FIRST, *SILENT), (MIT_V3, SECOND, *SILENT), (MIT, SECOND, *BROKEN)]
+
+
+@pytest.mark.parametrize(("wire_format", "dead", "lose", "code", "said"), quick([LOST[0], LOST[-1]], LOST))
+def test_a_bus_that_is_lost_lets_the_whole_arm_down_and_its_motors_once_they_are_reached(
+    wire_format: WireFormat, dead: str, lose: Callable[[CarriedArm, str], None], code: FaultCode, said: str
 ) -> None:
-    arm = carried(wire_format)
-    rig = arm.rig
+    arm = raised(channel=ON_TWO, wire_format=wire_format)
     live = [0, 1] if dead == SECOND else [2, 3]
-    silence(rig.wires[dead])
+    lose(arm, dead)
     arm.run(0.2)
-    assert arm.safety.state is State.LETTING_DOWN and arm.safety.fault
-    assert arm.safety.fault.code is FaultCode.MOTOR_SILENT
-    assert f"no motor on {dead} replies: the bus is lost, or the supply is cut" in arm.safety.fault.reason
-    assert all(rig.damping[joint] > 0.3 * DAMPING for joint in live)
-    arm.run_until(lambda: arm.safety.is_unreached)
-    assert not any(arm.safety.limits.is_silent(arm.clock.monotonic(), arm.loop.samples[joint]) for joint in live)
+    assert arm.state is State.LETTING_DOWN and arm.safety.fault and arm.safety.fault.code is code
+    assert said.format(dead) in arm.safety.fault.reason
+    assert [motor.damping > 0.3 * DAMPING for motor in arm.motors] == [joint in live for joint in range(4)]
+    assert arm.run_until(lambda: arm.safety.is_unreached)
+    assert not any(arm.safety.limits.is_silent(arm.now, arm.loop.samples[joint]) for joint in live)
     assert not arm.loop.is_off
-    silence(rig.wires[dead], False)
-    arm.assert_let_down()
-
-
-def test_a_bus_that_fails_does_not_keep_the_other_from_its_commands() -> None:
-    arm = carried()
-    rig = arm.rig
-    rig.second.refusal = BusError("no such device")
-    rig.second.break_down(can.CanOperationError("No buffer space available"))
-    arm.run(0.2)
-    assert arm.safety.fault and arm.safety.fault.code is FaultCode.BUS_ERROR
-    assert all(damping > 0.3 * DAMPING for damping in rig.damping[:2])
-    assert rig.damping[2:] == [0.0, 0.0]
-    rig.second.refusal = None  # it is plugged in again
-    rig.second.broken = set()
+    plug_in(arm, dead)
     arm.assert_let_down()
 
 
 def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_for_off() -> None:
-    arm = carried()
-    rig = arm.rig
-    arm.safety.disable(arm.clock.monotonic())
-    arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
-    rig.second.refusal = BusError("no such device")
-    rig.second.break_down(can.CanOperationError("Network is down"))
+    arm = raised(channel=ON_TWO)
+    arm.safety.disable(arm.now)
+    assert arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
+    break_down(arm, SECOND)
     arm.run(0.5)
     assert not arm.loop.is_off
-    rig.second.refusal = None
-    rig.second.broken = set()
-    arm.run_until(lambda: arm.loop.is_off)
-    assert rig.motors_on == [False] * 4
+    plug_in(arm, SECOND)
+    arm.assert_let_down()
 
 
 def test_a_command_to_a_motor_that_is_on_the_other_bus_is_no_foreign_command() -> None:
-    rig = TwoBusRig()
-    bus = MotorBus(rig.arm.ports(rig.clock), rig.motors, clock=rig.clock)
-    command = message_of((3, rig.motors[2].command(1.0, 0.0)))
-    rig.first.carry(None, command)
-    bus.receive_until(rig.clock.monotonic() + CYCLE)
-    assert bus.ignored == {"foreign frame": 1} and not bus.foreign_commands
-    rig.second.carry(None, command)
-    bus.receive_until(rig.clock.monotonic() + CYCLE)
-    assert bus.ignored[FOREIGN_COMMAND] == bus.foreign_commands == 1
+    arm = CarriedArm(channel=ON_TWO)
+    command = message_of((3, MOTORS_OF_ARM[2].command(1.0, 0.0)))
+    for name, expected in ((FIRST, 0), (SECOND, 1)):
+        arm.wires[name].carry(None, command)
+        arm.bus.receive_until(arm.now + CYCLE)
+        assert arm.bus.foreign_commands == arm.bus.ignored[FOREIGN_COMMAND] == expected
+    assert arm.bus.ignored["foreign frame"] == 1
+
+
+# Motors that another owner left.
+
+
+def next_loop(arm: CarriedArm) -> ControlLoop:
+    """Return the loop of an owner that knows nothing of the last one."""
+    bus, limits = MotorBus(arm.on_bus.ports(arm.clock), arm.on_bus.motors, clock=arm.clock), arm.on_bus.limits
+    bus.listen()
+    return ControlLoop(bus, SafetyMachine(limits, CYCLE, arm.on_bus.motors), CYCLE, NoController())
+
+
+@pytest.mark.parametrize(("wire_format", "silent_for"), [(MIT, 0.0), (MIT_V3, 3.0)], ids=["at once", "reached late"])
+def test_motors_that_an_owner_without_notes_left_on_are_damped_and_let_down(
+    wire_format: WireFormat, silent_for: float
+) -> None:
+    arm = raised(wire_format=wire_format).leave()
+    arm.device.bus_silent = silent_for > 0.0
+    arm.clock.later(silent_for, partial(setattr, arm.device, "bus_silent", False))
+    loop, end = next_loop(arm), arm.now + 30.0
+    loop.safety.enable(arm.now)  # refused: the arm does not hang
+    while arm.now < end and (arm.device.powered or not loop.is_off):
+        loop.cycle()
+    arm.assert_down()
+    assert arm.fastest < DRIVEN  # 5.3 rad/s where the first frame is zero torque
+
+
+@pytest.mark.parametrize(("make", "is_on"), [(CarriedArm, False), (raised, True)], ids=["off", "on"])
+def test_a_loop_can_end_at_once_while_no_motor_was_ever_heard(make: Callable[[], CarriedArm], is_on: bool) -> None:
+    arm = make().leave()
+    arm.device.bus_silent = True
+    loop = next_loop(arm)
+    loop.cycle()
+    arm.device.bus_silent = False
+    loop.stop()
+    assert arm.motors_on == [is_on] * 4  # not known, so nothing was sent

@@ -2,7 +2,6 @@
 """The trunk's orientation from an IMU: on simulated motions known exactly, and on recorded ones (BROAD)."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,14 +47,7 @@ def test_any_mounting_of_the_imu_gives_the_tilt_of_the_trunk(report):
         estimator = TrunkEstimator(mounting.as_quat())
         answer = last(estimator, samples_of(lambda t, fixed=world_from_trunk * mounting: fixed, report=report))
         assert (answer.pitch, answer.roll) == pytest.approx((-0.5, 0.2), abs=1e-4)
-
-
-@pytest.mark.parametrize("report", [False, True])
-def test_the_orientation_agrees_with_pitch_and_roll(report):
-    mounting = Rotation.from_euler("zyx", (2.0, 0.4, -1.0))
-    bow = samples_of(lambda t: Rotation.from_euler("xyz", (0.3, 0.2 * t, 0.1)) * mounting, report=report)
-    answer = last(TrunkEstimator(mounting.as_quat()), bow)
-    assert down(answer.orientation) == pytest.approx(gravity(answer), abs=1e-6)
+        assert down(answer.orientation) == pytest.approx(gravity(answer), abs=1e-6)
 
 
 def test_a_bow_through_90_degrees_is_followed_without_a_jump():
@@ -133,28 +125,23 @@ def frozen(count, rate=100.0, **values):
     return (GOOD._replace(time=5.0 + (k + 1) / rate, **values) for k in range(count))
 
 
-@pytest.mark.parametrize("orientation", [None, ALIGNED])
-def test_a_frozen_imu_is_refused_after_a_tenth_of_a_second_and_followed_again_once_it_measures(orientation):
-    estimator = settled(report=orientation is not None)
-    accepted = [estimator.update(sample) for sample in frozen(10, orientation=orientation)]
-    assert all(accepted)
-    for sample in list(frozen(40, orientation=orientation))[10:]:
-        with pytest.raises(ParameterError, match="the IMU or its driver is frozen"):
-            estimator.update(sample)
+FROZEN = [(100.0, 10, 11, None), (100.0, 10, 11, ALIGNED), (20.0, 9, 10, None), (1000.0, 99, 103, None)]
+
+
+@pytest.mark.parametrize(("rate", "accepted", "refused", "orientation"), FROZEN)
+def test_a_frozen_imu_is_refused_after_a_tenth_of_a_second_and_followed_again_once_it_measures(
+    rate, accepted, refused, orientation
+):
     report = orientation is not None
-    tilted = [
-        estimator.update(s) for s in samples_of(lambda t: Rotation.from_euler("y", 0.3), start=5.4, report=report)
-    ]
+    estimator = settled(report, rate=rate)
+    samples = list(frozen(refused, rate, orientation=orientation))
+    assert all(estimator.update(sample) for sample in samples[:accepted])
+    with pytest.raises(ParameterError, match="the IMU or its driver is frozen"):
+        estimator.update(samples[-1])
+    begin = 5.4 + refused / rate
+    moved = samples_of(lambda t: Rotation.from_euler("y", 0.3), rate=rate, start=begin, report=report)
+    tilted = [estimator.update(sample) for sample in moved]
     assert tilted[0] is None and tilted[-1].pitch == pytest.approx(0.3, abs=1e-3)
-
-
-def test_a_slow_or_fast_imu_is_taken_for_frozen_by_samples_and_by_time():
-    slow, fast = settled(rate=20.0), settled(rate=1000.0)
-    assert all(slow.update(sample) is not None for sample in frozen(9, rate=20.0))
-    assert all(fast.update(sample) is not None for sample in frozen(99, rate=1000.0))
-    for estimator, rate, count in ((slow, 20.0, 10), (fast, 1000.0, 103)):
-        with pytest.raises(ParameterError, match="the IMU or its driver is frozen"):
-            estimator.update(list(frozen(count, rate))[-1])
 
 
 @pytest.mark.parametrize("missing", [(0.0, 0.0, 0.0, 0.0), (math.nan,) * 4])
@@ -184,33 +171,11 @@ def test_a_mounting_or_a_range_that_no_sensor_has_is_refused(name, value):
 def test_values_beyond_the_given_ranges_are_refused_and_at_the_range_accepted():
     estimator = TrunkEstimator(ALIGNED, 100.0, gyroscope_range=4.4, accelerometer_range=19.6)
     last(estimator, samples_of(lambda t: Rotation.identity()))
-    for wrong, problem in (
-        (GOOD._replace(angular_velocity=(0.0, 5.0, 0.0)), "gyroscope_range = 4"),
-        (GOOD._replace(acceleration=(0.0, 25.0, G)), "accelerometer_range = 19"),
-    ):
-        with pytest.raises(ParameterError, match=problem):
-            estimator.update(wrong)
+    with pytest.raises(ParameterError, match="gyroscope_range = 4"):
+        estimator.update(GOOD._replace(angular_velocity=(0.0, 5.0, 0.0)))
+    with pytest.raises(ParameterError, match="accelerometer_range = 19"):
+        estimator.update(GOOD._replace(acceleration=(0.0, 25.0, G)))
     assert estimator.update(GOOD._replace(acceleration=(0.0, 19.6, G))) is not None
-
-
-def test_a_saturated_sample_is_carried_as_uncertainty():
-    estimator, untouched = settled(), settled()
-    before = untouched.update(GOOD)
-    after = estimator.update(GOOD._replace(angular_velocity=(0.0, 0.0, math.radians(2000.0))))
-    assert after is None or after.uncertainty > before.uncertainty
-
-
-def test_a_knock_beyond_the_range_is_followed_by_the_new_tilt_after_a_second_of_rest():
-    estimator, random = settled(), np.random.default_rng(8)
-    turned = np.array((0.0, math.sin(1.0), math.cos(1.0)))  # the true turn: 1 rad; the saturated rate shows 1.4
-    times, answers = 5.0 + 0.01 * np.arange(1, 405), []
-    for time in times:
-        rate, force = random.normal(0.0, 0.002, (2, 3)) + np.array((np.zeros(3), G * turned))
-        rate[0] += math.radians(2000.0) if time < 5.045 else 0.0
-        answers.append(estimator.update(ImuSample(time, rate, force)))
-    first = next(k for k, answer in enumerate(answers) if k >= 4 and answer)
-    assert answers[3] is None and times[first] < 6.5
-    assert all(answer.roll == pytest.approx(1.0, abs=0.02) for answer in answers[first:] if answer)
 
 
 EACH = pytest.mark.parametrize("path", quick(RECORDED[:2], RECORDED), ids=[path.stem for path in RECORDED])
@@ -239,14 +204,6 @@ def test_evenly_spaced_samples_give_vqf_alone():
     assert published.mean() > 0.9
     # The bias is read every tenth sample, and matters only to rounding.
     np.testing.assert_allclose(here[published], alone[published], atol=1e-5)
-
-
-def test_jitter_of_the_stamps_costs_little():
-    motion, counts = recorded(RECORDED[2])
-    jitter = np.random.default_rng(1).uniform(-0.3, 0.3, len(motion.times)) / motion.rate
-    jittered = replace(motion, times=motion.times + jitter)
-    rms, _, published = score(motion, follow(jittered).gravity, counts)
-    assert rms < score(motion, follow(motion).gravity, counts)[0] + 0.1 and published >= 0.99
 
 
 @EACH

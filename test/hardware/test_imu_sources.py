@@ -132,11 +132,6 @@ def test_the_time_that_opening_takes_is_not_silence(rig):
     assert reopening.openings == 1 and reopening.problem == ""
 
 
-def test_closing_closes_the_device(rig):
-    rig.reopening.close()
-    assert not rig.bus.is_open and rig.reopening.source is None
-
-
 def test_an_unplugged_chip_is_noticed_at_the_second_failed_reading(rig):
     source = rig.open()
     rig.read_for(0.1, source.read)
@@ -157,19 +152,28 @@ def test_a_chip_whose_values_are_stuck_is_closed_after_half_a_second_and_set_up_
     assert rig.reopening.problem == "" and rig.reopening.openings == 2
 
 
-def test_another_chip_is_refused_with_what_to_use(rig):
-    who_am_i = {"mpu6050": 0x75, "icm20948": 0x000, "lsm6dsox": 0x0F}[rig.values["source"]]
-    rig.chip.registers[who_am_i] = 0x71
-    with pytest.raises(DeviceError, match=r"Failed to find .* \(a chip of another kind is read by its ROS driver"):
-        rig.open()
+WHO_AM_I = {"mpu6050": 0x75, "icm20948": 0x000, "lsm6dsox": 0x0F}
+REFUSED = {
+    "another chip": (
+        lambda rig: rig.chip.registers.update({WHO_AM_I[rig.values["source"]]: 0x71}),
+        r"Failed to find .* \(a chip of another kind is read by its ROS driver"),
+    "another address": (lambda rig: setattr(rig.chip, "address", 0x6B), "No I2C device at address"),
+    "a rate that it does not have": (
+        lambda rig: rig.values.update(rate=500.0), r"rate = 500\.0: must be 250 or less"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", REFUSED)
+def test_what_cannot_be_opened_is_refused_with_what_to_use(rig, wrong):
+    spoil, words = REFUSED[wrong]
+    rig.reopening.close()
     assert not rig.bus.is_open
-
-
-def test_the_address_can_be_set(rig):
-    rig.chip.address = 0x6B
-    with pytest.raises(DeviceError, match="No I2C device at address"):
+    spoil(rig)
+    with pytest.raises(ParameterError if "rate" in wrong else DeviceError, match=words):
         rig.open()
-    assert "at 0x6B" in rig.open(**{"i2c.address": 0x6B}).name
+    assert rig.bus.is_open == ("rate" in wrong)
+    if rig.chip.address == 0x6B:
+        assert "at 0x6B" in rig.open(**{"i2c.address": 0x6B}).name
 
 
 def test_the_temperature_is_read_where_the_driver_reports_it(rig):
@@ -177,12 +181,6 @@ def test_the_temperature_is_read_where_the_driver_reports_it(rig):
     rig.read_for(0.1, source.read)
     expected = {"mpu6050": 26.03, "icm20948": None, "lsm6dsox": 26.0}[rig.values["source"]]
     assert source.temperature == (None if expected is None else pytest.approx(expected, abs=0.01))
-
-
-def test_a_wrong_parameter_is_not_retried(rig):
-    rig.values["rate"] = 500.0
-    with pytest.raises(ParameterError, match=r"rate = 500\.0: must be 250 or less"):
-        Reopening(rig.open).read(rig.time())
 
 
 def test_a_missing_bus_is_named():

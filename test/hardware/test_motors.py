@@ -8,57 +8,46 @@ At the start, signs are proven slowly, and exchanged IDs are found; elastic join
 from __future__ import annotations
 
 import itertools
-import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
 
 from exo_gravity.core.motors.ak import MIT, USUAL_MOTORS
 from exo_gravity.core.motors.damiao import (
-    CLEAR_ERROR,
     CTRL_MODE,
     DAMIAO_MIT,
     LOST,
-    PMAX,
-    REGISTERS,
     TIMEOUT,
     TMAX,
-    WRITE,
 )
 from exo_gravity.core.motors.families import FORMATS, MOTORS
-from exo_gravity.core.motors.frames import ENTER, EXIT
+from exo_gravity.core.motors.frames import ENTER
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.lab.inputs.arms import node_values, read_arm
+from exo_gravity.lab.inputs.parameter_file import load, packaged_config
+from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.motors.firmware import FIRMWARES, Firmware
+from exo_gravity.sim.params import device_of, simulator_table
 
 from ..support.copies import prepared
 from ..support.simulated_device import joints_of
 from ..support.thorough import quick
-from .carried_arm import (
-    DRIVEN,
-    ENERGY,
-    EVENTS,
-    PEAK,
-    POSE,
-    REAL_RATE,
-    UNKNOWN_LOSS,
-    CarriedArm,
-    JudgedArm,
-    ShippedArm,
-    assert_held_and_let_down,
-    assert_switched_on_and_off_without_a_collision,
-    cut,
-)
-from .wires import Responder, motor_bus
+from .arms import DRIVEN, ENERGY, PEAK, REAL_RATE, CarriedArm, JudgedArm
+from .wires import Responder
 
+POSE = (0.0, 0.5, 0.4, 0.6)  # rad
+# While a motor has no power and it is not yet known, the others push on with the torque of the pose before.
+UNKNOWN_LOSS = 1.9, 0.5  # rad/s and J
 DAMIAO_PEAK = (9.0, 18.0, 9.0, 7.0)  # Nm
 LIMIT = 0.2  # s, the time-out of the Damiao motors
 BY_NAME = {
@@ -69,6 +58,7 @@ POSES = {"elbow": [1.0], "seven_joints": [0.4, 0.3, 0.1, 0.6, 0.1, 0.2, -0.1]}  
 REPLYING = [name for name in FIRMWARES if name != "v3_query"]
 # The farthest from the boards of other tests: its time-out, and who asks for a reply.
 FARTHEST = "v3_2"
+NO_SIGNS = {"sign_check_torque": 0.0}
 
 
 def board(firmware: Firmware, name: str, can_id: int) -> JointMotor:
@@ -79,36 +69,54 @@ def board(firmware: Firmware, name: str, can_id: int) -> JointMotor:
     return JointMotor(spec, can_id, wire_format=wire_format)
 
 
-def joint_of(name: str, can_id: int) -> JointMotor:
-    """Return a motor of any family as a parameter file describes it."""
-    if name.startswith("AK"):
-        return JointMotor(MOTORS[name], can_id, wire_format=MIT)
-    return JointMotor(MOTORS[name], can_id, wire_format=DAMIAO_MIT, timeout=LIMIT)
-
-
-def arm_of(kind: str, **options: float) -> CarriedArm:
+def arm_of(kind: str, **options: Any) -> CarriedArm:
     """Return the paper's arm on the motors of a firmware, or on those of `BY_NAME`."""
     if kind in BY_NAME:
-        joints = [joint_of(name, number) for number, name in enumerate(BY_NAME[kind], 1)]
+        own = [{"wire_format": MIT} if name in USUAL_MOTORS else {"wire_format": DAMIAO_MIT, "timeout": LIMIT}
+               for name in BY_NAME[kind]]  # fmt: skip
+        joints = [JointMotor(MOTORS[name], n + 1, **own[n]) for n, name in enumerate(BY_NAME[kind])]
         return CarriedArm(joints, [simulated(joint) for joint in joints], DAMIAO_PEAK, **options)
     firmware = replace(FIRMWARES[kind], status_rate=500.0)  # as docs/wiring.md asks for
     joints = [board(firmware, name, number) for number, name in enumerate(USUAL_MOTORS, 1)]
     return CarriedArm(joints, [SimulatedMotor(joint, firmware) for joint in joints], PEAK, **options)
 
 
+def shipped_arm(name: str, rate: float, kinds: Mapping[int, type[DamiaoMotor]] = MappingProxyType({})) -> JudgedArm:
+    """Return the simulated arm of a file in config, without an IMU. kinds: of motors, by joint (0..), if others."""
+    nodes = load(packaged_config(f"{name}.yaml"))
+    arm = read_arm(nodes, "/right")
+    given = device_of(node_values(nodes, "/right/simulator", simulator_table(nodes["/right/simulator"])))
+    motors = [kinds[n](motor.joint) if n in kinds else motor for n, motor in enumerate(given.motors)]
+    return JudgedArm(
+        SimulatedDevice(given.arm, motors), replace(arm.settings, use_imu=False), arm.motors, arm.limits, rate
+    )
+
+
 @prepared
 def raised_arm(kind: str) -> JudgedArm:
     """Return an arm that the wearer has raised and left to its motors."""
-    shipped = kind in POSES
-    arm = ShippedArm(kind, REAL_RATE) if shipped else arm_of(kind, rate=REAL_RATE, proves_signs=False)
+    arm = shipped_arm(kind, REAL_RATE) if kind in POSES else arm_of(kind, rate=REAL_RATE, limits=NO_SIGNS)
     arm.carry()
     arm.raise_to(POSES.get(kind, POSE))
     return arm
 
 
+def assert_held_and_let_down(arm: JudgedArm) -> None:
+    """A raised arm stays where it is, and comes down gently."""
+    arm.run(3.0)
+    assert arm.caused.speed < 0.05
+    assert arm.let_down()
+    arm.assert_not_thrown()
+
+
 @pytest.mark.parametrize("kind", quick((FARTHEST, "mixed"), (*REPLYING, *BY_NAME)))
 def test_an_arm_is_switched_on_and_off_without_a_collision(kind: str) -> None:
-    assert_switched_on_and_off_without_a_collision(arm_of(kind, bitrate=1_000_000))
+    arm = arm_of(kind, bitrate=1_000_000)
+    arm.enable()
+    assert arm.run_until(lambda: arm.state is State.PROVING and arm.safety.waiting_for == "", 5.0)
+    arm.run(0.5)
+    assert arm.device.powered and arm.let_down(1.0)
+    assert arm.wire.collisions == arm.wire.bus_offs == 0
 
 
 # Seven joints take eight times as long as the elbow.
@@ -118,7 +126,7 @@ def test_an_arm_is_held_and_let_down(kind: str) -> None:
 
 
 def test_an_arm_on_can_fd_is_sent_only_fast_frames_and_is_held_and_let_down() -> None:
-    arm = arm_of("damiao", is_fd=True)
+    arm = arm_of("damiao", is_fd=True, limits=NO_SIGNS)
     listener = Responder(arm.wire)
     arm.carry()
     assert {(message.is_fd, message.bitrate_switch) for message in listener.received} == {(True, True)}
@@ -128,17 +136,40 @@ def test_an_arm_on_can_fd_is_sent_only_fast_frames_and_is_held_and_let_down() ->
 
 @pytest.mark.parametrize("kind", quick((FARTHEST, "damiao"), (*REPLYING, "damiao")))
 def test_a_torque_that_another_tool_left_in_the_motors_memory_is_not_carried_out(kind: str) -> None:
-    arm = arm_of(kind, remembered=4.9)
+    arm = arm_of(kind, limits=NO_SIGNS)
+    for joint in arm.on_bus.motors:
+        for frame in (*joint.enter, (joint.command_id, joint.command(4.9, 0.0)), *joint.exit):
+            arm.device.exchange(*frame)
     arm.carry()
     arm.assert_not_thrown()
 
 
-# Of stalls, the firmware that takes them worst.
+def cut(duration: float, *joints: int) -> Callable[[JudgedArm], None]:
+    """Return the event that the motors of `joints`, by default of all, have no power for `duration` s."""
+
+    def act(arm: JudgedArm) -> None:
+        for joint in joints or range(len(arm.motors)):
+            ACTS["unplugged"](arm, joint, duration)
+
+    return act
+
+
+EVENTS: dict[str, Callable[[JudgedArm], None]] = {
+    "all motors restart in 20 ms": cut(0.02),
+    "all motors restart in 80 ms": cut(0.08),
+    "supply cut for 3 s": cut(3.0),
+    "motor 2 restarts in 30 ms": cut(0.03, 1),
+    "motor 2 loses its power for 1 s": cut(1.0, 1),
+    "motor 1 loses its power for 1 s": cut(1.0, 0),
+    **{f"loop stalls for {ms} ms": lambda arm, ms=ms: arm.clock.stall(0.001 * ms) for ms in (20, 40, 60, 75, 120, 300)},
+}
+# Of stalls, the firmware that takes them worst. While a motor without power is late, the others stop driving.
 WORST = [
     ("open_drive", "loop stalls for 75 ms"),
     ("v3_2", "loop stalls for 120 ms"),
     ("damiao", "motor 2 restarts in 30 ms"),
     ("damiao", "loop stalls for 300 ms"),
+    ("ak", "motor 2 loses its power for 1 s"),
 ]
 OF_ALL = ("all motors restart in 80 ms", "supply cut for 3 s", "motor 1 loses its power for 1 s",
           "loop stalls for 60 ms", "loop stalls for 300 ms")  # fmt: skip
@@ -149,22 +180,21 @@ CASES = [*itertools.product((*REPLYING, "damiao"), EVENTS), *itertools.product(P
 def test_whatever_the_firmware_drops_the_motors_drive_no_joint(kind: str, event: str) -> None:
     """A motor that has lost its torque lets its joint fall; what counts is what motors drive, then and afterwards."""
     arm = raised_arm(kind)
-    arm.go_through(EVENTS[event], is_loss="stalls" not in event)
-    assert arm.safety.state is State.ACTIVE or arm.safety.fault
-    assert not any(motor.dips for motor in arm.device.motors) or arm.safety.fault, "torque was lost without a word"
-
-
-@pytest.mark.parametrize("motor", [1, 2])
-def test_while_a_motor_that_has_lost_its_power_is_late_the_others_stop_driving_their_joints(motor: int) -> None:
-    arm = raised_arm("ak")
-    arm.go_through(cut(1.0, motor), is_loss=True)
-    assert arm.caused.energy < ENERGY, arm.caused
+    EVENTS[event](arm)
+    arm.run(4.0)
+    if arm.state is not State.ACTIVE:
+        assert arm.safety.fault
+        arm.run_until(lambda: arm.loop.is_off, 11.0)
+    is_stall, is_one = "stalls" in event, "loses its power" in event
+    speed, energy = (DRIVEN, ENERGY) if is_stall else UNKNOWN_LOSS
+    arm.assert_not_thrown(speed, ENERGY if is_one and kind == "ak" else energy)
+    assert not any(motor.dips for motor in arm.motors) or arm.safety.fault, "torque was lost without a word"
 
 
 def test_a_board_in_query_reply_mode_is_not_started_and_the_reason_is_told() -> None:
     arm = arm_of("v3_query")
     arm.enable()
-    assert arm.run_until(lambda: arm.safety.state is State.DISABLED, 15.0)
+    assert arm.run_until(lambda: arm.state is State.DISABLED, 15.0)
     assert "query-reply" in arm.safety.refusal or "no reply" in arm.safety.refusal
     assert not arm.device.powered
 
@@ -172,25 +202,10 @@ def test_a_board_in_query_reply_mode_is_not_started_and_the_reason_is_told() -> 
 # What only Damiao motors do.
 
 
-def damiao_of(arm: JudgedArm, joint: int) -> DamiaoMotor:
-    motor = arm.device.motors[joint]
-    assert isinstance(motor, DamiaoMotor)
-    return motor
-
-
-def test_motors_that_let_go_in_a_stall_are_switched_on_again_and_lower_the_arm() -> None:
-    arm = raised_arm("damiao")
-    arm.clock.stall(0.3)
-    assert arm.run_until(lambda: arm.device.motors[0].dips and arm.safety.fault, 0.1)
-    assert arm.run_until(lambda: all(motor.entered for motor in arm.device.motors), 0.05)
-    assert arm.run_until(lambda: arm.loop.is_off, 30.0)
-    assert not arm.device.powered
-
-
 def test_a_motor_that_lets_go_says_so_where_its_torque_is_too_small_to_tell() -> None:
     arm = raised_arm("damiao")
-    assert abs(arm.device.motors[0].torque(arm.device.arm.positions[0], 0.0)) < 0.2  # Nm
-    damiao_of(arm, 0).write(TIMEOUT, 20)  # 1 ms, shorter than a cycle
+    assert abs(arm.motors[0].torque(arm.device.arm.positions[0], 0.0)) < 0.2  # Nm
+    arm.motors[0].write(TIMEOUT, 20)  # 1 ms, shorter than a cycle
     assert arm.run_until(lambda: arm.safety.fault, 0.05)
     fault = arm.safety.fault
     assert fault and fault.code is FaultCode.TORQUE_NOT_DELIVERED
@@ -198,48 +213,13 @@ def test_a_motor_that_lets_go_says_so_where_its_torque_is_too_small_to_tell() ->
 
 
 def test_a_host_that_died_leaves_motors_off_that_the_next_start_switches_on_again() -> None:
-    arm = arm_of("damiao")
-    for joint in range(len(BY_NAME["damiao"])):  # a host that dies with its motors on
-        motor = damiao_of(arm, joint)
+    arm = arm_of("damiao", limits=NO_SIGNS)
+    for motor in arm.motors:  # a host that dies with its motors on
         arm.device.exchange(motor.joint.command_id, ENTER)
         arm.device.exchange(*motor.joint.idle)
     arm.device.advance(1.0)
-    assert [damiao_of(arm, joint).latched for joint in range(len(BY_NAME["damiao"]))] == [LOST] * len(BY_NAME["damiao"])
+    assert [motor.latched for motor in arm.motors] == [LOST] * len(arm.motors)
     arm.carry()
-
-
-def foreign(data: bytes, motor: int = 2) -> Callable[[JudgedArm], None]:
-    return lambda arm: arm.wire.carry(None, message_of((motor, data)))
-
-
-def push(arm: JudgedArm) -> None:
-    joint = damiao_of(arm, 1).joint
-    stop = arm.wire.repeat(message_of((joint.command_id, joint.command(10.0, 0.0))), 0.01)
-    arm.clock.later(1.0, stop)
-
-
-def write(register: int, value: float) -> Callable[[JudgedArm], None]:
-    data = bytes((2, 0, WRITE, register)) + struct.pack("<f", value)
-    return lambda arm: arm.wire.carry(None, message_of((REGISTERS, data)))
-
-
-FOREIGN = {
-    "EXIT": foreign(EXIT),
-    "CLEAR_ERROR": foreign(CLEAR_ERROR),
-    "EXIT of another mode": foreign(EXIT, 0x202),
-    "a torque, 100 times a second": push,
-    "another range": write(PMAX, 12.6),
-}
-
-
-@pytest.mark.parametrize("command", quick(("a torque, 100 times a second",), FOREIGN))
-def test_a_foreign_command_is_answered_and_lets_the_arm_down(command: str) -> None:
-    arm = raised_arm("damiao")
-    FOREIGN[command](arm)
-    arm.run_until(lambda: arm.loop.is_off, 30.0)
-    assert arm.safety.fault and arm.safety.fault.code is FaultCode.FOREIGN_COMMAND
-    arm.assert_not_thrown(*UNKNOWN_LOSS)
-    assert not arm.device.powered
 
 
 SET_OTHERWISE = [
@@ -262,29 +242,14 @@ def test_a_motor_that_is_set_otherwise_than_the_file_says_is_not_switched_on(
     arm.run(max(0.0, asked - 0.3))
     arm.enable()
     arm.run(min(asked, 0.3))
-    damiao_of(arm, 1).write(register, value)
-    assert arm.run_until(lambda: arm.safety.state is State.DISABLED, 15.0)
+    arm.motors[1].write(register, value)
+    assert arm.run_until(lambda: arm.state is State.DISABLED, 15.0)
     assert f"motor 2 to be set right: {sentence}" in arm.safety.refusal
     assert not arm.device.powered and not arm.caused.energy
 
 
-def test_the_replies_of_a_motor_with_another_master_id_are_named() -> None:
-    arm = arm_of("damiao")
-    joints = [
-        replace(joint_of(name, 1 + i), master_id=0x20 + i if i == 1 else 0) for i, name in enumerate(BY_NAME["damiao"])
-    ]
-    bus = motor_bus(arm.wire, joints)
-    bus.listen()
-    arm.run(0.1)
-    assert bus.boards.hindrance(arm.now, 250.0) == ""
-    bus.receive_until(arm.now + 0.01)
-    sentence = bus.boards.hindrance(arm.now, 250.0)
-    assert sentence == "motor 2 replies with the ID 18: set master_id = 18, or 33 on the motor"
-
-
 # The start, and elastic joints.
 
-RIGHT, EXCHANGED = (1, 2, 3, 4), (1, 2, 4, 3)
 SLOWEST = 100.0  # Hz, the lowest in use: a light joint gains most speed in a cycle
 LIGHT = 6  # the seven-joint arm's last joint, 0.002 kg m^2
 
@@ -301,46 +266,34 @@ class LateMotor(DamiaoMotor):
         return self._past[0]
 
 
-def proven(name: str, kinds: dict[int, type[DamiaoMotor]], reversed_motor: int | None = None) -> ShippedArm:
-    """Return an arm whose signs are proven, or that is refused."""
-    arm = ShippedArm(name, SLOWEST, kinds)
-    if reversed_motor is not None:
-        ACTS["torque_reversed"](arm, reversed_motor)
-    arm.enable()
-    assert arm.run_until(lambda: arm.safety.state in (State.RAMPING_IN, State.FAULT))
-    return arm
-
-
-PROVEN: list[tuple[str, dict[int, type[DamiaoMotor]]]] = [
-    ("sim", {}),
-    ("elbow", {}),
-    ("three_joints", {}),
-    ("seven_joints", {}),
-    ("seven_joints", dict.fromkeys(range(LIGHT + 1), LateMotor)),
+LATE = dict.fromkeys(range(LIGHT + 1), LateMotor)
+PROVEN: list[tuple[str, Mapping[int, type[DamiaoMotor]], str]] = [
+    ("sim", {}, ""),
+    ("elbow", {}, ""),
+    ("three_joints", {}, ""),
+    ("seven_joints", {}, ""),
+    ("seven_joints", LATE, ""),
+    ("seven_joints", {}, FaultCode.WRONG_SIGN),
 ]
 
 
 @pytest.mark.parametrize(
-    ("name", "kinds"),
-    quick([PROVEN[0], PROVEN[-1]], PROVEN),
-    ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies"],
+    ("name", "kinds", "fault"),
+    quick([PROVEN[0], *PROVEN[-2:]], PROVEN),
+    ids=["paper's", "elbow", "three joints", "seven joints", "seven joints, late replies", "a light joint reversed"],
 )
-def test_no_joint_turns_fast_while_its_sign_is_proven(name: str, kinds: dict[int, type[DamiaoMotor]]) -> None:
-    arm = proven(name, kinds)
-    assert arm.safety.state is State.RAMPING_IN, arm.safety.fault
-    assert 0.0 < arm.fastest < DRIVEN
-
-
-def test_a_light_joint_whose_motor_is_reversed_turns_no_faster() -> None:
-    arm = proven("seven_joints", {}, LIGHT)
-    assert arm.safety.fault and arm.safety.fault.code is FaultCode.WRONG_SIGN
+def test_no_joint_turns_fast_while_its_sign_is_proven(
+    name: str, kinds: Mapping[int, type[DamiaoMotor]], fault: str
+) -> None:
+    arm = shipped_arm(name, SLOWEST, kinds)
+    if fault:
+        ACTS["torque_reversed"](arm, LIGHT)
+    arm.enable()
+    assert arm.run_until(lambda: arm.state in (State.RAMPING_IN, State.FAULT))
+    assert arm.fault == fault
     arm.run(1.0)
-    assert not arm.device.powered
-    assert arm.fastest < DRIVEN
-
-
-USUAL = joints_of((MIT,) * 4)
-IDS = [(EXCHANGED, True), (EXCHANGED, False), (RIGHT, True), (RIGHT, False)]
+    assert arm.device.powered == (not fault)
+    assert 0.0 < arm.fastest < DRIVEN
 
 
 # Reach, come back, and wait there until the arm is at rest.
@@ -352,17 +305,16 @@ ELASTIC = ((150.0, 0.0), (150.0, 0.02), (1000.0, 0.0), (1000.0, 0.01))  # Nm/rad
 def test_an_elastic_arm_is_carried_without_an_alarm_and_stays_where_its_wearer_leaves_it(
     stiffness: float, play: float
 ) -> None:
-    motors = [SimulatedMotor(joint) for joint in USUAL]
-    arm = CarriedArm(USUAL, motors, PEAK, stiffness=stiffness, play=play)
+    arm = CarriedArm(joints_of((MIT,) * 4), peak=PEAK, stiffness=stiffness, play=play)
     arm.carry()
     arm.raise_to(POSE)
     arm.act(*REACH)
     arm.run(5.2)
-    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    assert arm.state is State.ACTIVE, arm.safety.fault
     left = np.array(arm.device.arm.positions)
     arm.forget()
     arm.run(2.0)
-    assert arm.safety.state is State.ACTIVE, arm.safety.fault
+    assert arm.state is State.ACTIVE, arm.safety.fault
     arm.assert_not_thrown()
     # What the hand held bends the joint, and the link falls through its play.
     assert np.abs(np.array(arm.device.arm.positions) - left).max() < 0.03 + play

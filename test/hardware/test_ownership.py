@@ -13,11 +13,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.families import MOTORS
@@ -37,13 +37,15 @@ from exo_gravity.hardware.ownership.bus_lock import (
     notes_file,
 )
 from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down, take_over
+from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 
+from ..support.copies import copied
 from ..support.simulated_device import OFF, drive_of
 from ..support.thorough import quick
-from .rig import CYCLE, FIRST, LIMITS, MOTORS_OF_ARM, SAFE_SPEED, SECOND, ArmOnWires, OnWatch, TwoBusRig, VirtualRig
-from .simulated_rig import PERIOD, NoWatchdog
-from .wires import Responder, motor_bus
+from .arms import CYCLE, FIRST, MOTORS_OF_ARM, ON_TWO, SAFE_SPEED, SECOND, CarriedArm, NoWatchdog, raised_usual_arm
+from .arms import raised_arm as raised
+from .wires import Responder
 
 CHANNEL = f"can{os.getpid()}"  # other test runs share the network namespace
 CAN0 = ("socketcan", CHANNEL, {})
@@ -125,24 +127,23 @@ def test_the_notes_outlive_their_owner_unless_the_motors_are_off(lock_folder):
     assert not list(lock_folder.iterdir())
 
 
-@pytest.mark.parametrize("obstacle", ["link", "second link", "folder", "pipe", "damage", "another layout", "no folder"])
-def test_motors_whose_notes_cannot_be_trusted_may_be_on(obstacle, lock_folder, monkeypatch):
-    path, other = notes_file(CAN0), lock_folder / "another file"
+OBSTACLES: dict[str, Callable[[Path, Path], object]] = {
+    "link": lambda path, other: path.symlink_to(other),
+    "second link": lambda path, other: path.hardlink_to(other),
+    "folder": lambda path, other: path.mkdir(),
+    "pipe": lambda path, other: os.mkfifo(path),
+    "damage": lambda path, other: path.write_bytes(b"\xff" * 4096),
+    # As of another version of the package: numbers, but no torques.
+    "another layout": lambda path, other: path.write_bytes(struct.pack("=10d", *[1e9] * 10)),
+    "no folder": lambda path, other: setattr(bus_lock, "FOLDERS", (path.parent / "none",)),
+}
+
+
+@pytest.mark.parametrize("obstacle", OBSTACLES)
+def test_motors_whose_notes_cannot_be_trusted_may_be_on(obstacle, lock_folder):
+    other = lock_folder / "another file"
     other.write_bytes(b"precious")
-    if obstacle == "link":
-        path.symlink_to(other)
-    elif obstacle == "second link":
-        path.hardlink_to(other)
-    elif obstacle == "folder":
-        path.mkdir()
-    elif obstacle == "pipe":
-        os.mkfifo(path)
-    elif obstacle == "damage":
-        path.write_bytes(b"\xff" * 4096)
-    elif obstacle == "another layout":  # as of another version of the package: numbers, but no torques
-        path.write_bytes(struct.pack("=10d", *[1e9] * 10))
-    else:
-        monkeypatch.setattr(bus_lock, "FOLDERS", (lock_folder / "none",))
+    OBSTACLES[obstacle](notes_file(CAN0), other)
     lock = lock_of("first")
     assert str(notes_file(CAN0)) in lock.problem
     assert lock.notes.drive == UNKNOWN_DRIVE and lock.notes.drive.powered
@@ -169,56 +170,56 @@ def test_the_notes_are_in_the_first_folder_that_every_user_may_write_to(monkeypa
     assert notes_file(CAN0) == folders[2] / f"exo_gravity_socketcan_{CHANNEL}.bus"
 
 
+def leave_on(arm: CarriedArm) -> None:
+    """Leave the notes of a bridge that died with its watchdog, on each bus; of other buses they know nothing."""
+    effort = arm.notes.drive.effort
+    for part in arm.on_bus.parts:
+        lock = BusLock(part.address, "a dead bridge")
+        lock.notes.note(drive_of([torque if joint in part.joints else 7.0 for joint, torque in enumerate(effort)]))
+        lock.release()
+
+
 def test_a_second_owner_sends_no_frame_and_the_first_keeps_carrying():
-    rig = VirtualRig()
-    owned = OwnedBus(rig.arm, OWNER, print, rig.clock)
+    arm = raised().leave()
+    owned = OwnedBus(arm.on_bus, OWNER, print, arm.clock)
     bus = owned.open()
-    bus.exchange(rig.drive, rig.clock.monotonic() + 1.0)
-    rig.clock.sleep(0.01)  # until the last replies
-    listener = Responder(rig.wire)
+    bus.exchange(drive_of(arm.notes.drive.effort), arm.now + 1.0)
+    arm.clock.sleep(0.01)  # until the last replies
+    listener = Responder(arm.wire)
     with pytest.raises(BusError, match="held by /right/can_bridge"):
-        OwnedBus(rig.arm, "/left/can_bridge (PID 2)", print, rig.clock)
-    assert not listener.received
-    assert rig.motors_on == [True] * 4
+        OwnedBus(arm.on_bus, "/left/can_bridge (PID 2)", print, arm.clock)
+    assert not listener.received and all(arm.motors_on)
     bus.stop()
     owned.close()
 
 
 def test_a_bus_that_another_host_commands_is_refused_without_a_frame():
     """Another host does not see the lock: its frames show it."""
-    rig = VirtualRig(carried=False, pose=(0.0,) * 4)
-    other = motor_bus(rig.wire, MOTORS_OF_ARM)
-    rig.clock.every(0.02, lambda: other.exchange(OFF, rig.clock.monotonic()))
-    owned = OwnedBus(rig.arm, "a test", print, rig.clock)
+    arm = CarriedArm()
+    arm.clock.every(0.02, lambda: arm.bus.exchange(OFF, arm.now))
+    owned = OwnedBus(arm.on_bus, "a test", print, arm.clock)
     with pytest.raises(BusError, match="is in use: another sender commands motor"):
         owned.open()
-    assert other.foreign_commands == 0
+    assert arm.bus.foreign_commands == 0
     owned.close()
 
 
-NEXT: list[tuple[type[VirtualRig], WireFormat, bool]] = [
-    (VirtualRig, MIT, True),
-    (VirtualRig, MIT, False),
-    (TwoBusRig, MIT, False),
-    (TwoBusRig, MIT_V3, False),
-]
+NEXT = [(take_over, FIRST, MIT), (OwnedBus, FIRST, MIT), (OwnedBus, ON_TWO, MIT), (OwnedBus, ON_TWO, MIT_V3)]
 
 
 @pytest.mark.parametrize(
-    ("kind", "wire_format", "is_recovery"),
+    ("owner", "channel", "wire_format"),
     quick(NEXT[:3], NEXT),
     ids=["recovery", "next owner", "two buses", "two buses, V3 boards"],
 )
-def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(kind, wire_format, is_recovery):
-    rig, log = kind(wire_format=wire_format), []
-    rig.leave_on()
-    if is_recovery:
-        take_over(rig.arm, "a recovery", log.append, clock=rig.clock).release()
-    else:
-        OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
+def test_the_arm_that_a_dead_owner_left_with_its_motors_on_is_let_down_first(owner, channel, wire_format):
+    arm, log = raised(channel=channel, wire_format=wire_format).leave(), []
+    leave_on(arm)
+    next_owner = owner(arm.on_bus, "the next owner", log.append, clock=arm.clock)
+    (next_owner.close if owner is OwnedBus else next_owner.release)()
     assert log == [ENDED, "the arm is down, its motors are off"]
-    rig.assert_let_down()
-    assert [powered(part.address) for part in rig.arm.parts] == [False] * len(rig.arm.parts)
+    arm.assert_down()
+    assert [powered(part.address) for part in arm.on_bus.parts] == [False] * len(arm.on_bus.parts)
 
 
 def powered(address: Address) -> bool:
@@ -230,46 +231,46 @@ def powered(address: Address) -> bool:
 
 
 def test_an_arm_whose_notes_cannot_be_read_is_let_down_gently_from_what_its_motors_reply():
-    rig, log = VirtualRig(), []
-    notes_file(rig.arm.address).mkdir()
-    OwnedBus(rig.arm, "the next owner", log.append, rig.clock).close()
+    arm, log = raised().leave(), []
+    notes_file(arm.on_bus.address).mkdir()
+    OwnedBus(arm.on_bus, "the next owner", log.append, arm.clock).close()
     assert log[0].startswith("it is not known what the motors apply, they may be on")
-    rig.assert_let_down()
+    arm.assert_down()
 
 
 @pytest.mark.parametrize(
-    ("kind", "lose", "unreached"),
+    ("channel", "lose", "unreached"),
     [
-        (VirtualRig, lambda rig: setattr(rig.device, "bus_silent", True), [True] * 4),
-        (TwoBusRig, lambda rig: setattr(rig.second, "refusal", BusError("no such device")), [False, False, True, True]),
+        (FIRST, lambda arm: setattr(arm.device, "bus_silent", True), [True] * 4),
+        (ON_TWO, lambda arm: lose_bus(arm, SECOND), [False, False, True, True]),
     ],
     ids=["silent", "second bus cannot be opened"],
 )
-def test_a_watchdog_stays_with_what_the_next_owner_cannot_reach(monkeypatch, kind, lose, unreached):
-    rig, stayed = kind(), []
+def test_a_watchdog_stays_with_what_the_next_owner_cannot_reach(monkeypatch, channel, lose, unreached):
+    arm, stayed = raised(channel=channel).leave(), []
 
     class Stays(NoWatchdog):
         def __init__(self, lock: ArmLock, *_: object) -> None:
             stayed.append([own.notes.drive.powered for own in lock.of_joints])
 
     monkeypatch.setattr(owned_bus, "Watchdog", Stays)
-    rig.leave_on()
-    lose(rig)
+    leave_on(arm)
+    lose(arm)
     with pytest.raises(BusError, match="a motor that may be powered does not reply"):
-        OwnedBus(rig.arm, "the next owner", lambda text: None, rig.clock)
-    assert stayed == [unreached] and rig.motors_on == unreached
-    assert [powered(part.address) for part in rig.arm.parts] == sorted(set(unreached))
+        OwnedBus(arm.on_bus, "the next owner", lambda text: None, arm.clock)
+    assert stayed == [unreached] and arm.motors_on == unreached
+    assert [powered(part.address) for part in arm.on_bus.parts] == sorted(set(unreached))
 
 
 @pytest.mark.parametrize("held", [FIRST, SECOND], ids=["first", "second"])
 def test_an_arm_of_which_one_bus_is_held_is_refused_and_holds_neither(held: str) -> None:
-    rig = TwoBusRig(carried=False)
-    lock = BusLock(("wire", held, {}), "/left/can_bridge (PID 1)", clock=rig.clock)
+    arm = CarriedArm(channel=ON_TWO)
+    lock = BusLock(("wire", held, {}), "/left/can_bridge (PID 1)", clock=arm.clock)
     with pytest.raises(BusError, match=rf"CAN bus {held} is held by /left/can_bridge \(PID 1\)"):
-        ArmLock(rig.arm, "/right/can_bridge (PID 2)", 0.1, rig.clock)
+        ArmLock(arm.on_bus, "/right/can_bridge (PID 2)", 0.1, arm.clock)
     lock.release()
     for name in (FIRST, SECOND):
-        BusLock(("wire", name, {}), "another", 0.0, rig.clock).release()
+        BusLock(("wire", name, {}), "another", 0.0, arm.clock).release()
 
 
 @pytest.mark.parametrize("order", [(FIRST, SECOND), (SECOND, FIRST)])
@@ -278,27 +279,31 @@ def test_the_locks_are_taken_in_one_order_however_the_motors_are_wired(
 ) -> None:
     taken: list[str] = []
 
-    class Noted(BusLock):
-        def __init__(self, address: Address, *others: Any, **options: Any) -> None:
-            taken.append(address[1])
-            super().__init__(address, *others, **options)
+    def noted(address: Address, *others: Any, **options: Any) -> BusLock:
+        taken.append(address[1])
+        return BusLock(address, *others, **options)
 
-    monkeypatch.setattr(bus_lock, "BusLock", Noted)
-    rig, (first, second) = TwoBusRig(carried=False), order
-    arm = ArmOnWires(("wire", f"{first},{second},{second},{first}", {}), rig.motors, LIMITS, CYCLE, rig.wires)
-    ArmLock(arm, "a test", 0.1, rig.clock).release()
+    monkeypatch.setattr(bus_lock, "BusLock", noted)
+    on_bus, (first, second) = CarriedArm(channel=ON_TWO).on_bus, order
+    crossed = replace(on_bus, address=("wire", f"{first},{second},{second},{first}", {}))
+    ArmLock(crossed, "a test", 0.1, VirtualClock()).release()
     assert taken == [FIRST, SECOND]
 
 
 def test_an_end_that_was_opened_is_closed_if_the_other_bus_cannot_be() -> None:
-    rig = TwoBusRig()
-    rig.second.refusal = BusError("no such device")
+    arm = CarriedArm(channel=ON_TWO).leave()
+    lose_bus(arm, SECOND)
     with pytest.raises(BusError, match="no such device"):
-        rig.arm.ports(rig.clock)
-    assert not any(isinstance(end, VirtualBus) for end in rig.first.ends)
+        arm.on_bus.ports(arm.clock)
+    assert not any(isinstance(end, VirtualBus) for end in arm.wire.ends)
 
 
 # How the arm that a dead process left is let down.
+
+
+def lowered(arm: CarriedArm, log: Callable[[str], None] = print, is_wanted: bool = False) -> bool:
+    """Let down the arm that a dead process left with what it noted; return whether it is off."""
+    return let_down(arm.on_bus, ArmNotes([arm.notes] * 4), log, lambda: is_wanted)
 
 
 def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
@@ -308,47 +313,41 @@ def commands(listener: Responder, can_id: int) -> list[MotorCommand]:
     return [unpack_command(spec, data) for data in frames if data[0] != can_id and data not in (ENTER, EXIT)]
 
 
-def test_the_arm_is_lowered_from_the_noted_torques_and_its_motors_are_switched_off():
-    rig = VirtualRig()
-    rig.arm = replace(rig.arm, period=PERIOD)
-    listener = Responder(rig.wire)
-    assert rig.let_down()
-    torques = [command.torque for command in commands(listener, 2)]
-    assert torques[0] == pytest.approx(rig.carrying[1], abs=0.02)
-    largest = max(abs(after - before) for before, after in itertools.pairwise(torques))
-    assert largest <= MAX_EFFORT_RATE * PERIOD + 2 * MOTORS["AK80-9"].torque_range / 4095
-    assert not rig.notes.drive.powered
-    rig.assert_let_down()
-
-
-def test_the_noted_damping_is_kept():
-    rig = VirtualRig()
-    listener = Responder(rig.wire)
-    assert rig.let_down(drive_of(rig.carrying, (5.0,) * 4))
-    assert min(command.kd for command in commands(listener, 2)[:50]) == pytest.approx(5.0, abs=0.01)
+def test_the_arm_is_lowered_from_the_noted_torques_and_damping_and_its_motors_are_switched_off():
+    arm = raised().leave()
+    held, listener = arm.notes.drive.effort, Responder(arm.wire)
+    arm.notes.note(drive_of(held, (5.0,) * 4))
+    assert lowered(arm)
+    sent = commands(listener, 2)
+    assert sent[0].torque == pytest.approx(held[1], abs=0.1)  # the damping of half a code
+    assert min(command.kd for command in sent[:50]) == pytest.approx(5.0, abs=0.01)
+    largest = max(abs(after.torque - before.torque) for before, after in itertools.pairwise(sent))
+    assert largest <= MAX_EFFORT_RATE * CYCLE + 2 * MOTORS["AK80-9"].torque_range / 4095
+    assert not arm.notes.drive.powered
+    arm.assert_down()
 
 
 def test_a_motor_that_has_lost_its_power_is_not_pushed_by_the_noted_torque():
     """The operator cut the supply: the motors are off, and the arm hangs."""
-    rig = VirtualRig(pose=NO_TORQUE, carried=False)
-    assert rig.let_down(drive_of((0.0, 6.0, 2.0, 1.0)))
-    assert rig.top_speed < 0.01
-    assert rig.motors_on == [False] * 4
+    arm = CarriedArm().leave()
+    arm.notes.note(drive_of((0.0, 6.0, 2.0, 1.0)))
+    assert lowered(arm)
+    assert arm.fastest < 0.01 and not arm.device.powered
 
 
-def lose_bus(rig: VirtualRig) -> None:
-    rig.wire.refusal = BusError("no such device")
-    rig.wire.break_down(OSError("no such device"))
+def lose_bus(arm: CarriedArm, name: str = FIRST) -> None:
+    arm.wires[name].refusal = BusError("no such device")
+    arm.wires[name].break_down(OSError("no such device"))
 
 
-def reach_again(rig: VirtualRig) -> None:
-    rig.wire.refusal, rig.device.cut_off = None, (False,) * 4
+def reach_again(arm: CarriedArm) -> None:
+    arm.wire.refusal, arm.device.cut_off = None, (False,) * 4
 
 
 SILENT = "a motor does not reply; it may still be powered; trying again"
-LOSSES: list[tuple[Callable[[VirtualRig], None], float, float, str]] = [
+LOSSES: list[tuple[Callable[[CarriedArm], None], float, float, str]] = [
     (lose_bus, 0.1, 14.0, SILENT),
-    (lambda rig: setattr(rig.device, "cut_off", (False, True, False, False)), 0.0, 14.0, SILENT),
+    (partial(ACTS["cut_off"], motors=[1]), 0.0, 14.0, SILENT),
     (lose_bus, 0.0, 1.0, "no such device; the motors may still be powered"),
 ]
 
@@ -359,56 +358,48 @@ LOSSES: list[tuple[Callable[[VirtualRig], None], float, float, str]] = [
     ids=["the adapter", "a motor", "the adapter, from the start"],
 )
 def test_an_arm_that_is_reached_again_late_is_let_down_and_the_log_is_honest(lose, after, until, said):
-    rig, log = VirtualRig(), []
-    start = rig.clock.monotonic()
-    rig.clock.later(until, partial(reach_again, rig))
-    rig.clock.later(after, partial(lose, rig)) if after else lose(rig)
-    assert rig.let_down(log=log.append)
-    assert log == [said]
-    assert rig.clock.monotonic() > start + until
-    rig.assert_let_down()
+    arm, log = raised().leave(), []
+    start = arm.now
+    arm.clock.later(until, partial(reach_again, arm))
+    arm.clock.later(after, partial(lose, arm)) if after else lose(arm)
+    assert lowered(arm, log.append)
+    assert log == [said] and arm.now > start + until
+    arm.assert_down()
 
 
-@pytest.mark.parametrize(("wire_format", "duration"), [(MIT, 10.0), (MIT_V3, 2.0)])
+@pytest.mark.parametrize(("wire_format", "duration"), quick([(MIT_V3, 2.0)], [(MIT, 10.0), (MIT_V3, 2.0)]))
 def test_the_watchdog_leaves_motors_off_whose_supply_returns(wire_format: WireFormat, duration: float) -> None:
-    rig = VirtualRig(wire_format=wire_format)
-    watches: list[OnWatch] = []
-
-    def release() -> None:
-        watches.append(OnWatch(rig))
-        rig.switch_supply(True)
-
-    rig.clock.later(0.5, lambda: rig.switch_supply(False))
-    rig.clock.later(0.5 + duration, release)
-    assert rig.let_down()
-    assert watches and not watches[0].was_on
+    arm = raised(wire_format=wire_format).leave()
+    for joint in range(4):
+        arm.schedule([(0.5, "unplugged", {"joint": joint, "duration": duration})], ACTS)
+    arm.clock.later(0.5 + duration, arm.forget)
+    assert lowered(arm)
+    assert not arm.records["on"].any()
 
 
 @pytest.mark.parametrize("wire_format", quick([MIT_V3], [MIT, MIT_V3]), ids=["mit", "mit_v3"])
 def test_an_arm_on_two_buses_is_let_down_as_one(wire_format: WireFormat) -> None:
     """Motors 3 and 4 hold next to nothing here: they must still be braked while the first bus lowers joint 2."""
-    rig = TwoBusRig(pose=(0.0, 1.3, 0.0, 0.3), carried=False, wire_format=wire_format)
-    carrying = tuple(gravity_torque(rig.links, rig.device.arm.positions).tolist())
+    worn: dict[str, Any] = {"has_wearer": False, "mode": "one_g", "channel": ON_TWO, "wire_format": wire_format}
+    arm = raised_usual_arm((0.0, 1.3, 0.0, 0.3), **worn).leave()
+    carrying = arm.notes.drive.effort
     assert max(map(abs, carrying[2:])) < 0.1 and carrying[1] > 3.0
-    for motor, torque in zip(rig.motors, carrying, strict=True):
-        for frame in ((motor.command_id, motor.command(torque, 0.0)), *motor.enter):
-            rig.device.exchange(*frame)
-    near, far = (rig.notes_of(drive_of(carrying)) for _ in range(2))
+    near, far = copied(arm.notes), copied(arm.notes)
+    near.clock = far.clock = arm.clock
     damped: list[float] = []
-    rig.clock.later(0.15, lambda: damped.extend(rig.damping))
-    on: list[tuple[bool, bool]] = []
-    rig.clock.every(0.1, lambda: on.append((any(rig.motors_on[:2]), any(rig.motors_on[2:]))))
-    assert let_down(rig.arm, ArmNotes([near, near, far, far]), print, lambda: False)
+    arm.clock.later(0.15, lambda: damped.extend(motor.damping for motor in arm.motors))
+    on: list[list[bool]] = []
+    arm.clock.every(0.1, lambda: on.append(arm.motors_on))
+    assert let_down(arm.on_bus, ArmNotes([near, near, far, far]), print, lambda: False)
     assert min(damped) > 1.0
-    assert all(first == second for first, second in on)
-    assert not near.drive.powered and not far.drive.powered
-    assert rig.motors_on == [False] * 4 and rig.top_speed < SAFE_SPEED
+    assert all(any(each[:2]) == any(each[2:]) for each in on)
+    assert not near.drive.powered and not far.drive.powered and not arm.device.powered and arm.fastest < SAFE_SPEED
 
 
-UNREACHED = [
-    (MIT, lambda wire: setattr(wire, "refusal", BusError("no such device")), "the motors may still be powered"),
-    (MIT_V3, lambda wire: setattr(wire, "refusal", BusError("no such device")), "the motors may still be powered"),
-    (MIT, lambda wire: setattr(wire, "loss", 1.0), "a motor does not reply"),
+UNREACHED: list[tuple[WireFormat, Callable[[CarriedArm], None], str]] = [
+    (MIT, lose_bus, "the motors may still be powered"),
+    (MIT_V3, lose_bus, "the motors may still be powered"),
+    (MIT, lambda arm: setattr(arm.wire, "loss", 1.0), "a motor does not reply"),
 ]
 
 
@@ -418,18 +409,19 @@ UNREACHED = [
     ids=["cannot be opened", "cannot be opened, V3 boards", "silent"],
 )
 def test_a_bus_that_is_lost_is_handed_over_and_does_not_keep_the_other_waiting(wire_format, lose, said) -> None:
-    rig, log = TwoBusRig(wire_format=wire_format), list[str]()
-    near, far = rig.notes_of(), rig.notes_of()
-    lose(rig.first)
-    other = Responder(rig.first)
-    assert not let_down(rig.arm, ArmNotes([near, near, far, far]), log.append, lambda: True)
+    arm, log = raised(channel=ON_TWO, wire_format=wire_format).leave(), list[str]()
+    near, far = copied(arm.notes), copied(arm.notes)
+    near.clock = far.clock = arm.clock
+    lose(arm)
+    other = Responder(arm.wire)
+    assert not let_down(arm.on_bus, ArmNotes([near, near, far, far]), log.append, lambda: True)
     assert said in log[0]
-    assert rig.motors_on == [True, True, False, False] and near.drive.powered
-    assert far.drive.powered == (not rig.first.refusal)
-    if not rig.first.refusal:
+    assert arm.motors_on == [True, True, False, False] and near.drive.powered
+    assert far.drive.powered == (not arm.wire.refusal)
+    if not arm.wire.refusal:
         return
     # Status frames of V3 boards alone.
     assert all((frame.arbitration_id & ID_BITS) >> 8 == 0x29 for frame in other.received)
-    rig.clock.later(30.0, lambda: setattr(rig.first, "refusal", None))
-    assert let_down(rig.arm, ArmNotes([near, near, far, far]), log.append, lambda: False)
-    assert rig.motors_on == [False] * 4
+    arm.clock.later(30.0, partial(reach_again, arm))
+    assert let_down(arm.on_bus, ArmNotes([near, near, far, far]), log.append, lambda: False)
+    assert not arm.device.powered

@@ -46,11 +46,12 @@ from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, B
 from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
+from exo_gravity.sim import ArmConfig
 
-from ..hardware.rig import raised_arm
-from ..hardware.simulated_rig import NoWatchdog, SimulatedRig
+from ..hardware.arms import NoWatchdog, SimulatedRig, raised_arm
 from ..support.keys import broken
 from ..support.node_thread import NodeThread
+from ..support.simulated_device import make_device
 from ..support.waiting import wait_until
 
 real_time = pytest.mark.real_time
@@ -388,7 +389,8 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimulatedRig]:
     monkeypatch.setattr(machine, "START_GATE", replace(machine.START_GATE, calm=0.2))
     monkeypatch.setattr(guidance, "GUIDANCE", replace(guidance.GUIDANCE, time=0.2))
     monkeypatch.setattr(owned_bus, "Watchdog", NoWatchdog)
-    rig = SimulatedRig(friction=0.5, pose=NO_TORQUE)  # more friction than the pushes of the switch-on check
+    # More friction than the pushes of the switch-on check.
+    rig = SimulatedRig(make_device(config=ArmConfig(coulomb_friction=(0.5,) * 4)))
     yield rig
     rig.close()
 

@@ -24,7 +24,7 @@ from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
-from ..hardware.rig import LIMITS, raised_arm
+from ..hardware.arms import LIMITS, raised_arm
 from ..support import CONFIG
 from ..support.launched_nodes import CALM, NO_IMU
 from ..support.truth import Truth
@@ -94,7 +94,7 @@ def test_an_arm_whose_compensator_has_failed_is_let_down_as_one_whose_compensato
 
     exchange = EffortExchange(node, LIMITS, lambda: arm and arm.loop, answer)
     arm = raised_arm()
-    torque.append(arm.rig.carrying)
+    torque.append(arm.notes.drive.effort)
     exchange.take(arm.clock.monotonic(), arm.loop.samples)
     arm.loop.controller = exchange
     arm.run(1.0)
