@@ -216,7 +216,7 @@ class Wire:
 
     clock: by default one of its own, which begins at `start` s.
     echoes: whether it returns each frame to its sender too, unmarked, as udp_multicast.
-    bitrate: bit/s; 0: frames take no time, and none collide.
+    bitrate: bit/s; 0: frames take no time, and none collide: there is no `arbitration`.
 
     refusal: what opening it raises, None if it can be opened. opened: how many ends were opened. loss: share of the
     frames that are lost. commands_lost, replies_lost: arbitration IDs of frames that are lost on their way from a host,
@@ -237,22 +237,7 @@ class Wire:
         self.broken: set[VirtualBus] = set()
         self.error: Exception = OSError()
         self._echoes = echoes
-        self._arbitration = Arbitration(self.clock, bitrate, self._deliver) if bitrate else None
-
-    @property
-    def collisions(self) -> int:
-        """How often two frames with one ID met."""
-        return self._arbitration.collisions if self._arbitration else 0
-
-    @property
-    def tec(self) -> int:
-        """The highest transmit error counter that an end has had: above 127 it is error passive."""
-        return self._arbitration.tec if self._arbitration else 0
-
-    @property
-    def bus_offs(self) -> int:
-        """How often an end was off the bus."""
-        return self._arbitration.bus_offs if self._arbitration else 0
+        self.arbitration = Arbitration(self.clock, bitrate, self._deliver) if bitrate else None
 
     def open(self, *_: object) -> VirtualBus:
         """Open another end."""
@@ -294,8 +279,8 @@ class Wire:
         lost = self.commands_lost if isinstance(sender, VirtualBus) else self.replies_lost
         if message.arbitration_id in lost or (self.loss and self._random.random() < self.loss):
             return
-        if self._arbitration:
-            self._arbitration.send(controller or sender, sender, message, retransmits)
+        if self.arbitration:
+            self.arbitration.send(controller or sender, sender, message, retransmits)
         else:
             self._deliver(sender, message)
 

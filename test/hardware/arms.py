@@ -152,8 +152,8 @@ class CarriedArm(JudgedArm):
         **settings: Any,
     ) -> None:
         mass, cog = Wearer(75.0).on_links(DEFAULT_LINKS.length)
-        worn = {"wearer_mass": mass, "wearer_cog": cog}
-        elastic = {"joint_stiffness": (stiffness,) * len(joints)}
+        worn: dict[str, Any] = {"wearer_mass": mass, "wearer_cog": cog}
+        elastic: dict[str, Any] = {"joint_stiffness": (stiffness,) * len(joints)}
         config = ArmConfig(
             coulomb_friction=(friction,) * len(joints),
             rotor_inertia=[joint.spec.rotor_inertia for joint in joints],
@@ -178,7 +178,7 @@ class CarriedArm(JudgedArm):
             own = [joint for joint, of_joint in enumerate(channels) if of_joint == name]
             played = end.play(device, tick=None, joints=own, first=played)
         ports = self.on_bus.ports(wire.clock)
-        both = {"ports": ports, "played": played, "note": self.notes.note}
+        both: dict[str, Any] = {"ports": ports, "played": played, "note": self.notes.note}
         super().__init__(device, Settings("right", DEFAULT_LINKS, **given), joints, kept, rate, wire, **both)
 
     def leave(self) -> CarriedArm:
@@ -221,7 +221,7 @@ class SimulatedRig:
         if interface == "udp_multicast":
             channel, options = "239.74.163.2", {"port": port, "hop_limit": 0}
         self.device, self.carrying = device, [motor.torque(0.0, 0.0) for motor in device.motors]
-        device.truth = TruthRecords()
+        self.truth = device.truth = TruthRecords()
         self.arm = ArmOnBus((interface, channel, options), MOTORS_OF_ARM, LIMITS, 0.004)
         self._stop = threading.Event()
         self._bus = open_bus(*self.arm.address)
@@ -237,7 +237,7 @@ class SimulatedRig:
         """The motors are off, and no joint turned fast, not even once nothing held it."""
         time.sleep(AFTER_EXIT)
         assert not self.device.powered
-        assert np.abs(self.device.truth.records["velocity"]).max() < SAFE_SPEED
+        assert np.abs(self.truth.records["velocity"]).max() < SAFE_SPEED
 
     def close(self) -> None:
         """Stop the device."""

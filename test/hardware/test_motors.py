@@ -116,7 +116,7 @@ def test_an_arm_is_switched_on_and_off_without_a_collision(kind: str) -> None:
     assert arm.run_until(lambda: arm.state is State.PROVING and arm.safety.waiting_for == "", 5.0)
     arm.run(0.5)
     assert arm.device.powered and arm.let_down(1.0)
-    assert arm.wire.collisions == arm.wire.bus_offs == 0
+    assert arm.wire.arbitration.collisions == arm.wire.arbitration.bus_offs == 0
 
 
 # Seven joints take eight times as long as the elbow.

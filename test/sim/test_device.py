@@ -351,7 +351,7 @@ def test_frames_take_the_time_of_their_bits_and_the_lowest_waiting_id_is_next(wi
     expected = stuffed_bits(7, LOW) / BITRATE
     assert arrived[0][1] == pytest.approx(expected, abs=1e-8)
     assert arrived[1][1] == pytest.approx(expected + stuffed_bits(8, LOW) / BITRATE, abs=1e-7)
-    assert (wire.collisions, wire.tec) == (0, 0)
+    assert (wire.arbitration.collisions, wire.arbitration.tec) == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +368,11 @@ def test_two_senders_of_one_id_meet_again(wire, second_data, arrive, collisions)
     second.send(frame(1, second_data))
     wire.clock.sleep(0.02)
     assert [bytes(listener.recv(0.0).data) for _ in arrive] == arrive and listener.recv(0.01) is None
-    assert (wire.collisions, wire.tec, wire.bus_offs) == (collisions, 8 * collisions, 0)
+    assert (wire.arbitration.collisions, wire.arbitration.tec, wire.arbitration.bus_offs) == (
+        collisions,
+        8 * collisions,
+        0,
+    )
 
 
 def test_a_sender_that_fails_too_often_is_off_the_bus_for_a_while(wire):
@@ -378,7 +382,7 @@ def test_a_sender_that_fails_too_often_is_off_the_bus_for_a_while(wire):
         wire.carry(None, frame(1, LOW), "one shot", False)
         wire.carry(None, frame(1, LOW), "another", False)
         wire.clock.sleep(0.001)
-    assert wire.bus_offs > 0 and wire.tec >= 256
+    assert wire.arbitration.bus_offs > 0 and wire.arbitration.tec >= 256
     wire.clock.sleep(0.2)
     while listener.recv(0.0):
         pass
@@ -391,7 +395,7 @@ def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
 
     All at once is what the motor bus did at a47959f4.
     """
-    before = wire.collisions
+    before = wire.arbitration.collisions
     for data in (lambda can_id: command(can_id - 1), lambda can_id: ENTER, lambda can_id: command(can_id - 1, 1.0)):
         for can_id in IDS:
             host.send(frame(can_id, data(can_id)))
@@ -399,7 +403,7 @@ def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
     wire.clock.sleep(0.01)
     while host.recv(0.0):
         pass
-    return wire.collisions - before
+    return wire.arbitration.collisions - before
 
 
 LATE = replace(FIRMWARES["open_drive"], reply_delay=FIRMWARES["ak"].reply_delay)  # to the master's ID
@@ -414,7 +418,7 @@ def test_frames_to_a_motor_that_owes_a_reply_collide_and_awaited_ones_never(wire
     device = make_device(firmware)
     wire.play(device)
     host = wire.open()
-    assert enable(wire, host, is_awaiting=True) == 0 and wire.tec == 0
+    assert enable(wire, host, is_awaiting=True) == 0 and wire.arbitration.tec == 0
     least, most = at_once
-    assert least <= enable(wire, host, is_awaiting=False) <= most and (wire.tec >= 128) == (least == 8)
+    assert least <= enable(wire, host, is_awaiting=False) <= most and (wire.arbitration.tec >= 128) == (least == 8)
     assert device.powered

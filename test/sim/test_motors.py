@@ -485,7 +485,7 @@ def test_a_public_master_switches_on_reads_pushes_zeroes_and_switches_off(way, f
     master.wait(1.5)
     master.update(0.0)
     assert master.state["position"] == pytest.approx(0.0, abs=0.02)
-    assert not motor.entered and wire.collisions == 0
+    assert not motor.entered and wire.arbitration.collisions == 0
 
 
 # Damiao motors
