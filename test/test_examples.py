@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
@@ -98,13 +97,13 @@ def test_the_notebook_leads_to_drift_effort_and_the_share_that_was_set():
         np.testing.assert_allclose(row / 100.0 * (3.0, 9.0, 3.0, 3.0), expected, atol=0.05)
 
 
-def cascade() -> dict[str, Any]:
-    return runpy.run_path(str(ROOT / "examples" / "admittance.py"))
+def example(name: str) -> dict[str, Any]:
+    return runpy.run_path(str(ROOT / "examples" / name))
 
 
 @pytest.mark.thorough
 def test_the_cascade_takes_work_off_a_wearer_who_reaches_and_lets_the_arm_go_where_they_lead_it():
-    variables = cascade()
+    variables = example("admittance.py")
     (_, led, alone), (_, poses, assisted) = (map(np.array, variables["reach"](is_on)) for is_on in (False, True))
     assert variables["effort_of"](assisted) < 0.8 * variables["effort_of"](alone)
     steps = min(len(poses), len(led))
@@ -113,7 +112,7 @@ def test_the_cascade_takes_work_off_a_wearer_who_reaches_and_lets_the_arm_go_whe
 
 
 def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_damps_what_moves_by_itself():
-    variables, still = cascade(), [0.0] * 4
+    variables, still = example("admittance.py"), [0.0] * 4
     robot, worn = ROBOT.links, ROBOT.worn_links(*LOAD)
 
     def after(seconds: float, velocity: list[float], wearer: list[float], deviation: float) -> np.ndarray:
@@ -130,40 +129,37 @@ def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_da
 
 
 class Environment:
-    """A node that plays what is around an example's node, until the block ends."""
+    """A node that plays what is around an example's node, made by `make`."""
 
-    def __enter__(self) -> Environment:
-        rclpy.init()
+    def __init__(self, make: Callable[[], Any]) -> None:
         self.node, self.executor = rclpy.create_node("environment", namespace="/right"), SingleThreadedExecutor()
         self.heard: list[JointState] = []
         self.node.create_subscription(JointState, "assist_efforts", self.heard.append, 10)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for node in self.executor.get_nodes():
-            node.destroy_node()
-        self.executor.shutdown()
-        rclpy.try_shutdown()
-
-    def add(self, example: Node) -> Node:
-        """Let the example's node run."""
-        for node in (example, self.node):
+        self.example = make()
+        for node in (self.example, self.node):
             self.executor.add_node(node)
-        return example
 
-    def wait_until(self, condition: Callable[[], bool]) -> None:
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.1), timeout=30.0)
+    def spin(self) -> None:
+        self.executor.spin_once(timeout_sec=0.1)
 
     def assert_silent(self) -> None:
         """Assert that no efforts come any more, but for those on their way."""
         for seconds in (0.5, 0.3):
             count, end = len(self.heard), time.monotonic() + seconds
-            wait_until(lambda end=end: time.monotonic() > end, lambda: self.executor.spin_once(timeout_sec=0.1))
+            wait_until(lambda end=end: time.monotonic() > end, self.spin)
         assert len(self.heard) == count
 
 
+@pytest.fixture
+def around():
+    """What plays the surroundings of a node."""
+    rclpy.init()
+    yield Environment
+    rclpy.shutdown()
+
+
 @pytest.mark.thorough
-def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_torque_is_known():
+def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_torque_is_known(around):
     carried = read_arm(load(packaged_config("three_joints.yaml")), "/right")
     names = carried.limits.joint_names
     parts = {
@@ -171,42 +167,36 @@ def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_
         "wearer_efforts": JointState(name=names, effort=[0.0, 2.0, 0.0]),
         "wearer_efforts_std": JointState(name=names, effort=[0.1] * 3),
     }
-    with Environment() as around:
-        around.add(cascade()["AdmittanceNode"]("/right", names, carried.settings))
-        publishers = {topic: around.node.create_publisher(JointState, topic, 1) for topic in parts}
-        timers = [around.node.create_timer(0.01, partial(publishers[topic].publish, parts[topic])) for topic in parts]
-        around.wait_until(lambda: any(message.effort[1] > 0.5 for message in around.heard))
-        newest = around.heard[-1]
-        assert list(newest.name) == list(names) and newest.effort[0] == newest.effort[2] == 0.0
-        timers[1].cancel()
-        around.assert_silent()
-
-
-def example() -> dict[str, Any]:
-    return runpy.run_path(str(ROOT / "examples" / "emg_assistance.py"))
+    arm = around(lambda: example("admittance.py")["AdmittanceNode"]("/right", names, carried.settings))
+    publishers = {topic: arm.node.create_publisher(JointState, topic, 1) for topic in parts}
+    timers = [arm.node.create_timer(0.01, partial(publishers[topic].publish, parts[topic])) for topic in parts]
+    wait_until(lambda: any(message.effort[1] > 0.5 for message in arm.heard), arm.spin)
+    newest = arm.heard[-1]
+    assert list(newest.name) == list(names) and newest.effort[0] == newest.effort[2] == 0.0
+    timers[1].cancel()
+    arm.assert_silent()
 
 
 @pytest.mark.parametrize(("volts", "activation"), [(0.01e-3, 0.0), (0.21e-3, 0.5), (0.9e-3, 1.0)])
 def test_a_muscle_is_as_active_as_its_mean_rectified_signal_on_whatever_offset(volts: float, activation: float):
-    muscle = example()["Envelope"]()
+    muscle = example("emg_assistance.py")["Envelope"]()
     for noise in np.random.default_rng(1).normal(size=3000) * np.sqrt(np.pi / 2.0):
         muscle.add(1e-3 + volts * noise)
     assert muscle.activation == pytest.approx(activation, abs=0.12)
 
 
 @pytest.mark.thorough
-def test_the_biceps_bends_and_the_triceps_stretches_the_elbow_and_without_emg_nothing_is_sent(capfd):
-    variables = example()
-    with Environment() as around:
-        node = around.add(variables["EmgAssistance"]())
-        node.report()
-        assert "waiting for /emg (std_msgs/Float32MultiArray" in capfd.readouterr().err
-        before = set(node.timers)
-        variables["pretend"](node)
-        for sign in (1.0, -1.0):
-            around.wait_until(lambda sign=sign: any(sign * message.effort[3] > 1.0 for message in around.heard))
-        assert around.heard[-1].name[3] == "right_elbow_flexion"
-        assert not any(any(message.effort[:3]) for message in around.heard)
-        for timer in set(node.timers) - before:
-            timer.cancel()
-        around.assert_silent()
+def test_the_biceps_bends_and_the_triceps_stretches_the_elbow_and_without_emg_nothing_is_sent(around, capfd):
+    variables = example("emg_assistance.py")
+    arm = around(variables["EmgAssistance"])
+    arm.example.report()
+    assert "waiting for /emg (std_msgs/Float32MultiArray" in capfd.readouterr().err
+    before = set(arm.example.timers)
+    variables["pretend"](arm.example)
+    for sign in (1.0, -1.0):
+        wait_until(lambda sign=sign: any(sign * message.effort[3] > 1.0 for message in arm.heard), arm.spin)
+    assert arm.heard[-1].name[3] == "right_elbow_flexion"
+    assert not any(any(message.effort[:3]) for message in arm.heard)
+    for timer in set(arm.example.timers) - before:
+        timer.cancel()
+    arm.assert_silent()

@@ -29,8 +29,7 @@ ROWS = (
 @pytest.mark.parametrize(("row", "most"), quick(ROWS[:1], ROWS), ids=lambda value: getattr(value, "name", ""))
 def test_ordinary_equipment_carries_an_arm_without_an_alarm(row, most):
     result = row.play(1.0, carried=2.0)
-    assert is_quiet(result), result
-    assert result.starts and not result.refused_samples
+    assert is_quiet(result) and result.starts and not result.refused_samples, result
     assert 0.0 < result.largest_error < most
 
 
@@ -43,26 +42,10 @@ def entered(*electronics: float) -> OrdinaryMotor:
 def test_a_reply_carries_the_torque_applied_when_its_command_arrives_and_the_current_loop_follows():
     motor = entered(0.004, 1e-9)
     assert abs(reply_to(motor, command(torque=2.0)).torque) <= TORQUE_CODE
-    for _ in range(4):
-        motor.advance(0.0, 0.0, 0.001)
+    motor.advance(0.0, 0.0, 0.004)
     assert reply_to(motor, command(torque=-1.0)).torque == pytest.approx(2.0 * (1.0 - np.exp(-1.0)), abs=TORQUE_CODE)
-    assert motor.torque(0.0, 0.0) > 1.2
     motor.receive(EXIT, 0.0, 0.0, 0.0)
     assert motor.torque(0.0, 0.0) == 0.0
-
-
-def test_a_filtered_speed_is_replied_and_damps():
-    motor = entered(1e-9, 0.005)
-    motor.receive(command(kd=1.0), 0.0, 0.0, 0.0)
-    assert motor.advance(0.0, 1.0, 0.005) == pytest.approx(np.exp(-1.0) - 1.0, abs=0.03)
-    speed = reply_to(motor, command(), velocity=1.0).velocity
-    assert speed == pytest.approx(1.0 - np.exp(-1.0), abs=2 * SPEC.velocity_range / 4095)
-
-
-def test_noise_of_the_torque_does_not_depend_on_the_torque():
-    motor = entered(1e-9, 1e-9, 0.1)
-    replied = [reply_to(motor, command()).torque for _ in range(500)]
-    assert np.std(replied) == pytest.approx(0.1, rel=0.2)
 
 
 def test_the_imus_report_has_a_row_for_each_trial_and_a_column_for_each_method():

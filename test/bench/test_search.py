@@ -1,19 +1,15 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The search: a seed replays its case, the truth judges it, and a run goes on where the last one ended."""
+"""The search: a seed replays its case, and each cause has its bound."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import pytest
 
-from bench.search.__main__ import kept
 from bench.search.case import KINDS, Bound, Case, Event, bound_of, draw
-from bench.search.play import play_case
 from bench.search.stage import ACTS
-from exo_gravity.core.safety.drive import State
 
 pytestmark = pytest.mark.thorough
 
@@ -62,27 +58,3 @@ BOUNDS = {  # rad/s where only the speed is another one
 def test_each_cause_has_its_bound(events, bound):
     found = bound_of(case_of(*events), clamped=False)
     assert found == bound if isinstance(bound, Bound) else found.speed == bound
-
-
-def test_bounds_follow_the_rate_the_clamp_and_whether_the_arm_is_worn():
-    assert bound_of(replace(case_of(DROPPED), rate=100.0), clamped=True).speed == 7.0
-    assert bound_of(case_of(LEAN), clamped=True).speed == bound_of(case_of(DROPPED), clamped=True).speed == 2.9
-    worn = [replace(case_of(first, PUSH), worn=True) for first in (Event(1.0, "body_mass", {"mass": 100.0}), ZERO_G)]
-    assert bound_of(worn[0], clamped=False).speed == 2.9
-    assert bound_of(worn[1], clamped=False) == ASKED  # to One-G
-
-
-def test_an_arm_that_is_disabled_comes_down_within_its_bound():
-    played, records = play_case(case_of(Event(0.1, "disable", {})))
-    states = [state for _, state, _ in played.states]
-    assert states[-3:] == [State.ACTIVE, State.LETTING_DOWN, State.DISABLED]
-    assert not played.error and played.share < 1.0
-    assert records["position"][:, 1].max() == pytest.approx(POSE[1], abs=0.05)
-    assert not records["on"][-1].any()
-
-
-def test_a_run_goes_on_with_the_cases_that_are_not_kept_also_after_a_line_was_cut_off(tmp_path):
-    path = tmp_path / "search.jsonl"
-    assert kept(path) == {}
-    path.write_text('{"seed": 3, "share": 0.5}\n{"seed": 4, "sh')
-    assert kept(path) == {3: {"seed": 3, "share": 0.5}}

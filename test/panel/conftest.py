@@ -32,6 +32,14 @@ def stage() -> Iterator[Stage]:
 
 
 @pytest.fixture
+def locked() -> Iterator[Stage]:
+    """A panel that asks for a token."""
+    stage = Stage(token="a token for this test")
+    yield stage
+    stage.close()
+
+
+@pytest.fixture
 def visit(browser: Browser, stage: Stage) -> Iterator[Callable[..., Page]]:
     """A function that opens the page; an error in a script fails the test."""
     from ..support.panel_browser import open_page

@@ -23,7 +23,7 @@ def main() -> None:
     stage.arms.states.update(right="active", left="active")
     for settings in stage.arms.settings.values():
         settings["mode"] = "zero_g"
-    stage.arms.share = ("40", "10")
+    stage.arms.wearer |= {"share of the wearer (%)": "40", "share band (%)": "10"}
     stage.files.content["recording"] = RECORDING
     try:
         with chromium() as browser:

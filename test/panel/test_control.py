@@ -21,12 +21,9 @@ import yaml
 import exo_gravity.panel
 from exo_gravity.core import vocabulary
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
-from exo_gravity.core.compensation.settings import COMPENSATOR
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME
-from exo_gravity.core.safety.limits import CAN_BRIDGE
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.panel import recordings
 from exo_gravity.panel.control import LIMITS, Control, Page, parse
@@ -37,7 +34,6 @@ from exo_gravity.sim.script import TIMED, VALUED
 from ..support.panel_stage import WEARER_FILE, PlayedArms, PlayedFiles
 
 DOWN = [("let_down", "right"), ("let_down", "left")]
-OWN_LEASE = ("10.0.0.1 page 1", "hold")
 
 
 class Panel(Control):
@@ -137,53 +133,48 @@ def test_a_wrong_request_is_refused(body):
         parse(body, ("right", "left"), {"demo"})
 
 
-def test_log_and_refusals_name_the_client_and_never_the_wearers_data(panel):
+def test_page_and_log_get_refusals_and_the_name_of_the_client_and_never_the_wearers_data(panel):
     values = {"support": 0.3, "wearer.body_mass": 81.5, "wearer.sex": "female"}
     assert panel.ask(panel.first, "set", "right", values=values) == (200, "")
     assert panel.notes == ["10.0.0.1 page 1: set right support = 0.3, wearer.body_mass, wearer.sex: done"]
     for values in ({"wearer.body_mass": 81.5, "law": "exact"}, {"wearer.body_mass": 815.0}):
         assert panel.status(panel.first, "set", "right", values=values) == 400
         assert "wearer.body_mass" in panel.notes[-1] and "81" not in panel.notes[-1]
+    panel.arms.problem = "refused: the arm is active"
+    assert panel.ask(panel.first, "enable", "right") == (409, "refused: the arm is active")
+    assert panel.notes[-1].endswith("enable right: refused: the arm is active")
 
 
-OPERATED = ("enable", "activate", "clear_fault", "resume", "confirm_pose")
-FILED = ("record", "stop_recording", "save", "stop_trial")
+OPERATED = [(kind, {"arm": "right"}) for kind in ("enable", "activate", "clear_fault", "resume", "confirm_pose")]
+FILED = [(kind, {}) for kind in ("record", "stop_recording", "save", "stop_trial")] + [("trial", {"name": "demo"})]
 
 
-def test_every_page_lets_down_and_only_the_one_in_control_does_anything_else(panel):
+def test_every_page_lets_down_and_marks_and_only_the_one_in_control_does_anything_else(panel):
     for page in (panel.first, panel.second, "", "guessed"):
         assert panel.ask(page, "let_down") == panel.ask(page, "let_down", "left") == (200, "")
     assert panel.arms.calls == 4 * [*DOWN, ("let_down", "left")]
     panel.arms.calls.clear()
-    requests = [(kind, {"arm": "right"}) for kind in OPERATED] + [(kind, {}) for kind in FILED]
-    for kind, more in (*requests, ("trial", {"name": "demo"})):
+    for done, (kind, more) in enumerate(OPERATED + FILED):
         assert [panel.status(page, kind, **more) for page in (panel.second, "", "guessed")] == [403] * 3
-        assert len(panel.arms.calls) + len(panel.files.calls) == [*OPERATED, *FILED, "trial"].index(kind)
+        assert len(panel.arms.calls) + len(panel.files.calls) == done
         assert panel.status(panel.first, kind, **more) == 200
-    assert panel.arms.calls == [(kind, "right") for kind in OPERATED]
-    assert panel.files.calls == [*FILED, "trial demo"]
+    assert panel.arms.calls == [(kind, "right") for kind, _ in OPERATED]
+    assert panel.files.calls == [" ".join((kind, *more.values())) for kind, more in FILED]
+    panel.now += 10.0
+    assert panel.status(panel.second, "marker", text="a") == 200 and panel.files.calls[-1] == "marker a"
 
 
 def test_letting_down_has_no_rate_limit_and_everything_else_has_also_in_the_log(panel):
-    def statuses(count: int) -> list[int]:
-        return [panel.status(panel.first, "clear_fault", "right") for _ in range(count)]
-
-    assert statuses(int(LIMITS.burst) + 1) == [200] * int(LIMITS.burst) + [429]
-    panel.now += 1.0
-    assert statuses(int(LIMITS.refill) + 1) == [200] * int(LIMITS.refill) + [429]
+    for count, pause in ((LIMITS.burst, 0.0), (LIMITS.refill, 1.0)):
+        panel.now += pause
+        statuses = [panel.status(panel.first, "clear_fault", "right") for _ in range(int(count) + 1)]
+        assert statuses == [200] * int(count) + [429]
     assert [panel.status(panel.first, "let_down") for _ in range(50)] == [200] * 50
     panel.notes.clear()
     panel.now += 10.0
     for _ in range(500):
         panel.ask(panel.first, "nonsense")
     assert len(panel.notes) <= LIMITS.burst
-
-
-def test_a_refusal_of_the_device_reaches_the_page_and_the_log(panel):
-    panel.arms.problem = "refused: the arm is active"
-    assert panel.ask(panel.first, "enable", "right") == (409, "refused: the arm is active")
-    assert panel.notes[-1].endswith("enable right: refused: the arm is active")
-    assert panel.ask(panel.first, "let_down")[1] == "; ".join(f"{arm}: {panel.arms.problem}" for _, arm in DOWN)
 
 
 def test_nothing_keeps_an_arm_up_neither_the_other_arm_nor_the_log(panel, caplog):
@@ -209,12 +200,6 @@ def test_control_is_taken_and_given_up_here_and_at_the_arms(panel):
     assert panel.holder is None
 
 
-def test_a_reloaded_page_keeps_its_number_and_control_and_no_other_secret_is_accepted(panel):
-    panel.first.connection = None
-    assert panel.opened(secret=panel.first.secret) is panel.first is panel.holder and panel.first.number == 1
-    assert panel.opened(secret="my own").secret != "my own"
-
-
 def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_and_a_new_page_takes_over(panel):
     assert LIMITS.gone > LEASE_TIME + 0.1  # s between two looks of the bridge: the arm has been let down by then
     panel.now += LIMITS.gone
@@ -228,14 +213,17 @@ def test_the_operators_page_is_gone_when_it_confirms_nothing_for_a_while_and_a_n
     assert panel.opened() is panel.holder
 
 
-def test_the_number_of_pages_is_limited_to_those_that_are_open(panel):
-    pages = [panel.first, panel.second, *(panel.opened() for _ in range(LIMITS.pages - 2))]
+def test_a_reloaded_page_stays_the_same_and_only_pages_that_are_open_count(panel):
+    panel.first.connection = None
+    assert panel.opened(secret=panel.first.secret) is panel.first is panel.holder and panel.first.number == 1
+    assert panel.opened(secret="my own").secret != "my own"
+    pages = [panel.opened() for _ in range(LIMITS.pages - 3)]
     assert panel.open("", "10.0.0.1") is None
-    pages[5].connection = None
+    pages[2].connection = None
     panel.opened()
-    assert panel.open(pages[5].secret, "10.0.0.1") is None
-    pages[6].connection = None
-    assert panel.opened(secret=pages[6].secret) is pages[6]
+    assert panel.open(pages[2].secret, "10.0.0.1") is None
+    pages[3].connection = None
+    assert panel.opened(secret=pages[3].secret) is pages[3]
 
 
 def test_confirmations_of_the_operators_page_and_enabling_renew_its_lease_and_nothing_else(panel):
@@ -247,7 +235,7 @@ def test_confirmations_of_the_operators_page_and_enabling_renew_its_lease_and_no
     panel.confirm(panel.first)
     panel.open(panel.first.secret, "10.0.0.1")  # reloaded
     panel.ask(panel.first, "enable", "right")
-    assert panel.arms.leases == [OWN_LEASE] * 3
+    assert panel.arms.leases == [("10.0.0.1 page 1", "hold")] * 3
 
 
 def test_an_arm_that_another_operator_holds_is_only_let_down(panel):
@@ -281,13 +269,9 @@ class Device:
 
     def __init__(self):
         self.state, self.performed = "active", []
-
-    def parameters(self):
         compensator = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
-        return {"/right/compensator": compensator, "/right/simulator": {}}
-
-    def states(self):
-        return {"right": self.state}
+        self.parameters = lambda: {"/right/compensator": compensator, "/right/simulator": {}}
+        self.states = lambda: {"right": self.state}
 
     def mark(self, text):
         self.marked = text
@@ -371,17 +355,30 @@ def test_a_recorder_that_has_ended_by_itself_is_stopped_with_its_exit_code(kept,
     assert "exit code 1" in asyncio.run(stopped())
 
 
-@pytest.mark.parametrize("problem", ["", "stopped by the operator"])
-def test_a_trial_is_followed_to_its_report(kept, run_instead, tmp_path, problem):
-    run_instead(problem=problem)
-    first, *_, last = kept.followed()
+# What the trial prints last and its problem, and its end as the page shows it.
+TRIALS = [("{'phase': 'reporting'}", ""), ("{'step': 0, 'left': 3.0}", "stopped by the operator")]
+
+
+@pytest.mark.parametrize(("last", "problem"), TRIALS)
+def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_restart(
+    kept, run_instead, tmp_path, last, problem
+):
+    run_instead(last=last, problem=problem)
+    assert kept.begin("P01") == ""
+    first, *_, end = kept.followed()
     assert first["recording"]["on"] and (first["trial"]["phase"], first["trial"]["step"]) == ("running", -1)
     assert not first["trial"]["guided"] and kept.device.performed == [str(tmp_path / "short.yaml"), ""]
-    name = "short_20260314_120000"
-    assert last["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
-    assert not last["recording"]["on"] and kept.report(name) == kept.out / name / "report.html"
+    name = "P01/2026-03-14/short_20260314_120000"
+    assert end["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
+    assert not end["recording"]["on"]
+    restarted = Kept(tmp_path)
+    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name}
+    assert restarted.past() == {"subjects": ["P01"], "past": [entry]}
+    assert restarted.state()["session"]["subject"] == ""
+    assert restarted.report(name) == kept.out / name / "report.html"
     (tmp_path / "report.html").touch()
-    assert kept.report("..") is kept.report(str(tmp_path)) is None  # no other file is served
+    wrong = ("..", str(tmp_path), "\0", "a" * 3000, "../etc")  # no other file is served
+    assert [restarted.report(name) for name in wrong] == [None] * 5
 
 
 def test_a_trial_that_cannot_start_says_why(kept, run_instead):
@@ -389,23 +386,6 @@ def test_a_trial_that_cannot_start_says_why(kept, run_instead):
     assert kept.followed()[-1]["trial"]["problem"] == "trial: no rclpy"
     kept.device.state = "disabled"
     assert "every arm is active" in asyncio.run(kept.trial("short"))
-
-
-def test_the_virtual_wearer_ends_with_a_trial_that_an_arm_ended(kept, run_instead):
-    run_instead(last="{'step': 0, 'left': 3.0}")
-    assert kept.followed() and kept.device.performed[-1] == ""
-
-
-def test_a_trial_of_a_subject_is_in_the_list_with_its_report_after_a_restart(kept, run_instead, tmp_path):
-    run_instead()
-    assert kept.begin("P01") == ""
-    kept.followed()
-    restarted = Kept(tmp_path)
-    name = "P01/2026-03-14/short_20260314_120000"
-    entry = {"subject": "P01", "trial": "short", "when": "2026-03-14 12:00:00", "report": name}
-    assert restarted.past() == {"subjects": ["P01"], "past": [entry]}
-    assert restarted.report(name) == kept.out / name / "report.html"
-    assert restarted.state()["session"]["subject"] == ""
 
 
 def test_a_name_is_refused_as_a_code_and_does_not_reach_the_log(kept):
@@ -429,12 +409,10 @@ def test_what_belongs_to_the_wearer_is_kept_in_a_file_and_read_again_with_the_su
     assert kept.begin("P01") and kept.state()["session"]["subject"] == "P02"
 
 
-def test_a_marker_without_a_text_is_called_marker_and_half_of_a_character_reaches_no_page(kept):
+def test_a_marker_without_a_text_is_called_marker_and_half_of_a_character_is_refused(kept):
     assert kept.ask("marker", text="") == "" and kept.device.marked == "marker"
     assert kept.ask("marker", text=["a"]).startswith("text ")
     assert kept.ask("marker", text="calm \ud83d").startswith("text must be")
-    json.dumps(kept.state(), ensure_ascii=False).encode()
-    assert [kept.report(name) for name in ("\0", "a" * 3000, "../etc")] == [None] * 3  # no report's names
 
 
 # After a fault
@@ -502,23 +480,21 @@ def test_a_change_of_which_the_panel_learns_after_the_fault_is_the_cause_and_a_l
     assert look.go(0.1, RAISED) == cause
 
 
-def test_the_limit_of_a_joint_is_the_smaller_one_and_a_compensator_without_a_limit_of_its_own_has_none():
-    bridge = values_of(
-        CAN_BRIDGE, {"can.interface": "virtual", "can.channel": "test", "max_effort": [3.0, 9.0, 3.0, 3.0]}
-    )
-    compensator = values_of(COMPENSATOR, {}) | {"max_effort": [0.0, 5.0, 0.0, 12.0]}
-    assert setup_of({"right": (bridge, compensator)})["arms"]["right"]["max_effort"] == [3.0, 5.0, 3.0, 3.0]
+# The bridge's limits, the compensator's, and what the page shows.
+LIMITED = [
+    ([3.0, 9.0, 3.0, 3.0], [0.0, 5.0, 0.0, 12.0], [3.0, 5.0, 3.0, 3.0]),
+    ([3.0, 9.0, 3.0], [2.0] * 4, [2.0] * 3),  # of an arm with other joints
+]
 
 
-def test_nodes_of_other_programs_and_of_other_arms_that_have_an_arms_names_leave_the_page_its_setup():
+def test_the_limit_of_a_joint_is_the_smaller_one_and_nodes_of_other_programs_leave_the_page_its_setup():
+    for ours, its, shown in LIMITED:
+        assert setup_of({"right": ({"max_effort": ours}, {"max_effort": its})})["arms"]["right"]["max_effort"] == shown
     bridge = fitting("/right/can_bridge", {"max_effort": "much", "can.channel": ["vcan0"], "rate": math.nan, "own": 1})
-    assert bridge == {"own": 1}
     compensator = fitting("/right/compensator", {"max_effort": 3.0, "support": 0.5, "payload.mass": math.inf})
-    assert compensator == {"support": 0.5}
+    assert (bridge, compensator) == ({"own": 1}, {"support": 0.5})
     shown = setup_of({"right": (bridge, compensator)})["arms"]["right"]
     assert shown["max_effort"] is None and shown["settings"]["support"] == 0.5
-    others = {"right": ({"max_effort": [3.0, 9.0, 3.0]}, {"max_effort": [2.0] * 4})}
-    assert setup_of(others)["arms"]["right"]["max_effort"] == [2.0] * 3
 
 
 # Texts

@@ -7,7 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from ..support.launched_nodes import executable
 from ..support.node_thread import NodeThread
@@ -32,7 +32,10 @@ MAX_EFFORT = [9.0, 18.0, 9.0, 9.0]
 
 
 class PanelProcess:
-    """The process of a panel, which answers at `url`; address: the line of its log with that."""
+    """The process of a panel, which answers at `url`, and a page of it without a browser, once `open` was called.
+
+    address: the line of its log with its address.
+    """
 
     def __init__(self, folder: Path, **parameters: object) -> None:
         self.port = free_port()
@@ -41,15 +44,41 @@ class PanelProcess:
         self.url = f"http://127.0.0.1:{self.port}/"
         command = [executable("panel"), "--ros-args", *options]
         self.process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
-        assert self.process.stderr is not None
-        self.address = next(line for line in self.process.stderr if "http://" in line)
-
-    def close(self) -> None:
-        self.process.kill()
-        self.process.wait()
+        self.address = next(line for line in self.process.stderr or () if "http://" in line)
 
     def get(self, path: str = "", **options: Any) -> httpx.Response:
         return httpx.get(self.url + path, verify=False, **options)
+
+    def open(self) -> None:
+        self.headers = {"origin": self.url.rstrip("/")}
+        self.connection = connect(self.url.replace("http", "ws") + "live", origin=self.url.rstrip("/"))
+        self.connection.send(json.dumps({"page": ""}))
+        self.headers["x-panel-page"] = self.message("page")["page"]
+
+    def message(self, kind: str, condition: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
+        """Return the first message of this type for which `condition` holds."""
+        while (content := json.loads(self.connection.recv(timeout=PATIENCE)))["type"] != kind or not condition(content):
+            pass
+        return content
+
+    def ask(self, kind: str, **body: Any) -> tuple[int, str]:
+        answer = httpx.post(self.url + "action", json={"do": kind, **body}, headers=self.headers, verify=False)
+        return answer.status_code, answer.json()["error"]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., PanelProcess]]:
+    """A function that starts a panel with these parameters."""
+    panels: list[PanelProcess] = []
+
+    def start(**parameters: object) -> PanelProcess:
+        panels.append(PanelProcess(tmp_path, **parameters))
+        return panels[-1]
+
+    yield start
+    for panel in panels:
+        panel.process.kill()
+        panel.process.wait()
 
 
 class PlayedArm:
@@ -68,8 +97,8 @@ class PlayedArm:
         self.close = self._thread.close
         self.bridge.declare_parameter("max_effort", MAX_EFFORT)
         self.compensator.declare_parameter("support", 0.1)
-        self.bridge.create_service(SetBool, "~/enable", self._on_enable)
-        self.bridge.create_service(Trigger, "~/clear_fault", self._on_clear_fault)
+        self.bridge.create_service(SetBool, "~/enable", partial(self._answer, "enable"))
+        self.bridge.create_service(Trigger, "~/clear_fault", partial(self._answer, "clear_fault"))
         self.bridge.create_service(GetState, "~/get_state", self._on_get_state)
         self.bridge.create_service(ChangeState, "~/change_state", self._on_change_state)
         self.bridge.create_subscription(KeyValue, "~/control", self._on_control, 10)
@@ -89,9 +118,9 @@ class PlayedArm:
     def _on_control(self, message: KeyValue) -> None:
         self.leases.add((message.key, message.value))
 
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.asked.append(("enable", request.data))
-        response.success = True
+    def _answer(self, name: str, request: Any, response: Any) -> Any:
+        self.asked.append((name, getattr(request, "data", None)))
+        response.success, response.message = name == "enable", "refused: there is no fault"
         return response
 
     def _on_get_state(self, request: GetState.Request, response: GetState.Response) -> GetState.Response:
@@ -108,11 +137,6 @@ class PlayedArm:
         self.lifecycle = after or self.lifecycle
         return response
 
-    def _on_clear_fault(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.asked.append(("clear_fault", None))
-        response.success, response.message = False, "refused: there is no fault"
-        return response
-
 
 @pytest.fixture
 def stranger() -> Iterator[str]:
@@ -124,68 +148,30 @@ def stranger() -> Iterator[str]:
     thread.close()
 
 
-@dataclass
-class Visitor:
-    """A page of a panel without a browser."""
-
-    panel: PanelProcess
-    connection: ClientConnection
-    secret: str = ""
-
-    @property
-    def origin(self) -> str:
-        return self.panel.url.rstrip("/")
-
-    def message(self, kind: str, condition: Callable[[dict[str, Any]], Any] = bool) -> dict[str, Any]:
-        """Return the first message of this type for which `condition` holds."""
-        while (content := json.loads(self.connection.recv(timeout=PATIENCE)))["type"] != kind or not condition(content):
-            pass
-        return content
-
-    def ask(self, kind: str, **body: Any) -> tuple[int, str]:
-        headers = {"origin": self.origin, "x-panel-page": self.secret}
-        given = {"json": {"do": kind, **body}, "headers": headers, "verify": False}
-        answer = httpx.post(self.panel.url + "action", **given)
-        return answer.status_code, answer.json()["error"]
-
-
-@pytest.fixture
-def page(tmp_path: Path) -> Iterator[Visitor]:
-    """A page of a panel on loopback, which holds the arms' control."""
-    panel = PanelProcess(tmp_path, dead_man=True)
-    assert "on this machine only" in panel.address
-    with connect(panel.url.replace("http", "ws") + "live", origin=panel.url.rstrip("/")) as connection:
-        connection.send(json.dumps({"page": ""}))
-        visitor = Visitor(panel, connection)
-        visitor.secret = visitor.message("page")["page"]
-        yield visitor
-    panel.close()
-
-
 def is_known(setup: dict[str, Any], support: float = 0.1) -> bool:
     arm = setup["arms"].get("right")
     return bool(arm) and arm["max_effort"] == MAX_EFFORT and arm["settings"]["support"] == support
 
 
-def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_another_program(page, stranger):
-    wait_until(lambda: stranger in page.panel.get("parameters").json())
+def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_another_program(start, stranger):
+    page = start(dead_man=True)
+    assert "on this machine only" in page.address
+    page.open()
+    wait_until(lambda: stranger in page.get("parameters").json())
     assert page.ask("let_down") == (409, "no arm is present")
     arm = PlayedArm()
     try:
         page.message("setup", is_known)
         shown = page.message("state", lambda state: state["arms"]["right"]["joints"])["arms"]["right"]
         assert [joint["position"] for joint in shown["joints"]] == [0.1] * 4
-        name = f"panel {page.panel.process.pid}, 127.0.0.1 page 1"
+        name = f"panel {page.process.pid}, 127.0.0.1 page 1"
         while (name, "hold") not in arm.leases:
             page.connection.send(json.dumps({"seen": page.message("state")["number"]}))
         arm.holder = "anna"
         page.message("state", lambda state: state["control"]["elsewhere"] == "anna")
-        assert page.ask("enable", arm="right") == (403, "enable right: anna holds control of this arm")
         assert page.ask("take") == (200, "")
         arm.holder = name
-        page.message("state", lambda state: not state["control"]["elsewhere"])
-        while (name, "take") not in arm.leases:
-            page.message("state")
+        page.message("state", lambda state: not state["control"]["elsewhere"] and (name, "take") in arm.leases)
         assert page.ask("enable", arm="right") == (200, "")
         assert page.ask("clear_fault", arm="right") == (409, "refused: there is no fault")
         for arm.lifecycle in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_INACTIVE):
@@ -194,7 +180,7 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_a
         refusal = "the bridge does not wait for its operator: it is played"
         assert page.ask("activate", arm="right") == (409, refusal)
         assert page.ask("set", arm="right", values={"support": 0.2}) == (200, "")
-        settings = page.panel.get("settings/right").json()  # also before the panel has heard of it
+        settings = page.get("settings/right").json()  # also before the panel has heard of it
         assert settings == {"settings": {"support": 0.2}}
         page.message("setup", lambda setup: is_known(setup, 0.2))
         assert page.ask("let_down") == (200, "")
@@ -207,15 +193,13 @@ def test_the_page_shows_and_operates_an_arm_that_comes_and_goes_and_no_node_of_a
     assert page.ask("let_down") == (409, "right: /right/can_bridge/enable does not answer")
 
 
-def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(tmp_path):
-    panel, probe = PanelProcess(tmp_path, token=TOKEN), RosProbe()
-    try:
-        assert TOKEN in panel.address
-        assert [panel.get(params=given).status_code for given in ({}, {"token": TOKEN})] == [401, 303]
-        values = probe.dump_parameters(["/panel"])["/panel"]["ros__parameters"]
-        assert values["port"] == panel.port and "token" not in values
-        panel.process.terminate()
-        assert panel.process.wait(PATIENCE) == 0
-    finally:
-        probe.close()
-        panel.close()
+def test_its_parameters_can_be_read_but_not_its_token_and_it_ends_well(start):
+    panel = start(token=TOKEN)
+    assert TOKEN in panel.address
+    assert [panel.get(params=given).status_code for given in ({}, {"token": TOKEN})] == [401, 303]
+    probe = RosProbe()
+    values = probe.dump_parameters(["/panel"])["/panel"]["ros__parameters"]
+    probe.close()
+    assert values["port"] == panel.port and "token" not in values
+    panel.process.terminate()
+    assert panel.process.wait(PATIENCE) == 0

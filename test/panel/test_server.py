@@ -21,16 +21,6 @@ from exo_gravity.panel.server import SERVING, Access, PanelServer
 from ..support.panel_stage import Stage
 from ..support.waiting import PATIENCE
 
-TOKEN = "a token for this test"
-
-
-@pytest.fixture
-def locked() -> Iterator[Stage]:
-    """A panel that asks for a token."""
-    stage = Stage(token=TOKEN)
-    yield stage
-    stage.close()
-
 
 def origin_of(stage: Stage) -> str:
     return stage.url.rstrip("/")
@@ -98,9 +88,7 @@ def test_only_the_names_of_this_machine_are_answered_and_no_other_pages_requests
     assert stage.arms.calls == []
 
 
-def test_behind_a_proxy_the_pages_origin_has_the_proxys_name(locked):
-    proxied = {"host": "panel.example.org", "origin": "https://panel.example.org"}
-    assert act(locked, **proxied) == 401  # not 403: only the token is missing
+TOKEN = "a token for this test"
 
 
 def access_at(host: str, token: str = "", clock: Callable[[], float] = lambda: 0.0) -> Access:
@@ -130,6 +118,8 @@ def test_without_the_token_nothing_is_served_and_with_it_everything(locked):
         answer = get(locked, path)
         assert answer.status_code == 401 and "main.js" not in answer.text
     assert act(locked) == 401
+    # Behind a proxy the page's origin has the proxy's name: it is not 403, only the token is missing.
+    assert act(locked, host="panel.example.org", origin="https://panel.example.org") == 401
     with pytest.raises(InvalidStatus), live(locked):
         pass
     assert locked.arms.calls == []
@@ -170,13 +160,18 @@ def test_every_page_gets_setup_and_state_a_reloaded_page_stays_the_same_and_its_
     assert closed.value.rcvd is not None and closed.value.rcvd.code == 4001
 
 
-def test_the_settings_of_an_arm_are_read_when_they_are_asked_for(stage):
+def test_settings_are_read_when_they_are_asked_for_and_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
     stage.arms.settings["right"]["support"] = 0.4  # of which the pages have not heard yet
     assert get(stage, "settings/right").json()["settings"]["support"] == 0.4
     assert get(stage, "settings/middle").status_code == 404
     stage.arms.problem = "no answer"
     answer = get(stage, "settings/right")
     assert (answer.status_code, answer.json()) == (503, {"error": "no answer"})
+    stage.files.reports["demo_1"] = tmp_path / "report.html"
+    stage.files.reports["demo_1"].write_text("<p>held</p>")
+    answer = get(stage, "report/demo_1")
+    policy = answer.headers["content-security-policy"]
+    assert answer.status_code == 200 and "script-src" not in policy and "default-src 'none'" in policy
 
 
 BODIES = [
@@ -202,14 +197,6 @@ def test_only_a_request_that_is_json_and_short_is_carried_out_and_a_live_connect
         assert stage.arms.calls == []
         assert act(stage, iter((content[:9], content[9:]))) == status
     assert stage.arms.calls
-
-
-def test_a_report_may_hold_styles_but_no_scripts(stage, tmp_path: Path):
-    stage.files.reports["demo_1"] = tmp_path / "report.html"
-    stage.files.reports["demo_1"].write_text("<p>held</p>")
-    answer = get(stage, "report/demo_1")
-    policy = answer.headers["content-security-policy"]
-    assert answer.status_code == 200 and "script-src" not in policy and "default-src 'none'" in policy
 
 
 def test_a_page_that_stops_confirming_no_longer_renews_its_lease(stage):

@@ -69,8 +69,8 @@ def wait_for_state(page: Page, state: str, arm: str = "right") -> None:
     page.wait_for_selector(of_arm(f'.badge[data-state="{state}"]', arm))
 
 
-def enable(page: Page, arm: str = "right") -> None:
-    """Enable the arm as its operator does."""
-    wait_for_state(page, "disabled", arm)
-    page.click(of_arm(".enable", arm))
+def enable(page: Page, state: str = "disabled") -> None:
+    """Enable the right arm, which is in this state, as its operator does."""
+    wait_for_state(page, state)
+    page.click(of_arm(".enable"))
     page.click("#ask-yes")

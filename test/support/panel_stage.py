@@ -59,14 +59,9 @@ class PlayedArms:
     calls: list[tuple[str, ...]] = field(default_factory=list)
     problem: str = ""
     errors: dict[str, Exception] = field(default_factory=dict)
-    changing: str = "none"  #: the joint whose load a compensator reports to change
     compensator: dict[str, str] = field(default_factory=dict)  #: further keys of a compensator
-    contact: dict[str, str] = field(default_factory=dict)  #: what `wearer` reports of contacts
+    wearer: dict[str, str] = field(default_factory=dict)  #: and of `wearer`
     pose: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  #: rad, about which the joints swing
-    adapts: dict[str, str] = field(default_factory=dict)  #: what it reports of a support that adapts
-    share: tuple[str, str] = ("unknown", "unknown")  #: of their arm's weight that the wearer carries, and its band, %
-    joint_shares: dict[str, str] = field(default_factory=dict)  #: the same of joints, by key
-    limit: str = "0.068"  #: the largest support that it reports
     sinking: float = 0.0  #: rad/s at which the joints give way to gravity
     reports: dict[str, dict[str, str]] = field(default_factory=dict)  #: further keys of the bridges, by arm
     #: settings that the panel still shows of an arm, in place of those in force
@@ -139,10 +134,9 @@ class PlayedArms:
         level = 2 if fault != "none" else 0
         bridge = {**values, "level": level, "message": sentence, **self.reports.get(name, {})}
         carried = {"mass carried (kg)": "1.854", "level": 0, "message": "compensating", "state": "compensating"}
-        carried |= {"changing load": self.changing, "reason": "none", "weighing": "none", **self.compensator}
-        of_wearer = {"largest support": self.limit, "support adapts": "off", **self.adapts, **self.contact}
-        of_wearer["share of the wearer (%)"], of_wearer["share band (%)"] = self.share
-        of_wearer |= self.joint_shares
+        carried |= {"changing load": "none", "reason": "none", "weighing": "none", **self.compensator}
+        share = dict.fromkeys(("share of the wearer (%)", "share band (%)"), "unknown")
+        of_wearer = {"largest support": "0.068", "support adapts": "off", **share, **self.wearer}
         velocity = [-self.sinking * math.copysign(1.0, tau) for tau in effort]
         joints = joint_rows(SimpleNamespace(name=names, position=position, velocity=velocity, effort=effort))
         statuses = {"bridge": bridge, "compensator": carried, "wearer": of_wearer, "simulator": self.simulator}
@@ -206,7 +200,7 @@ class Stage:
         self.arms = PlayedArms()
         self.files, self.notes = PlayedFiles(), list[str]()
         self.control = Control(self.arms, self.files, self.notes.append, time.monotonic)
-        self.port = free_port()
+        self.port, self.token = free_port(), token
         self.url = f"http://127.0.0.1:{self.port}/"
         self.server = PanelServer(host, self.port, token, self.control)
         trials, markers = list(self.files.trials), ["begin", "end", "a text of one's own"]
