@@ -262,18 +262,19 @@ def test_any_load_up_to_the_largest_moments_is_explained_in_any_pose_at_any_tilt
 
 
 GRAVITY = torque_of(RAISED)
-JUDGED = {  # torque, pose, what may be added, and s until the fault at most
-    "the heaviest load": (GRAVITY, RAISED, NO_TORQUE, math.inf),
+OLD = torque_of((HANGING[0], HANGING[1] + 0.36, *HANGING[2:]))  # of a pose of 0.18 s ago, at 2 rad/s
+JUDGED: dict[str, tuple[Any, float, dict[str, Any]]] = {
+    # torque; s until the fault at most; and, where they are other than usual: pose, velocity, age, what may be added
+    "the heaviest load": (GRAVITY, math.inf, {}),
+    "no load": (NO_TORQUE, math.inf, {}),
     **{  # for the check that names it
-        f"an impossible {torque} Nm": ((0.0, torque, 0.0, 0.0), RAISED, NO_TORQUE, math.inf)
-        for torque in (math.nan, math.inf, 41.0)
+        f"an impossible {torque} Nm": ((0.0, torque, 0.0, 0.0), math.inf, {}) for torque in (math.nan, math.inf, 41.0)
     },
-    "no load": (NO_TORQUE, RAISED, NO_TORQUE, math.inf),
-    "three times the heaviest": (torque_of(RAISED, 3.0), RAISED, NO_TORQUE, 0.1),
-    "the wrong sign": (torque_of(RAISED, -1.0), RAISED, NO_TORQUE, 0.1),
-    "another pose": (GRAVITY, HANGING, NO_TORQUE, 0.1),
+    "three times the heaviest": (torque_of(RAISED, 3.0), 0.1, {}),
+    "the wrong sign": (torque_of(RAISED, -1.0), 0.1, {}),
+    "another pose": (GRAVITY, 0.1, {"theta": HANGING}),
     **{
-        f"{push} Nm more, {name}": ((GRAVITY[0], GRAVITY[1] + push, *GRAVITY[2:]), RAISED, addition, latest)
+        f"{push} Nm more, {name}": ((GRAVITY[0], GRAVITY[1] + push, *GRAVITY[2:]), latest, {"addition": addition})
         for push in (3.0, -6.0)
         for name, addition, latest in (
             ("unannounced", NO_TORQUE, 0.2),
@@ -281,25 +282,19 @@ JUDGED = {  # torque, pose, what may be added, and s until the fault at most
             ("permitted at other joints", (3.0, 0.0, 3.0, 3.0), 0.2),
         )
     },
+    "as old as its ride while the wearer moves": (OLD, math.inf, {"theta": HANGING, "velocity": 2.0, "age": 0.18}),
+    "too old for its age": (OLD, 0.8, {"theta": HANGING, "velocity": 2.0}),
 }
 
 
-@pytest.mark.parametrize(("torque", "theta", "addition", "latest"), JUDGED.values(), ids=JUDGED)
-def test_only_what_gravity_and_permitted_additions_explain_is_no_fault(torque, theta, addition, latest):
+@pytest.mark.parametrize(("torque", "latest", "given"), JUDGED.values(), ids=JUDGED)
+def test_only_what_gravity_and_permitted_additions_explain_is_no_fault(torque, latest, given):
     """The time until the monitor finds a fault in a constant torque."""
-    monitor = MotionMonitor(replace(WATCHED, largest_addition=addition))
-    faults = [monitor.step(PERIOD, samples(theta), torque)[1] is not None for _ in range(500)]
+    monitor = MotionMonitor(replace(WATCHED, largest_addition=given.get("addition", NO_TORQUE)))
+    read, age = samples(given.get("theta", RAISED), given.get("velocity", 0.0)), given.get("age", 0.0)
+    faults = [monitor.step(PERIOD, read, torque, age)[1] is not None for _ in range(500 if not age else 200)]
     found = faults.index(True) * PERIOD if any(faults) else math.inf
     assert found < latest or found == latest == math.inf
-
-
-def test_a_torque_may_be_as_old_as_its_ride_while_the_wearer_moves() -> None:
-    moved = samples(HANGING, 2.0)  # on from a pose of 0.18 s ago
-    old = torque_of((HANGING[0], HANGING[1] + 0.36, *HANGING[2:]))
-    for age, is_fault in ((0.0, True), (0.18, False)):
-        monitor = MotionMonitor(WATCHED)
-        faults = [monitor.step(PERIOD, moved, old, age)[1] for _ in range(200)]
-        assert any(faults) is is_fault
 
 
 def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some_seconds() -> None:

@@ -13,7 +13,7 @@ from exo_gravity.core.compensation.support import REQUEST
 from exo_gravity.lab.observer.adaptation import ADAPTATION, SupportAdaptation
 from exo_gravity.lab.observer.momentum import WearerEstimate
 
-from ..core.test_support_request import SETTINGS
+from ..core.test_compensator import SETTINGS
 
 PERIOD, WEIGHT, CODE = 0.01, 8.0, 25.0 / 4095.0  # s, Nm, rad
 RISE, MEMORY = ADAPTATION.rise, ADAPTATION.memory

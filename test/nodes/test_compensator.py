@@ -213,7 +213,7 @@ def test_efforts_of_one_outer_loop_are_added_and_the_arm_stays_carried_without_t
     rig.wait_until(lambda: adds(rig, STILL) and "more than one publisher" in rig.status.message)
     rig.on_cycle = ours
     rig.wait_until(lambda: adds(rig, ASSIST))
-    message.effort = [math.nan, 0.0, 0.0, 0.0]  # other refusals: test/core/test_assist.py
+    message.effort = [math.nan, 0.0, 0.0, 0.0]  # other refusals: test/core/test_terms.py
     said = "gravity compensation alone: assist_efforts must be numbers"
     rig.wait_until(lambda: adds(rig, STILL) and rig.status.message.startswith(said))
     assert (rig.values["assist reason"], rig.values["warnings"]) == ("invalid", "terms_refused")
