@@ -46,8 +46,6 @@ ROOMS = {
         "imu_sources",
         "urdf_checks",
         "urdf_model",
-        "urdf_links",
-        "urdf_held",
         "urdf_arm",
     ),
 }

@@ -13,7 +13,7 @@ import copy
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,20 +22,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from exo_gravity import packaged
-from exo_gravity.core.arm.arm_data import MAX_GAIN, MAX_GRAVITY, MAX_MASS, MAX_PAYLOAD, MAX_REACH, STANDARD_GRAVITY
+from exo_gravity.core.arm.arm_data import (
+    MAX_GAIN,
+    MAX_GRAVITY,
+    MAX_MASS,
+    MAX_PAYLOAD,
+    MAX_REACH,
+    NO_PAYLOAD,
+    STANDARD_GRAVITY,
+)
 from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.rotation import ZERO
+from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import checked, unused_efforts
-from exo_gravity.hardware.urdf_held import Bodies, Held
-from exo_gravity.hardware.urdf_links import UrdfLinks
-from exo_gravity.hardware.urdf_model import LEAST_LENGTH, UrdfShape
+from exo_gravity.hardware.urdf_model import LEAST_LENGTH, UrdfJoints, UrdfShape
 
 PACKAGE = "package://"
 # The compensator's parameters.
 MOMENT_NAMES, TURN_NAMES = (tuple(f"urdf.{what}_{axis}" for axis in "xyz") for what in ("moment", "turn"))
+LEAST_POSES = 500  # at random, for the least inertia
 BASE_POSES = 60  # at random, from which the moments are found that torque can show
 DEPENDENT = 1e-6  # of the largest column: what is left of one that depends on others
 INERTIAL, MOMENT = 10, slice(1, 4)  # parameters of a link in Pinocchio's regressor, and those of its first moment
@@ -85,6 +92,68 @@ def arm_in_file(values: Mapping[str, Any], why: str) -> UrdfArm:
     return arm_from(values, read_urdf(values["urdf.file"]))
 
 
+@dataclass(frozen=True)
+class Held:
+    """What an arm of n joints holds: a load in its hand, and a wearer's arm on its links.
+
+    Both are points of mass. A wearer's segment lies on the line from its link's joint to the next joint, or from the
+    last joint to the hand. First moments of a wearer's arm, as `calibrate wearer` finds them, take the place of its
+    points in all but the inertia: they move the links' centres of gravity.
+    """
+
+    payload: tuple[float, float, float, float] = NO_PAYLOAD  #: kg, and its centre of gravity in m in the hand's frame
+    worn: tuple[tuple[float, float], ...] = ()  #: (n,) kg of the wearer's segment, and m from the link's joint
+    moments: tuple[tuple[float, ...], ...] = ()  #: (n, 3) kg m of the wearer's arm, in place of `worn`
+
+    @property
+    def mass(self) -> float:
+        """Kg of load and wearer."""
+        return self.payload[0] + sum(mass for mass, _ in self.worn)
+
+
+class UrdfLinks:
+    """The inertia of an arm by Pinocchio: `Links` of core/arm/interface.py.
+
+    moves: how the joints of `model` move.
+    rotors: (n,) kg m^2 at the joints.
+    """
+
+    def __init__(self, pin: Any, model: Any, moves: UrdfJoints, rotors: Sequence[float]) -> None:
+        self._pin, self._moves, self._rotors = pin, moves, np.array(rotors)
+        self._model, self._data = model, model.createData()
+
+    def torque(self, theta: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float]) -> Torque:
+        """Return the torque (n,) in Nm for theta rad, velocity rad/s and acceleration rad/s^2, (n,) each."""
+        self._model.gravity.linear = self._model.gravity.angular = np.zeros(3)
+        rates = (self._moves.own @ values for values in (velocity, acceleration))
+        torque = self._pin.rnea(self._model, self._data, self._moves.configuration(theta), *rates)
+        return tuple((self._moves.own.T @ torque + self._rotors * acceleration).tolist())
+
+    def momentum(
+        self, theta: Sequence[float], velocity: Sequence[float], turning: Floats3 = ZERO
+    ) -> tuple[Torque, Torque]:
+        """Return the generalized momentum p = M v, (n,) kg m^2/s, and C^T v, (n,) Nm, with M' = C + C^T.
+
+        turning: angular velocity of the base, (3,) rad/s, whose part is neglected.
+        """
+        speed, at = self._moves.own @ velocity, self._moves.configuration(theta)
+        momentum = self.matrix(theta) @ np.asarray(velocity)
+        coriolis = self._pin.computeCoriolisMatrix(self._model, self._data, at, speed)
+        return tuple(momentum.tolist()), tuple((self._moves.own.T @ (coriolis.T @ speed)).tolist())
+
+    def matrix(self, theta: Sequence[float]) -> np.ndarray:
+        """Return the mass matrix (n, n) in kg m^2 at `theta` (n,) rad."""
+        upper = np.triu(self._pin.crba(self._model, self._data, self._moves.configuration(theta)))
+        own = self._moves.own
+        return np.asarray(own.T @ (upper + np.triu(upper, 1).T) @ own + np.diag(self._rotors))
+
+    @cached_property
+    def least(self) -> tuple[float, ...]:
+        """The least inertia (n,) in kg m^2 that each joint feels, the other joints being free, in poses at random."""
+        poses = np.random.default_rng(0).uniform(-math.pi, math.pi, (LEAST_POSES, len(self._moves.names)))
+        return tuple(np.min([1.0 / np.diag(np.linalg.inv(self.matrix(pose))) for pose in poses], axis=0).tolist())
+
+
 class UrdfArm(UrdfShape):
     """The arm that `joint_names` (n,) move in the URDF `text`; other joints are where `follow` says, or at 0.
 
@@ -106,8 +175,8 @@ class UrdfArm(UrdfShape):
         self.gain, self.gravity = np.ones(len(names)), STANDARD_GRAVITY
         self._held = Held()
         self._rotors = tuple(rotors) or (0.0,) * len(names)
-        self._change = np.zeros((len(names), 3))  # kg m, beyond the URDF
-        self._turn = np.zeros((len(names), 3))  # rad, likewise
+        self.change = np.zeros((len(names), 3))  #: (n, 3) kg m, by what `corrected` changed the moments
+        self.turn = np.zeros((len(names), 3))  #: (n, 3) rad, by what `turned` turned the joints' places
         self._identity = text, names
         self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
@@ -119,7 +188,6 @@ class UrdfArm(UrdfShape):
         unused = {name for name, *_ in unused_efforts(self)}
         efforts = zip(names, self.moves.efforts, strict=True)
         self.max_effort = tuple(0.0 if name in unused else effort for name, effort in efforts)
-        self._bodies = Bodies(self._pin, self._joints, names, self._along, hand)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, UrdfArm) and self._key == other._key
@@ -129,7 +197,7 @@ class UrdfArm(UrdfShape):
 
     @property
     def _key(self) -> tuple[object, ...]:
-        own = self._own_mass, self._change.tobytes(), self._turn.tobytes()
+        own = self._own_mass, self.change.tobytes(), self.turn.tobytes()
         return (*self._identity, self._hand, self._rotors, self.scale, self._held, *own)
 
     @property
@@ -137,7 +205,7 @@ class UrdfArm(UrdfShape):
         """The load in the hand: kg, and its centre of gravity in m in the frame of the hand."""
         return self._held.payload
 
-    @cached_property
+    @property
     def scale(self) -> tuple[float, ...]:
         """(n,) m/s^2, gain times gravity."""
         return tuple((self.gain * self.gravity).tolist())
@@ -208,10 +276,10 @@ class UrdfArm(UrdfShape):
 
     def scaled(self, gain: Sequence[float], gravity: float) -> UrdfArm:
         """Return this arm with other gains, (n,), and another gravity, m/s^2. Raises ParameterError."""
-        arm = copy.copy(self)
+        _, arm = self.links, copy.copy(self)  # what takes long to compute, the least inertia, is computed once
         arm.gain = floats("gain", gain, len(self.gain), 0.0, MAX_GAIN)
         arm.gravity = one_float("gravity", gravity, 0.0, MAX_GRAVITY, "m/s^2")
-        arm._anew().__dict__["links"] = self.links  # what takes long to compute, the least inertia, is computed once
+        arm._data = arm._model.createData()
         return arm
 
     def corrected(self, change: np.ndarray) -> UrdfArm:
@@ -220,11 +288,11 @@ class UrdfArm(UrdfShape):
         change: (n, 3) kg m, by which the moment of the link of each joint differs from the URDF's, along x, y, z of the
         joint's frame. The masses stay the URDF's: the centres of gravity move.
         """
-        if np.array_equal(change, self._change):
+        if np.array_equal(change, self.change):
             return self
         arm = copy.copy(self)
-        arm._bare = self._bodies.shifted(self._bare, change - self._change, "urdf.moment")
-        arm._change = np.array(change)
+        arm._bare = self._shifted(self._bare, change - self.change, "urdf.moment")
+        arm.change = np.array(change)
         return arm._holding_all()
 
     def turned(self, turn: np.ndarray) -> UrdfArm:
@@ -233,14 +301,14 @@ class UrdfArm(UrdfShape):
         turn: (n, 3) rad, rotation vector by which the place of each joint differs from the URDF's, in the joint's
         frame. `base` remains that of the URDF: axes that are nearly parallel show next to nothing more.
         """
-        if np.array_equal(turn, self._turn):
+        if np.array_equal(turn, self.turn):
             return self
         _, arm = self.base, copy.copy(self)  # the copy keeps the base, which is computed before
         arm._bare = self._bare.copy()
-        for joint, old, new in zip(self._joints, self._turn, turn, strict=True):
+        for joint, old, new in zip(self._joints, self.turn, turn, strict=True):
             place = arm._bare.jointPlacements[joint]
             place.rotation = place.rotation @ self._pin.exp3(old).T @ self._pin.exp3(new)
-        arm._turn = np.array(turn)
+        arm.turn = np.array(turn)
         return arm._holding_all()
 
     def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> UrdfArm:
@@ -251,16 +319,6 @@ class UrdfArm(UrdfShape):
         """
         carried = one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
         return self._with(replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
-
-    @property
-    def change(self) -> np.ndarray:
-        """By what `corrected` changed the moments, (n, 3) kg m."""
-        return self._change
-
-    @property
-    def turn(self) -> np.ndarray:
-        """By what `turned` turned the joints' places, (n, 3) rad."""
-        return self._turn
 
     @cached_property
     def base(self) -> tuple[tuple[int, np.ndarray], ...]:
@@ -309,7 +367,7 @@ class UrdfArm(UrdfShape):
 
     def with_more_moments(self, moments: np.ndarray) -> UrdfArm:
         """Return this arm with `moments` (k,) kg m of `base` added to those of the robot. Raises ParameterError."""
-        change = self._change.copy()
+        change = self.change.copy()
         for (n, way), more in zip(self.base, moments, strict=True):
             change[n] += more * way
         return self.corrected(change)
@@ -392,13 +450,6 @@ class UrdfArm(UrdfShape):
         worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
         return self._with(replace(self._held, worn=worn, moments=()))
 
-    def _anew(self) -> UrdfArm:
-        """Forget what was computed for the arm that this is a copy of."""
-        for name in ("scale", "links"):
-            self.__dict__.pop(name, None)
-        self._data = self._model.createData()
-        return self
-
     def _with(self, held: Held) -> UrdfArm:
         """Return this arm with all that it is to hold."""
         arm = copy.copy(self)
@@ -406,9 +457,36 @@ class UrdfArm(UrdfShape):
         return arm._holding_all()
 
     def _holding_all(self) -> UrdfArm:
-        """Put load and wearer on the links."""
-        self._by_mass, self._model = self._held.on(self._bodies, self._bare)
-        return self._anew()
+        """Put load and wearer on the links, and forget the inertia of the arm that this is a copy of."""
+        self._by_mass, (mass, *place) = self._bare.copy(), self._held.payload
+        if mass:
+            hand = self._by_mass.frames[self._by_mass.getBodyId(self._hand)]
+            self._add(hand.parentJoint, mass, hand.placement.act(np.array(place)))
+        for joint, (worn, cog), way in zip(self._joints, self._held.worn, self.directions, strict=False):
+            self._add(joint, worn, way * cog)
+        self._model = self._shifted(self._by_mass, np.array(self._held.moments), "wearer.moment")
+        self._data = self._model.createData()
+        self.__dict__.pop("links", None)
+        return self
+
+    def _add(self, joint: int, mass: float, place: np.ndarray) -> None:
+        """Add a point of `mass` kg to the link of `joint`, at `place` (3,) m in the joint's frame."""
+        point = self._pin.Inertia(mass, place, np.zeros((3, 3)))
+        self._by_mass.appendBodyToJoint(joint, point, self._pin.SE3.Identity())
+
+    def _shifted(self, model: Any, moments: np.ndarray, what: str) -> Any:
+        """Return a copy of `model` whose links have these `moments` (n, 3) kg m more: their centres of gravity move.
+
+        moments: (0,) for none. Raises ParameterError that names `what` if a link without mass has one.
+        """
+        shifted = model.copy()
+        for joint, name, own in zip(self._joints, self.names, moments, strict=False):
+            link = shifted.inertias[joint]
+            if any(own) and not link.mass:
+                raise ParameterError(f"{what} of {name}", own.tolist(), "0: its link has no mass in the URDF")
+            if any(own):
+                shifted.inertias[joint] = self._pin.Inertia(link.mass, link.lever + own / link.mass, link.inertia)
+        return shifted
 
     def _holding(self, theta: Sequence[float], gravity: Sequence[float], turning: Sequence[float]) -> Torque:
         """Return the torque (n,) in Nm where gravity is `gravity` (3,) m/s^2, as the root link feels it.

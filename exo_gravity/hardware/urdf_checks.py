@@ -22,10 +22,11 @@ from exo_gravity.core.errors import ParameterError
 Found = Iterable[tuple[object, ...]]
 SHAPES = ("visual", "collision")
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)  # as urdfdom, Pinocchio and MuJoCo all read it
-# Attributes of a joint, or of what a link's inertial has, with one number each, or three.
-INERTIA = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-SINGLE = {"value", *INERTIA, "lower", "upper", "effort", "velocity", "multiplier", "offset"}
-VECTORS = {"xyz", "rpy"}
+# How many numbers an attribute of a joint has, or of what a link's inertial has.
+COUNTS = {"xyz": 3, "rpy": 3} | dict.fromkeys(
+    ("value", "ixx", "iyy", "izz", "ixy", "ixz", "iyz", "lower", "upper", "effort", "velocity", "multiplier", "offset"),
+    1,
+)
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,8 @@ def links_of(root: Element, model: Any) -> Iterator[Link]:
         name, inertial = link.get("name", ""), link.find("inertial")
         parts = {} if inertial is None else {part.tag: part.attrib for part in inertial}
         mass, cog = (parts.get(tag, {}).get(own, "0") for tag, own in (("mass", "value"), ("origin", "xyz")))
-        inertia = tuple(float(parts.get("inertia", {}).get(own, "0")) for own in INERTIA)
+        products = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+        inertia = tuple(float(parts.get("inertia", {}).get(own, "0")) for own in products)
         is_drawn = any(link.find(shape) is not None for shape in SHAPES)
         joint = model.frames[model.getBodyId(name)].parentJoint
         yield Link(name, float(mass), tuple(map(float, cog.split())), inertia, is_drawn, joint)
@@ -127,7 +129,7 @@ def _no_numbers(robot: Element) -> Found:
     for owner in (*robot.findall("link"), *robot.findall("joint")):
         for part in (*owner, *owner.findall("inertial/*")):
             for name, text in part.attrib.items():
-                words, count = text.split(), 3 if name in VECTORS else int(name in SINGLE)
+                words, count = text.split(), COUNTS.get(name)
                 if count and not (len(words) == count and all(map(NUMBER.fullmatch, words))):
                     expected = "3 finite numbers" if count > 1 else "a finite number"
                     yield f"{part.tag} {name} of the {owner.tag} {owner.get('name')}", text, expected

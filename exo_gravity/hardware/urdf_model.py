@@ -189,11 +189,11 @@ class UrdfJoints:
 
 
 class Frames(NamedTuple):
-    """The own frames of an arm's joints in m poses, in the root link's axes."""
+    """The own frames of an arm's joints, and its hand, in m poses, in the root link's axes."""
 
     before: np.ndarray  #: (m, n, 3, 3) how they would be turned with the joint itself at 0
     after: np.ndarray  #: (m, n, 3, 3) how they are turned
-    origin: np.ndarray  #: (m, n, 3) m
+    places: np.ndarray  #: (m, n + 1, 3) m, where the joints are, and the hand, or the last joint again
 
 
 class Skeleton(NamedTuple):
@@ -221,6 +221,7 @@ class UrdfShape:
         if not 1 <= len(set(names)) == len(names) <= MAX_JOINTS:
             raise ParameterError("joint_names", names, f"1 to {MAX_JOINTS} different joints of the URDF")
         self.moves = UrdfJoints(self._pin, text, names)  # shared by all arms that are made of this one
+        self.names = self.moves.names  #: the joints (n,)
         self._bare = self._model = self.moves.model  # Pinocchio's, without and with what the arm holds
         if hand and not self._model.existBodyName(hand):
             links = ", ".join(frame.name for frame in self._model.frames if frame.type == self._pin.FrameType.BODY)
@@ -229,12 +230,7 @@ class UrdfShape:
         self._joints = [self._model.getJointId(name) for name in names]
         self._axes = self._axes_of_joints()
         self._along = self._ways()
-        self.length = tuple(float(np.linalg.norm(way)) for way in self._along)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The joints (n,)."""
-        return self.moves.names
+        self.length = tuple(np.linalg.norm(self._along, axis=1).tolist())
 
     @property
     def moves_alone(self) -> bool:
@@ -276,8 +272,7 @@ class UrdfShape:
 
         First as they would be with the joint itself at 0, then as they are.
         """
-        before, after, _ = self._frames(theta)
-        return before, after
+        return self._frames(theta)[:2]
 
     @property
     def moved_by(self) -> np.ndarray:
@@ -297,7 +292,7 @@ class UrdfShape:
         """
         frames = self._frames(np.array([theta]))
         turns, along = frames.after[0], self._along_links
-        return self._with_hand(frames)[0], *(np.einsum("nab,nb->na", turns, ways) for ways in (self._axes, along))
+        return frames.places[0], *(np.einsum("nab,nb->na", turns, ways) for ways in (self._axes, along))
 
     @cached_property
     def _along_links(self) -> np.ndarray:
@@ -324,50 +319,42 @@ class UrdfShape:
         parents = [self._model.parents[joint] for joint in self._joints]
         if not self.moves_alone or parents[1:] != self._joints[:-1]:
             return None
-        turns, carried = self.frames(np.zeros((1, len(parents))))[1][0], self.masses
-        ways, moments, beside = self.directions, np.zeros(len(turns)), np.zeros(len(turns))
-        for n, (joint, way, length) in enumerate(zip(self._joints, ways, self.length, strict=True)):
-            link = self._model.inertias[joint]
-            own = link.mass * link.lever
-            beyond = length * (carried[n] - link.mass)
-            moments[n] = max(0.0, float(own @ way) + beyond) if np.any(way) else 0.0
-            beside[n] = np.linalg.norm(own + beyond * ways[n] - moments[n] * ways[n])
-        axes = np.einsum("nab,nb->na", turns, self._axes)
-        return Skeleton(axes, np.einsum("nab,nb->na", turns, ways), moments, np.cumsum(beside[::-1])[::-1])
+        turns, ways = self.frames(np.zeros((1, len(parents))))[1][0], self.directions
+        links = [self._model.inertias[joint] for joint in self._joints]
+        beyond = np.multiply(self.length, self.masses - [link.mass for link in links])
+        own = np.array([link.mass * link.lever for link in links]) + beyond[:, None] * ways
+        moments = np.maximum(np.einsum("na,na->n", own, ways), 0.0)
+        beside = np.linalg.norm(own - moments[:, None] * ways, axis=1)
+        axes, along = (np.einsum("nab,nb->na", turns, vectors) for vectors in (self._axes, ways))
+        return Skeleton(axes, along, moments, np.cumsum(beside[::-1])[::-1])
 
     def places(self, theta: np.ndarray) -> np.ndarray:
         """Return where the joints are at `theta` (m, n) rad, and the hand or the last joint again: (m, n + 1, 3) m.
 
         In the root link's axes.
         """
-        return self._with_hand(self._frames(theta))
-
-    def _with_hand(self, frames: Frames) -> np.ndarray:
-        _, after, origins = frames
-        return np.concatenate((origins, origins[:, -1:] + after[:, -1:] @ self._along[-1]), axis=1)
+        return self._frames(theta).places
 
     def _frames(self, theta: np.ndarray) -> Frames:
-        """Return the frames of the arm's joints at `theta` (m, n) rad."""
+        """Return the frames of the arm's joints, and its hand, at `theta` (m, n) rad."""
         model, data, frames = self._model, self._model.createData(), []
         for at in self.moves.configurations(theta):
             self._pin.forwardKinematics(model, data, at)
             frames.append([place.homogeneous for place in data.oMi])
         places, parents = np.array(frames)[..., :3, :], [model.parents[joint] for joint in self._joints]
         turned = places[:, parents, :, :3] @ [model.jointPlacements[joint].rotation for joint in self._joints]
-        return Frames(turned, places[:, self._joints, :, :3], places[..., 3][:, self._joints])
+        turns, origins = places[:, self._joints, :, :3], places[..., 3][:, self._joints]
+        hand = origins[:, -1:] + turns[:, -1:] @ self._along[-1]
+        return Frames(turned, turns, np.concatenate((origins, hand), axis=1))
 
-    def _ways(self) -> list[np.ndarray]:
-        """Return the way (3,) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
-        model, ways = self._model, []
-        hand = model.frames[model.getBodyId(self._hand)] if self._hand else None
-        for joint in self._joints:
-            following = [other for other in self._joints if model.parents[other] == joint]
-            if len(following) == 1:
-                ways.append(model.jointPlacements[following[0]].translation.copy())
-            elif hand is not None and hand.parentJoint == joint:
-                ways.append(hand.placement.translation.copy())
-            else:
-                ways.append(np.zeros(3))
+    def _ways(self) -> np.ndarray:
+        """Return the way (n, 3) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
+        model, ways = self._model, np.zeros((len(self._joints), 3))
+        hands = [model.frames[model.getBodyId(self._hand)]] if self._hand else []
+        for way, joint in zip(ways, self._joints, strict=True):
+            following = [model.jointPlacements[other] for other in self._joints if model.parents[other] == joint]
+            ends = following if len(following) == 1 else [hand.placement for hand in hands if hand.parentJoint == joint]
+            way[:] = sum(end.translation for end in ends)
         return ways
 
 

@@ -21,13 +21,13 @@ from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import for_joints
 from exo_gravity.hardware.urdf_checks import SHAPES, robot_of
+from exo_gravity.hardware.urdf_model import LEAST_LENGTH
 from exo_gravity.sim.arm import FRICTION, STEP, STOP, JointConfig
 from exo_gravity.sim.trunk_motion import TrunkState
 
 # Links without mass, which MuJoCo refuses to move, get the least; inertias that no body can have are corrected.
 COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-14", "boundinertia": "1e-14"}
 POINT = (1e-7, 1e-7, 1e-7)  # kg m^2, the inertia of a point of mass
-LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -53,13 +53,11 @@ LEAST_MASS = 1e-3  # kg, of a link that has none in its URDF
 CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
 
-class Described:
-    """What a description, and a picture, states about one arm of n joints."""
+class _Named:
+    """The names in a description of one arm of n joints."""
 
     side: str  #: 'left' or 'right'
     limits: Limits  #: names, position, speed and torque limits of the joints
-    damping: Vector  #: (n,) Nm s/rad, 0 for unknown
-    friction: Vector  #: (n,) Nm, 0 for unknown
 
     @property
     def outward(self) -> float:
@@ -72,33 +70,9 @@ class Described:
         count = len(self.limits.joint_names)
         return (*(f"{self.side}_link_{n}" for n in range(1, count + 1)), f"{self.side}_end")
 
-    @property
-    def base(self) -> Point:
-        """Origin of joint 1 in the trunk's axes, m."""
-        raise NotImplementedError
-
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad, in the trunk's axes.
-
-        The origins (n + 1, 3) in m of the joints and the far end, the axes (n, 3) about which the joints turn, and unit
-        vectors (n, 3) along the links.
-        """
-        raise NotImplementedError
-
-    def link_vectors(self) -> np.ndarray:
-        """Return the vector (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
-        raise NotImplementedError
-
-    def bodies(self) -> list[tuple[float, Point]]:
-        """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
-
-        Raises ParameterError if a link has no mass.
-        """
-        raise NotImplementedError
-
 
 @dataclass(frozen=True, eq=False)
-class ArmDescription(Described):
+class ArmDescription(_Named):
     """The paper's arm."""
 
     side: str  #: 'left' or 'right'
@@ -116,7 +90,11 @@ class ArmDescription(Described):
         return given if any(given) else (0.0, self.outward * HALF_BREADTH, 0.0)
 
     def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (4,) rad."""
+        """Return where the arm is at `theta` (4,) rad, in the trunk's axes.
+
+        The origins (5, 3) in m of the joints and the far end, the axes (4, 3) about which the joints turn, and unit
+        vectors (4, 3) along the links.
+        """
         length = self.robot.length
         links = frames(length.tolist(), theta)
         along = _in_trunk(self, [link.along for link in links])
@@ -125,16 +103,16 @@ class ArmDescription(Described):
         return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
 
     def link_vectors(self) -> np.ndarray:
-        """Return each link's vector: its length along its direction."""
+        """Return the vector (4, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
         _, _, along = self.pose((0.0,) * JOINT_COUNT)
         return np.asarray(self.robot.length[:, None] * along)
 
     def bodies(self) -> list[tuple[float, Point]]:
-        """Return mass and centre of gravity of each link.
+        """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
 
-        Moments across the links (core/arm/gravity.py) become offsets of the centres of gravity: W of link 1, Z of link
-        2, Y3 and Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity,
-        also beyond the links, follow from the moments.
+        Raises ParameterError if a link has no mass. Moments across the links (core/arm/gravity.py) become offsets of
+        the centres of gravity: W of link 1, Z of link 2, Y3 and Y4 of links 3 and 4. An arm given by its moments has
+        the masses `mass`, and its centres of gravity, also beyond the links, follow from the moments.
         """
         robot = self.robot
         mass = [float(m) for m in (self.mass if robot.by_moments else robot.mass)]
@@ -152,13 +130,13 @@ class ArmDescription(Described):
 
 
 @dataclass(frozen=True, eq=False)
-class UrdfDescription(Described):
+class UrdfDescription(_Named):
     """An arm from a URDF, whose root link has the trunk's axes. It is on the side on which its first joint is."""
 
     robot: UrdfArm
     limits: Limits
-    damping: Vector
-    friction: Vector
+    damping: Vector  #: (n,) Nm s/rad, 0 for unknown
+    friction: Vector  #: (n,) Nm, 0 for unknown
 
     @property
     def side(self) -> str:  # type: ignore[override]
@@ -187,6 +165,10 @@ class UrdfDescription(Described):
     @property
     def _zero(self) -> list[float]:
         return [0.0] * len(self.limits.joint_names)
+
+
+#: What a description, and a picture, states about one arm of n joints.
+Described = ArmDescription | UrdfDescription
 
 
 def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> Described:
