@@ -155,14 +155,6 @@ def test_too_large_a_torque_is_clamped_and_the_joint_named():
     assert answer.clamped == (1,)
 
 
-def test_only_the_supported_share_of_the_wearer_is_carried_and_counts_as_mass():
-    run = CompensatorRun(mode="zero_g", support=0.5)
-    arm = ROBOT.with_wearer((0.0, 0.0, 2.0, 1.6), (0.0, 0.0, 0.16, 0.17), 0.5)
-    np.testing.assert_allclose(run.cycle(1.2).effort, gravity_torque(arm, THETA), rtol=1e-12)
-    heavy = settings_with(mode="zero_g", support=0.5, wearer_mass=(0.0, 0.0, 5.0, 4.0))
-    assert heavy.arm.total_mass == pytest.approx(6.354)
-
-
 FORCE = (1.0, -2.0, 11.0)  # m/s^2 upward; an upright trunk that accelerates forward, to the right and upward
 DOWN = np.array((2.0, -1.0, 11.0))  # the same as gravity in the left arm's base frame: x0 left, y0 forward, z0 down
 STILL = (0.0, 0.0, 0.0)
@@ -299,6 +291,8 @@ def test_what_is_asked_for_is_carried_by_a_guided_change_and_given_back_two_seco
     arm = raised()
     mass = ROBOT.total_mass + 0.7 * sum(SETTINGS.wearer_mass)
     assert arm.compensator.settings.arm.total_mass == pytest.approx(mass)
+    share = ROBOT.with_wearer(SETTINGS.wearer_mass, SETTINGS.wearer_cog, 0.7)
+    assert arm.answer.effort == pytest.approx(gravity_torque(share, ASKED_AT))
     arm.asked = None
     assert arm.run(REQUEST.expires - 0.3) == 0.7
     assert arm.run(0.4) == 0.4 and arm.answer.remainder and arm.report == "none"

@@ -97,12 +97,6 @@ def bounds(spec, field):
     return low, high, (high - low) / (2**bits - 1)
 
 
-def assert_within(spec, fields, values):
-    for field, value in zip(fields, values, strict=True):
-        low, high, code = bounds(spec, field)
-        assert low - 1e-9 * code <= value <= high + 1e-9 * code
-
-
 def scaled(spec, fields, shares):
     """Values of `fields`: the shares -1..1 of their ranges."""
     values = []
@@ -165,7 +159,8 @@ def test_a_joint_at_rest_gets_any_effort_without_stiffness_within_its_range_or_r
     except ParameterError:
         assert not (math.isfinite(effort) and abs(effort) < 1e100 and 0.0 <= damping <= spec.kd_max)
         return
-    assert_within(spec, OF_COMMAND, command)
+    for field, value in zip(OF_COMMAND, command, strict=True):
+        assert bounds(spec, field)[0] - 1e-9 <= value <= bounds(spec, field)[1] + 1e-9
     kd = min(damping / motor.torque_scale, spec.kd_max)
     assert command.kp == 0.0 and abs(command.kd - kd) <= bounds(spec, "kd")[2]
     torque = motor.direction * effort / motor.torque_scale

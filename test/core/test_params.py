@@ -42,13 +42,10 @@ WRONG += ([0.0, 0.0, 0.31, 0.0], [0.1, -1e-9, 0.1, 0.1], [1e308] * 4, ["0.1"] * 
 
 def possible(param, rng):
     """Draw a value within the bounds of the parameter."""
-    if param.choices:
-        return rng.choice(list(param.choices))
-    if not param.bounds:
-        return param.default
-    low, high = param.bounds
-    low, high = (5.0, 10.0) if param.name == "gravity" else (low, high)  # m/s^2, which go with any gain
-    high = high * rng.choice([1.0, 0.1]) if low == 0.0 else high
+    if param.choices or not param.bounds:
+        return rng.choice(list(param.choices)) if param.choices else param.default
+    low, high = (5.0, 10.0) if param.name == "gravity" else param.bounds  # m/s^2, which go with any gain
+    high *= rng.choice([1.0, 0.1]) if low == 0.0 else 1.0
     if isinstance(param.default, list):
         return [rng.uniform(low, high) for _ in param.default]
     return rng.choice([low, rng.uniform(low, high)])

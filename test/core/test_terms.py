@@ -174,22 +174,32 @@ def test_coupling_pulls_both_joints_so_that_no_way_around_gives_energy():
     assert np.abs(torque[:, 3]).max() == pytest.approx(0.4)
 
 
-def test_the_workspace_is_free_inside_and_pushes_back_outside():
-    limits = SoftLimits((-1.0, 0.2, 0.0, 0.0), (1.0,) * 4, (3.0,) * 4, (0.5,) * 4)
-    inside = STATE._replace(position=(0.9, 0.3, 0.5, 0.99), velocity=(1.0,) * 4)
-    assert limits.torque(inside) == ZERO
-    outside = STATE._replace(position=(1.1, 0.1, 9.0, -0.1))
-    assert limits.torque(outside) == pytest.approx((-0.3, 0.3, -0.5, 0.3))
+WORKSPACE = SoftLimits((-1.0, 0.2, 0.0, 0.0), (1.0,) * 4, (3.0,) * 4, (0.5,) * 4)
+PATH = (0.0, *ZERO, 1.0, 1.0, 0.0, 0.0, 0.5, 3.0, 1.0, 1.0, 0.0, 0.5)  # s and rad
+SPRING = Spring((2.0,) * 4, PATH, max_effort=(9.0 / 2,) * 4)
+GIVEN = {  # a term, its input, and its torque
+    "the workspace is free inside": (WORKSPACE, {"position": (0.9, 0.3, 0.5, 0.99), "velocity": (1.0,) * 4}, ZERO),
+    "and pushes back outside": (WORKSPACE, {"position": (1.1, 0.1, 9.0, -0.1)}, (-0.3, 0.3, -0.5, 0.3)),
+    **{
+        f"a spring on a recorded path, {elapsed} s after its start": (
+            SPRING,
+            {"position": ZERO, "elapsed": elapsed},
+            to,
+        )
+        for elapsed, to in (
+            (-1.0, ZERO),
+            (0.5, (1.0, 0.0, 0.0, 0.5)),
+            (2.0, (2.0, 1.0, 0.0, 1.0)),
+            (9.0, (2.0, 2.0, 0.0, 1.0)),
+        )
+    },
+    "a path of one pose": (Spring((2.0,) * 4, PATH[:5]), {}, Spring((2.0,) * 4, ZERO).torque(STATE)),
+}
 
 
-def test_a_spring_follows_a_recorded_path_and_stays_at_its_end():
-    path = (0.0, *ZERO, 1.0, 1.0, 0.0, 0.0, 0.5, 3.0, 1.0, 1.0, 0.0, 0.5)
-    spring = Spring((2.0,) * 4, path, max_effort=(9.0 / 2,) * 4)
-    halfway = {-1.0: ZERO, 0.5: (0.5, 0.0, 0.0, 0.25), 2.0: (1.0, 0.5, 0.0, 0.5), 9.0: path[-4:]}
-    assert Spring((2.0,) * 4, path[:5]).torque(STATE) == Spring((2.0,) * 4, ZERO).torque(STATE)
-    for elapsed, pose in halfway.items():
-        torque = spring.torque(STATE._replace(position=ZERO, elapsed=elapsed))
-        assert torque == pytest.approx(2.0 * np.array(pose))
+@pytest.mark.parametrize(("term", "state", "torque"), GIVEN.values(), ids=GIVEN)
+def test_a_term_gives_the_torque_of_its_row(term, state, torque):
+    assert term.torque(STATE._replace(**state)) == pytest.approx(torque)
 
 
 def test_the_tank_gives_what_it_holds_and_no_more():
@@ -454,23 +464,19 @@ def test_the_torque_of_an_outer_loop_that_died_never_returns_and_another_node_ma
     assert loop.run(1.5) == pytest.approx(FOLLOWED)
 
 
-def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already():
+@pytest.mark.parametrize(
+    ("bound", "torque", "state"), [(1.0, (1.0, -1.0, 0.0, 0.0), "assisting"), (0.0, NO_TORQUE, "off")]
+)
+def test_a_lower_bound_holds_for_the_efforts_that_are_followed_already_and_with_zero_they_are_ignored(
+    bound, torque, state
+):
     loop = OuterLoop()
     loop.input.assist, loop.efforts = Assist((10.0,) * 4), (5.0, -5.0, 0.0, 0.0)
     loop.run(2.0)
-    loop.input.assist = Assist((1.0,) * 4)
-    loop.sending = False
-    loop.run(0.04)  # the newest message is still valid
-    assert loop.torques[-1] == (1.0, -1.0, 0.0, 0.0)
+    loop.input.assist, loop.sending = Assist((bound,) * 4), False
+    assert loop.run(0.04) == torque  # the newest message is still valid
     loop.sending = True
-    assert loop.run(1.0) == (1.0, -1.0, 0.0, 0.0)
-
-
-def test_with_a_largest_effort_of_zero_efforts_are_ignored():
-    loop = OuterLoop()
-    loop.input.assist = Assist()
-    assert loop.run(2.0) == NO_TORQUE
-    assert loop.input.state == "off"
+    assert loop.run(1.0) == torque and loop.input.state == state
 
 
 number = st.one_of(st.floats(-50.0, 50.0), st.sampled_from([math.nan, math.inf]))
