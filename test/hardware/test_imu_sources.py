@@ -104,6 +104,9 @@ def test_one_failed_transfer_costs_a_sample_and_no_reopening(rig):
 def test_an_unplugged_chip_is_an_error_that_names_it_and_comes_back_when_it_is_plugged_in(rig):
     assert rig.read_for(0.1)
     rig.bus.plugged = False
+    with pytest.raises(DeviceError, match="does not answer: Remote I/O error") as error:  # at the second failed reading
+        rig.read_for(0.025, rig.reopening.source.read)
+    assert error.value.device == rig.reopening.source.name
     assert rig.read_for(3.0) == []
     assert rig.attempts - 1 == pytest.approx(6, abs=1)
     place = f"{rig.values['source']} at 0x{rig.chip.address:02X} on /dev/i2c-1"
@@ -130,15 +133,6 @@ def test_the_time_that_opening_takes_is_not_silence(rig):
     rig.chip.reset()
     assert len(rig.read_for(0.3, lambda: reopening.read(rig.time()))) <= 1
     assert reopening.openings == 1 and reopening.problem == ""
-
-
-def test_an_unplugged_chip_is_noticed_at_the_second_failed_reading(rig):
-    source = rig.open()
-    rig.read_for(0.1, source.read)
-    rig.bus.plugged = False
-    with pytest.raises(DeviceError, match="does not answer: Remote I/O error") as error:
-        rig.read_for(0.025, source.read)
-    assert error.value.device == source.name
 
 
 def test_a_chip_whose_values_are_stuck_is_closed_after_half_a_second_and_set_up_again(rig):

@@ -6,96 +6,37 @@ Judged by the arm's true motion.
 
 from __future__ import annotations
 
-import random
-
 import numpy as np
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.hardware.can.request_age import AGE, Requests
-from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus
 
-from .arms import REAL_RATE, CarriedArm, raised_usual_arm
+from .arms import REAL_RATE, raised_usual_arm
 
 CYCLE = 1.0 / REAL_RATE  # s
 SPEED = 0.6  # rad/s
 STEP = 0.35  # Nm within 2 ms: a frame may change the torque by 0.2, and the hand moves the damped joint
 
 
-def gap(arm: CarriedArm, duration: float) -> None:
-    """Let no newer efforts arrive for a while."""
-    last = arm.controller.efforts(arm.now)
-    arm.controller.change = lambda efforts: last
-    arm.run(duration)
-    arm.controller.change = None
-
-
-def felt(arm: CarriedArm) -> float:
-    """The largest torque of a motor beyond what gravity takes, in Nm."""
-    return float(np.abs(arm.truth.records["torque"] - arm.truth.records["weight"]).max())
-
-
-def largest_step(arm: CarriedArm) -> float:
-    """The largest change of a motor's torque within 2 ms, in Nm."""
-    return float(np.abs(np.diff(arm.truth.records["torque"][::2], axis=0)).max())
-
-
-def bare_arm() -> CarriedArm:
-    """Return a raised arm without a wearer."""
-    arm = raised_usual_arm((0.0, 1.3, 0.0, 0.3), has_wearer=False, mode="one_g")
-    arm.run(1.0)
-    arm.forget()
-    return arm
-
-
-def test_a_gap_while_the_arm_is_held_moves_nothing_and_one_too_long_lets_it_down():
-    arm = raised_usual_arm((0.3, 0.45, 0.10, 0.4))
-    arm.run(1.0)
-    arm.forget()
-    gap(arm, 0.15)
-    arm.run(0.3)
-    assert arm.safety.state is State.ACTIVE and arm.safety.ride.rides == 1
-    assert arm.fastest < 0.02 and felt(arm) < 0.05 and largest_step(arm) < 0.05
-    gap(arm, 0.25)
-    assert (arm.safety.state, arm.safety.fault.code) == (State.LETTING_DOWN, FaultCode.COMMAND_STALE)
-
-
 def test_a_wearer_who_moves_is_slowed_gently_while_efforts_are_late():
-    arm = bare_arm()
+    """An arm that is held: rows of the fault matrix."""
+    arm = raised_usual_arm((0.0, 1.3, 0.0, 0.3), has_wearer=False, mode="one_g")
     position = arm.device.arm.positions
     arm.act({"move": np.add(position, (0.0, -0.5, 0.0, 0.5)).tolist(), "over": 1.25})
     arm.run(0.45)
     assert max(map(abs, arm.device.arm.velocities)) > 0.9
     arm.forget()
-    gap(arm, 0.1)
-    arm.run(0.4)
-    assert arm.safety.state is State.ACTIVE and arm.safety.ride.rides == 1
-    assert arm.fastest < 1.1 and felt(arm) < 1.8 and largest_step(arm) < STEP
-
-
-def test_efforts_of_a_late_tilt_are_damped_at_once_and_withdrawn_ones_let_the_arm_down_at_once():
-    arm = bare_arm()
-    arm.controller.change = lambda efforts: efforts._replace(held=True)
-    arm.run(2 * CYCLE)
-    assert arm.safety.state is State.ACTIVE
-    assert all(motor.damping > 0.0 for motor in arm.device.motors)
+    last = arm.controller.efforts(arm.now)
+    arm.controller.change = lambda efforts: last
+    arm.run(0.1)
     arm.controller.change = None
-    arm.run(0.5)
-    assert not any(motor.damping for motor in arm.device.motors)
-    ACTS["efforts_withdrawn"](arm)
-    arm.run(2 * CYCLE)
-    assert arm.safety.state is State.LETTING_DOWN
-    assert all(motor.damping > 0.0 for motor in arm.device.motors)
-
-
-def test_a_loop_that_stood_still_for_longer_than_the_time_out_carries_on():
-    arm = bare_arm()
-    for _ in range(4):
-        arm.clock.stall(0.06)
-        arm.run(0.3)
-    assert arm.safety.state is State.ACTIVE
-    assert arm.fastest < 0.02
+    arm.run(0.4)
+    assert arm.state is State.ACTIVE and arm.safety.ride.rides == 1
+    beyond = np.abs(arm.records["torque"] - arm.records["weight"]).max()
+    step = np.abs(np.diff(arm.records["torque"][::2], axis=0)).max()
+    assert arm.fastest < 1.1 and beyond < 1.8 and step < STEP
 
 
 # Queues between the bridge and its motors, and lost frames, which look the same for a while.
@@ -164,19 +105,6 @@ def test_what_is_no_queue_is_none_and_holds_up_few_commands(name):
         assert line.now == pytest.approx(duration, abs=0.1)
         assert not line.requests.late
         assert not lost or line.asked > 0.9 * duration * rate
-
-
-def test_lost_frames_and_a_late_computer_together_do_not_make_a_motor_silent():
-    chance, requests = random.Random(1), Requests()
-    now = replied = silence = 0.0
-    for _ in range(500 * 20):  # 6 % of the commands get no reply, and one cycle in 50 begins 20 ms late
-        now += 0.002 + (0.02 if chance.random() < 0.02 else 0.0)
-        if requests.may_send(now, 0.002):
-            requests.sent(now, 1)
-            if chance.random() > 0.06:
-                silence, replied = max(silence, now - replied), now
-                requests.replied(now + 0.0003)
-    assert silence < 0.05
 
 
 def test_a_motor_that_does_not_reply_is_still_asked_in_every_cycle_and_replies_that_come_back_are_no_queue():
