@@ -8,15 +8,32 @@ import contextlib
 import importlib
 import io
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
 from exo_gravity.lab.processes import node_modules
 
-from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2, commands_of, words_of
+from .support.document_commands import DOCUMENTS, ELSEWHERE, ROOT, ROS2
 
 EXAMPLE = re.compile(r"```python\n(.*?)```\s*```text\n(.*?)```", re.DOTALL)
+
+
+def commands_of(path: Path) -> list[str]:
+    """Return the commands in the shell blocks of a document, and those of `ros2` in its text, without comments."""
+    text = path.read_text(encoding="utf-8")
+    blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
+    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    prose = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines += [code for code in re.findall(r"`(ros2 [^`]*)`", prose) if len(code.split()) > 3]
+    found = (" ".join(re.sub(r"(^|\s+)#.*", "", line).split()) for line in lines)
+    return [command for command in found if command]
+
+
+def words_of(command: str) -> list[str]:
+    """Return the words of a command of ours, without a workspace's prefix and the background's ampersand."""
+    return shlex.split(command.removeprefix("ros2 run exo_gravity ").rstrip("& "))
 
 
 def name(path: Path) -> str:

@@ -20,18 +20,15 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio
 
-from .support import ROOT
+from .support import ROBOT, ROOT
 from .support.waiting import wait_until
 
-LENGTH, COG, MASS = (0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203)
-ROBOT = ArmModel(LENGTH, COG, MASS)
-LOAD = Wearer(body_mass=75.0).on_links(LENGTH)
+LOAD = Wearer(body_mass=75.0).on_links(ROBOT.length)
 ROUNDING = 0.006  # Nm
 
 

@@ -20,7 +20,8 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.lab.anfis_file import text_of
 
-from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
+from ..support import ROBOT
+from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
 
 ARM = ArmModel((0.05, 0.13, 0.30, 0.30), (0.04, 0.10, 0.2, 0.12), (0.5, 0.4, 0.6, 0.2))
 UPRIGHT = Tilt.of("right")

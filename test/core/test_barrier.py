@@ -20,7 +20,7 @@ from exo_gravity.core.safety.descent import DESCENT, JointDescent
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.motion_monitor import MOTION, MotionMonitor
 
-from ..support.compensator_run import ROBOT
+from ..support import ROBOT
 from ..support.safety_run import LIMITS, PERIOD, reading
 
 NOTHING = (0.0,) * 4

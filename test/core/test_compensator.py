@@ -21,7 +21,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.trunk.inputs import TILT
 
-from ..support.compensator_run import PERIOD, ROBOT, THETA, CompensatorRun, settings_with
+from ..support import ROBOT
+from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
 
 
 def test_every_answer_is_the_torque_of_the_law_from_the_first_one_on():

@@ -29,7 +29,8 @@ from exo_gravity.lab.anfis_file import text_of
 from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
-from ..support.compensator_run import ROBOT, settings_with
+from ..support import ROBOT
+from ..support.compensator_run import settings_with
 from ..support.safety_run import LIMITS
 from .test_anfis import law, learned, random_model
 

@@ -29,7 +29,7 @@ from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.rig import Rig
 from exo_gravity.sim.script import TrialScript
 
-from ..support.compensator_run import ROBOT
+from ..support import ROBOT
 from ..support.simulated_device import joints_of, make_device
 from ..support.thorough import quick
 

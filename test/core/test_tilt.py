@@ -16,7 +16,8 @@ from exo_gravity.core.trunk.inputs import FELT, TILT, FeltMotion, TiltInput
 from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
 from exo_gravity.hardware.trunk_estimator import TUNING, VqfFusion
 
-from ..support.compensator_run import ROBOT, THETA, CompensatorRun
+from ..support import ROBOT
+from ..support.compensator_run import THETA, CompensatorRun
 
 
 def random_tilts(count=500):

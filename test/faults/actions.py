@@ -21,8 +21,8 @@ from exo_gravity.hardware.can.can_port import message_of
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 
 from ..support.launched_nodes import executable
-from ..support.load import start_frames, start_spin
 from .fault_case import Action
+from .load import start_frames, start_spin
 from .rig import Rig
 
 Steps = Sequence[Mapping[str, Any]]

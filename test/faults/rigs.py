@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import subprocess
+import threading
 import time
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,7 +13,7 @@ from typing import Any, ClassVar
 from builtin_interfaces.msg import Time
 from rosgraph_msgs.msg import Clock
 
-from ..support.launched_nodes import NO_IMU, LaunchedNodes, LauncherProcess, Parameters
+from ..support.launched_nodes import NO_IMU, LaunchedNodes, Parameters, children, executable
 from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .rig import CARRY_LIMIT, NEAR, Rig
@@ -54,6 +55,53 @@ class ExternalClockRig(Rig):
     def _publish_clock(self) -> None:
         fraction, seconds = math.modf(time.time() + self.clock_offset)
         self._publisher.publish(Clock(clock=Time(sec=int(seconds), nanosec=int(fraction * 1e9))))
+
+
+class LauncherProcess(LaunchedNodes):
+    """Nodes whose launcher is a process too, as for users."""
+
+    def start(self) -> LauncherProcess:
+        self.launcher_process = subprocess.Popen(
+            [
+                executable("launcher"),
+                "--params",
+                str(self.path),
+                "--only",
+                *self.names,
+            ],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+        return self
+
+    def _read(self) -> None:
+        for line in self.launcher_process.stdout or ():
+            self.log.append(line.rstrip())
+
+    @property
+    def have_ended(self) -> bool:
+        return self.launcher_process.poll() is not None
+
+    def pid(self, node: str) -> int:
+        """Return the ID of a node's process, which must run."""
+        for child in children(self.launcher_process.pid):
+            if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
+                return child
+        raise LookupError(f"{node} does not run")
+
+    def stop(self) -> None:
+        self.launcher_process.terminate()
+        try:
+            self.launcher_process.wait(60)
+        except subprocess.TimeoutExpired:
+            self.launcher_process.kill()
+            raise
+        if self._thread is not None:
+            self._thread.join(60)
+        self._end_watchdogs()
 
 
 class LauncherRig(Rig):

@@ -38,8 +38,7 @@ from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools import train_anfis
 
-from ..support import CONFIG
-from ..support.joint_state_feeder import PARTS, POSE, ROBOT
+from ..support import CONFIG, PARTS, ROBOT
 from ..support.waiting import wait_until
 
 PERIOD = 0.01  # s
@@ -133,6 +132,7 @@ class CompensatorRig:
 
 keep_to_this_machine()
 NAMES = [f"right_{part}" for part in PARTS]
+POSE = (0.2, 0.9, 0.7, 0.6)  # rad
 GRAVITY = gravity_torque(ROBOT, POSE)
 STILL = [0.0] * 4
 ASSIST = [0.5, -0.5, 0.25, 0.0]

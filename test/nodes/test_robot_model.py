@@ -19,8 +19,7 @@ from exo_gravity.lab.view.urdf import ROOT
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
-from ..support import CONFIG
-from ..support.joint_state_feeder import PARTS
+from ..support import CONFIG, PARTS
 from ..support.launched_nodes import LaunchedNodes
 from ..support.node_thread import NodeThread
 from ..support.waiting import wait_until

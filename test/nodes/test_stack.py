@@ -24,8 +24,7 @@ from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, to_nanoseconds
 from exo_gravity.sim.script import TrialScript
 
-from ..support import DATA
-from ..support.joint_state_feeder import ROBOT
+from ..support import DATA, ROBOT
 from ..support.launched_nodes import CALM, NO_IMU, children, executable
 from ..support.truth import Truth
 from ..support.waiting import PATIENCE, wait_until

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,14 +32,15 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.nodes.wearer.node import WearerNode
 
+from ..support import PARTS, ROBOT
 from ..support.chains import random_chain
-from ..support.joint_state_feeder import PARTS, POSE, ROBOT, StillArm
 from ..support.launched_nodes import NO_IMU
 from ..support.urdf_oracle import MujocoArm
 from ..support.waiting import wait_until
 
 keep_to_this_machine()
 OTHER_NODES = ("can_bridge", "simulator", "imu")
+POSE = (0.2, 0.9, 0.7, 0.6)  # rad
 LOAD = Wearer(75.0).on_links(ROBOT.length)
 WORN = {**NO_IMU, "max_effort": [9.0, 18.0, 9.0, 9.0], "wearer.body_mass": 75.0}
 ADAPTIVE = {**WORN, "mode": "zero_g", "support": 0.4, "support_adapts": True, "model_error.wearer": 0.03}
@@ -51,11 +52,30 @@ NONE = ["0.0"] * len(PARTS)  # Nm
 GRAVITY = (0.0, 0.0, -9.80665)
 
 
+class StillArm:
+    """Publishes the joint states of a still right arm; their stamps count them in ns.
+
+    effort: of its motors, (4,) Nm. velocity: (4,) rad/s. sinking: rad in each period, of the second joint.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.effort: Sequence[float] = ()
+        self.velocity: Sequence[float] = (0.0,) * 4
+        self.sinking = 0.0
+        self._message = JointState(name=[f"right_{part}" for part in PARTS], position=POSE)
+        self._publisher = node.create_publisher(JointState, "/right/joint_states", 1)
+        self.timer = node.create_timer(0.005, self._publish)
+
+    def _publish(self) -> None:
+        self._message.header.stamp.nanosec += 1
+        self._message.effort, self._message.velocity = self.effort, self.velocity
+        self._message.position[1] -= self.sinking
+        self._publisher.publish(self._message)
+
+
 @pytest.fixture
-def arm(probe) -> Iterator[StillArm]:
-    still = StillArm(probe.node)
-    yield still
-    still.close()
+def arm(probe) -> StillArm:
+    return StillArm(probe.node)
 
 
 @pytest.fixture

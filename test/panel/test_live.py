@@ -50,7 +50,7 @@ def panel_diagnostics(bag: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
+def clinic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
     """The nodes of the right arm, with trials, and the open page; one set of them for all tests."""
     folder = tmp_path_factory.mktemp("clinic")
     (folder / "scripts").mkdir()
@@ -70,14 +70,6 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
         probe.close()
         nodes.stop()
         print("\n".join(nodes.log))
-
-
-@pytest.fixture
-def clinic(running: Clinic) -> Clinic:
-    """The arm, carried, and the page."""
-    running.probe.wait_until_carried()
-    wait_for_state(running.page, "active")
-    return running
 
 
 def let_down(page: Page) -> None:

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,13 +46,15 @@ class PanelProcess:
         command = [executable("panel"), "--ros-args", *options]
         self.process = subprocess.Popen(command, stdout=sys.stderr, stderr=subprocess.PIPE, text=True)
         self.address = next(line for line in self.process.stderr or () if "http://" in line)
+        self.closing = ExitStack()
 
     def get(self, path: str = "", **options: Any) -> httpx.Response:
         return httpx.get(self.url + path, verify=False, **options)
 
     def open(self) -> None:
         self.headers = {"origin": self.url.rstrip("/")}
-        self.connection = connect(self.url.replace("http", "ws") + "live", origin=self.url.rstrip("/"))
+        live = connect(self.url.replace("http", "ws") + "live", origin=self.url.rstrip("/"))
+        self.connection = self.closing.enter_context(live)
         self.connection.send(json.dumps({"page": ""}))
         self.headers["x-panel-page"] = self.message("page")["page"]
 
@@ -77,6 +80,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., PanelProcess]]:
 
     yield start
     for panel in panels:
+        panel.closing.close()
         panel.process.kill()
         panel.process.wait()
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core import ArmModel
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 
-ROBOT = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
+from . import ROBOT
+
 THETA = (0.2, 0.7, 0.6, 0.5)  # rad
 PERIOD = 0.002  # s
 

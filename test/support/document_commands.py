@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import re
-import shlex
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -69,19 +67,3 @@ ELSEWHERE = {  # by their beginnings: what runs them, or what they need that no 
     "done": "ros-jazzy-sros2",
     "python examples/": "test/test_examples.py",
 }
-
-
-def commands_of(path: Path) -> list[str]:
-    """Return the commands in the shell blocks of a document, and those of `ros2` in its text, without comments."""
-    text = path.read_text(encoding="utf-8")
-    blocks = re.findall(r"^ *```sh\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
-    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
-    prose = re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
-    lines += [code for code in re.findall(r"`(ros2 [^`]*)`", prose) if len(code.split()) > 3]
-    found = (" ".join(re.sub(r"(^|\s+)#.*", "", line).split()) for line in lines)
-    return [command for command in found if command]
-
-
-def words_of(command: str) -> list[str]:
-    """Return the words of a command of ours, without a workspace's prefix and the background's ampersand."""
-    return shlex.split(command.removeprefix("ros2 run exo_gravity ").rstrip("& "))

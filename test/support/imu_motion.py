@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,27 +19,6 @@ from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 STILL_TIME = 3.0  # s at the start of each simulated motion
 RECORDED = sorted((Path(__file__).parents[1] / "data" / "broad").glob("*.npz"))
 Trunk = Callable[[np.ndarray], np.ndarray]  # times (n,) s -> roll, pitch and yaw (n, 3) rad
-
-FROM_HIPS = ((0.1, 0.0, 0.35), (-0.1, 0.05, 0.5), (0.0, 0.15, 0.5))  # m, of the IMU: on the breastbone, back, shoulder
-GYROSCOPE_SPAN = 0.002  # s over which it averages
-NEAR = 1e-3  # s between positions that give an acceleration
-ROLL, PITCH, YAW, AHEAD, _, UP = np.eye(6)
-STRIDE = 2.0 * np.pi * 0.95  # rad/s
-# What swings: axis (roll, pitch, yaw; then the hips' acceleration ahead, left, up), amplitude in rad or m/s^2, rad/s,
-# and phase in rad. Walking as in sim.trunk_motion.
-SWINGS = {
-    "walk": (
-        (0, 0.035, STRIDE, 0.0),
-        (1, 0.017, 2.0 * STRIDE, 0.0),
-        (3, 0.14 * G, 2.0 * STRIDE, 0.0),
-        (4, 0.14 * G, STRIDE, np.pi / 2),
-        (5, 0.23 * G, 2.0 * STRIDE, np.pi / 2),
-        (5, 0.06 * G, 4.0 * STRIDE, np.pi / 2),
-    ),
-    "clap": tuple((axis, size, 6.0 * np.pi, 0.0) for axis, size in ((1, 0.01), (3, 0.5), (4, 0.5), (5, 0.3))),
-    "nod": ((1, 0.05, 3.0 * np.pi, 0.0), (3, 0.2, 3.0 * np.pi, 0.0)),
-    "impact": ((5, 1.3 * G, 10.0 * np.pi, 0.0),),
-}
 
 
 @dataclass(frozen=True)
@@ -169,84 +147,3 @@ def even(duration: float = 15.0, rate: float = 100.0) -> np.ndarray:
 def bowing_and_walking(duration: float = 15.0) -> Motion:
     """Return the samples of an IMU on the bowing trunk, which walks from 8 s on."""
     return sampled(bowing_trunk, even(duration))
-
-
-@dataclass(frozen=True)
-class Part:
-    """The trunk turns and shifts by `change` (6,): roll, pitch, yaw in rad, hips ahead, left, up in m; or it swings."""
-
-    start: float
-    duration: float
-    change: np.ndarray | None = None
-    swing: str = ""
-
-
-def walk_and_bow(angle: float, over: float, walk: float) -> list[Part]:
-    """Return a walk of `walk` s, and right after it a bow by `angle` rad in `over` s, and back."""
-    begin = STILL_TIME + walk
-    bows = Part(begin, over, angle * PITCH), Part(begin + over + 1.0, over, -angle * PITCH)
-    return [Part(STILL_TIME, walk, swing="walk"), *bows]
-
-
-def there_and_back(at: float, over: float, change: np.ndarray, hold: float) -> list[Part]:
-    return [Part(at, over, change), Part(at + over + hold, over, -change)]
-
-
-def swinging(swing: str, at: float, over: float, size: float) -> list[Part]:
-    return [Part(at, 6.0 + 4.0 * size, swing=swing)]
-
-
-# What people do from `at` s on, in `over` s; size: -1 to 1.
-DOINGS: dict[str, Callable[[float, float, float], list[Part]]] = {
-    "bow": lambda at, over, size: there_and_back(at, over, (0.7 + 0.5 * size) * PITCH, max(0.0, 3.0 * size)),
-    "lean": lambda at, over, size: there_and_back(at, over, 0.4 * size * ROLL, max(0.0, -3.0 * size)),
-    "turn": lambda at, over, size: [Part(at, max(over, 0.8), 3.0 * size * YAW)],
-    "sit": lambda at, over, size: [Part(at, 0.8, 0.6 * PITCH - 0.3 * AHEAD), Part(at + 0.5, 0.6, -0.4 * UP),
-                                   Part(at + 1.0, 0.1, swing="impact"), Part(at + 1.1, 0.8, -0.6 * PITCH)],
-    "jump": lambda at, over, size: [Part(at, 0.6, 0.6 * PITCH), Part(at + 0.4, 0.6, 0.4 * UP + 0.3 * AHEAD),
-                                    Part(at + 0.6, 0.6, -0.6 * PITCH)],
-    **{swing: partial(swinging, swing) for swing in ("walk", "clap", "nod")},
-}  # fmt: skip
-
-
-def day(seed: int, duration: float) -> list[Part]:
-    """Return motions in random order, some of them at the same time."""
-    random, at = np.random.default_rng(seed), STILL_TIME
-    parts: list[Part] = []
-    while at < duration:
-        more = DOINGS[random.choice((*DOINGS, "bow"))](at, random.uniform(0.6, 2.0), random.uniform(-1.0, 1.0))
-        parts += more
-        if not more[0].swing or random.random() < 0.7:  # or the next one at the same time
-            at = max(part.start + part.duration for part in more) + random.choice((0.0, random.uniform(0.0, 2.0)))
-    return parts
-
-
-def worn(parts: list[Part], duration: float, rate: float = 100.0, seed: int = 0) -> Motion:
-    """Return the samples of an IMU at `rate` Hz on the trunk of a person who does `parts`."""
-    times, random = even(duration, rate), np.random.default_rng(seed)
-    turned, places = {}, {}
-    for shift in (-GYROSCOPE_SPAN, -NEAR, NEAR, 0.0):
-        pose, push = _pose(parts, times + shift)
-        turned[shift] = Rotation.from_euler("ZYX", pose[:, [2, 1, 0]])
-        places[shift] = pose[:, 3:] + turned[shift].apply(FROM_HIPS[seed % len(FROM_HIPS)])
-    moves, now = (places[-NEAR] - 2.0 * places[0.0] + places[NEAR]) / NEAR**2, turned[0.0]
-    gyroscope = (turned[-GYROSCOPE_SPAN].inv() * now).as_rotvec() / GYROSCOPE_SPAN
-    gyroscope += random.normal(0.0, 0.003, 3) + random.normal(0.0, 0.002, gyroscope.shape)
-    force = now.inv().apply(moves + np.array((0.0, 0.0, G))) + push
-    force += random.normal(0.0, 0.05, 3) + random.normal(0.0, 0.03, force.shape)
-    return Motion(rate, times, gyroscope, force, now.inv().apply((0.0, 0.0, -1.0)), times + 0.001)
-
-
-def _pose(parts: list[Part], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose (n, 6) as in Part, and the acceleration (n, 3) of what swings, in the trunk's axes."""
-    pose, swung = np.zeros((len(times), 6)), np.zeros((len(times), 6))
-    for part in parts:
-        since = times - part.start
-        if part.change is not None:
-            pose += np.outer(eased(since / part.duration), part.change)
-            continue
-        fade = eased(np.minimum(since, part.duration - since) / min(1.0, part.duration / 2.0))
-        for axis, amplitude, speed, phase in SWINGS[part.swing]:
-            swung[:, axis] += amplitude * fade * np.sin(speed * since + phase)
-    pose[:, :3] += swung[:, :3]
-    return pose, swung[:, 3:]

@@ -179,53 +179,6 @@ class LaunchedNodes:
             notes_file((self.bus["interface"], group, {"port": number})).unlink(missing_ok=True)
 
 
-class LauncherProcess(LaunchedNodes):
-    """The same, but the launcher is a process too, as for users."""
-
-    def start(self) -> LauncherProcess:
-        self.launcher_process = subprocess.Popen(
-            [
-                executable("launcher"),
-                "--params",
-                str(self.path),
-                "--only",
-                *self.names,
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-        return self
-
-    def _read(self) -> None:
-        for line in self.launcher_process.stdout or ():
-            self.log.append(line.rstrip())
-
-    @property
-    def have_ended(self) -> bool:
-        return self.launcher_process.poll() is not None
-
-    def pid(self, node: str) -> int:
-        """Return the ID of a node's process, which must run."""
-        for child in children(self.launcher_process.pid):
-            if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
-                return child
-        raise LookupError(f"{node} does not run")
-
-    def stop(self) -> None:
-        self.launcher_process.terminate()
-        try:
-            self.launcher_process.wait(60)
-        except subprocess.TimeoutExpired:
-            self.launcher_process.kill()
-            raise
-        if self._thread is not None:
-            self._thread.join(60)
-        self._end_watchdogs()
-
-
 def executable(name: str) -> str:
     """Return the path of an installed executable of the package."""
     return str(Path(sys.executable).with_name(name))

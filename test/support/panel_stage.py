@@ -21,9 +21,9 @@ from exo_gravity.panel.control import Control
 from exo_gravity.panel.server import PanelServer
 from exo_gravity.panel.view import SETTABLE, LoadChanges, joint_rows, setup_of
 
+from . import PARTS
 from .ports import free_port
 
-LEAVES = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
 BUS = {"can.interface": "virtual", "can.channel": "stage"}
 PERIOD = 0.1  # s between two states
 #: What a subject's file holds.
@@ -80,7 +80,7 @@ class PlayedArms:
     def __post_init__(self) -> None:
         self.states = dict.fromkeys(self.names, "disabled")
         for name in self.names:
-            given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in LEAVES], "wearer.body_mass": 75.0}
+            given = {"side": name, "joint_names": [f"{name}_{leaf}" for leaf in PARTS], "wearer.body_mass": 75.0}
             self.settings[name] = values_of(COMPENSATOR, {**given, "support": 0.05})
 
     def parameters(self) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Processes that load the CAN bus or the processors.
 
-python -m test.support.load frames JSON    send random frames; the JSON has bus, count, rate (1/s), ids and seed
-python -m test.support.load spin SECONDS   keep one processor busy
+python -m test.faults.load frames JSON    send random frames; the JSON has bus, count, rate (1/s), ids and seed
+python -m test.faults.load spin SECONDS   keep one processor busy
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import can
 
-from . import ROOT
+from ..support import ROOT
 
 
 def start_frames(
