@@ -180,10 +180,7 @@ class UrdfArm(UrdfShape):
         self._identity = text, names
         self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
-        # All that the joints move: each of several chains counts once, by its first joint.
-        joints, supports = {*self._joints}, self._model.supports
-        first = [n for n, joint in enumerate(self._joints) if not joints & {*supports[joint]} - {joint}]
-        self._own_mass = float(np.sum(self.masses[first]))
+        self._own_mass = sum(link.mass for link in self.moves.moved)
         self.notes = checked("arm", self)
         unused = {name for name, *_ in unused_efforts(self)}
         efforts = zip(names, self.moves.efforts, strict=True)

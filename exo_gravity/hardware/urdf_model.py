@@ -32,6 +32,7 @@ class UrdfJoints:
     model: of Pinocchio, with the joints alone that move.
     own: (nv, n), the velocities of the model for the arm's, and transposed the arm's torques for those of the model.
     others: joints that are not the arm's, and that change its torque.
+    moved: the links that the arm's joints move.
     peak: (n,) Nm, the largest torque that gravity needs in any pose and tilt.
     """
 
@@ -48,12 +49,11 @@ class UrdfJoints:
         self.links, self._reported = tuple(links_of(self.root, self.model)), set[str]()
         self.others = tuple(sorted(movable.keys() - {*self.names, *self.mimics}))
         checked("joints", self)
+        joints = {self.model.getJointId(name) for name in self.names}
+        self.moved = [link for link in self.links if joints.intersection(self.model.supports[link.joint])]
         self._couple()
         self.peak, effects = self._tried()
         self._lock([other for other, effect in zip(self.others, effects, strict=True) if effect > LIMITS.share])
-        self.links = tuple(links_of(self.root, self.model))
-        joints = {self.model.getJointId(name) for name in self.names}
-        self.moved = [link for link in self.links if joints.intersection(self.model.supports[link.joint])]  #: links
 
     def configuration(self, theta: Sequence[float]) -> np.ndarray:
         """Return Pinocchio's configuration (nq,) for the angles `theta` (n,) in rad.

@@ -28,7 +28,6 @@ from exo_gravity.core.safety.limits import DAMPING, Limits
 from exo_gravity.core.safety.motion_monitor import GRAVITY, MotionMonitor
 from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
-from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.motors import simulated
@@ -39,6 +38,7 @@ from ..support.chains import random_chain
 from ..support.thorough import quick
 from ..support.urdf_oracle import MujocoArm
 from .arms import DRIVEN, JudgedArm
+from .test_urdf_arm import ARMS
 
 COUNTS = (1, 2, 3, 5, 6, 7, 9)
 ANSWERED = 1e-10  # Nm, of what gravity needs
@@ -227,10 +227,7 @@ def test_what_mujoco_needs_of_any_chain_is_explained_in_any_pose_at_any_tilt(cou
 
 @pytest.mark.parametrize("name", ["elbow", "three_joints", "seven_joints"])
 def test_the_torque_of_a_shipped_arm_is_no_fault_and_its_opposite_is(name: str) -> None:
-    text = packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")
-    names = {"elbow": ["elbow"], "three_joints": ["abduction", "flexion", "elbow"]}.get(
-        name, ["flexion", "abduction", "rotation", "elbow", "pronation", "wrist_deviation", "wrist_flexion"]
-    )
+    text, names = ARMS[name][0].read_text(encoding="utf-8"), ARMS[name][1]
     arm, theta = UrdfArm(text, names, "hand"), [0.5 + 0.1 * n for n in range(len(names))]
     torque = MujocoArm(text, names).torque(theta, (0.0, 0.0, -9.80665))
     samples = tuple(JointSample(angle, 0.0, 0.0, None, None, 0.0) for angle in theta)
