@@ -170,7 +170,6 @@ REPLY = pack_reply(AK60, 1, 0.25, 0.0, 0.0, 30, 0)
         (frame(1, b""), "foreign command"),
         (frame(1, ENTER[:6]), "foreign command"),
         (frame(0x83, ENTER), "foreign frame"),
-        (frame(0x81, ENTER), "foreign frame"),  # the lowest 7 bits alone are motor 1's
         (frame(2, REPLY), "foreign command"),
         (frame(9, REPLY), "foreign frame"),
         (frame(1, REPLY[:5]), "malformed reply"),
@@ -188,6 +187,14 @@ def test_a_frame_that_is_not_a_reply_is_counted_and_ignored(bus, other, message,
     bus.exchange(OFF, now(bus))
     assert bus.samples[0].time == float("-inf")
     assert bus.ignored == {kind: 1}
+
+
+@pytest.mark.parametrize(("length", "kind"), [(7, "foreign command"), (8, "foreign frame")])
+def test_another_id_with_the_same_lowest_7_bits_commands_an_open_drive_alone(bus, other, length, kind):
+    for message in (frame(1, REPLY[:length]), frame(0x81, ENTER), frame(0x701, b"\x05")):
+        other.send(message)
+    bus.exchange(OFF, now(bus))
+    assert bus.ignored == {kind: 2}
 
 
 def test_a_late_reply_does_not_count_for_the_next_cycle(bus, other):

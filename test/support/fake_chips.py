@@ -9,8 +9,10 @@ from __future__ import annotations
 import errno
 import math
 import struct
+from collections import defaultdict
 from collections.abc import Callable
-from typing import ClassVar
+from functools import partial
+from typing import NamedTuple
 
 G = 9.80665
 Axes = tuple[float, float, float]
@@ -30,126 +32,101 @@ class FakeTime:
         self.now += duration
 
 
+Registers = dict[int, int]
+
+
+class Layout(NamedTuple):
+    """What differs from one kind of chip to another. Register nn of bank b is 0xbnn here."""
+
+    address: int
+    order: str  #: of the bytes of a number, as in struct
+    data: tuple[int, int]  #: first registers of the gyroscope and the accelerometer
+    reset: tuple[int, int]  #: register, and the bit of it that resets the chip
+    values: Registers  #: after a reset
+    ranges: tuple[tuple[int, int, tuple[float, ...]], ...]  #: of both: register, shift; LSB per deg/s, or per g
+    rate: Callable[[Registers], float]  #: how often it measures, in Hz; 0 asleep
+
+
 class FakeChip:
     """Registers, of which the data follow the motion at the instants at which the chip measures; asleep they stay."""
 
-    address: int
-    order: str  # of the bytes of a number, as in struct
-    data: tuple[int, int]  # first registers of the gyroscope and the accelerometer
-    reset_values: ClassVar[dict[int, int]]
-
-    def __init__(self, clock: FakeTime) -> None:
-        self.clock = clock
+    def __init__(self, layout: Layout, clock: Callable[[], float]) -> None:
+        self.address, self.bank = layout.address, 0
         self.angular_velocity: Callable[[float], Axes] = lambda time: (0.0, 0.0, 0.0)  # deg/s
         self.acceleration: Callable[[float], Axes] = lambda time: (0.0, 0.0, 1.0)  # g, +1 upward at rest
-        self.registers = dict(self.reset_values)
+        self._layout, self._clock = layout, clock
+        self.reset()
 
     def reset(self) -> None:
         """Lose the registers, as by a broken supply."""
-        self.registers = dict(self.reset_values)
-
-    def rate(self) -> float:
-        """Return how often it measures, in Hz; 0 asleep."""
-        raise NotImplementedError
-
-    def scales(self) -> tuple[float, float]:
-        """Return the LSB per deg/s and per g."""
-        raise NotImplementedError
+        self.registers = defaultdict(int, self._layout.values)
 
     def write(self, register: int, value: int) -> None:
         """Take a byte."""
-        self.registers[register] = value
+        place, (reset, bit) = self.bank << 8 | register, self._layout.reset
+        if register == 0x7F:  # of a chip with banks
+            self.bank = value >> 4
+        elif place == reset and value & bit:
+            self.reset()
+        else:
+            self.registers[place] = value
 
     def read(self, register: int) -> int:
         """Return a byte."""
-        return self.registers.get(register, 0)
+        return self.registers[self.bank << 8 | register]
 
     def measure(self) -> None:
         """Bring the data registers up to the present."""
-        if not self.rate():
+        layout, registers = self._layout, self.registers
+        if not (rate := layout.rate(registers)):
             return
-        count = math.floor(self.clock() * self.rate())
-        values = (*self.angular_velocity(count / self.rate()), *self.acceleration(count / self.rate()))
-        rate, force = self.scales()
+        count = math.floor(self._clock() * rate)
+        values = (*self.angular_velocity(count / rate), *self.acceleration(count / rate))
+        scales = [lsb[registers[register] >> shift & 3] for register, shift, lsb in layout.ranges for _ in range(3)]
         noise = [count >> bit & 1 for bit in range(6)]  # LSB: the values differ from one measurement to the next
-        raw = [
-            round(value * scale) + n for value, scale, n in zip(values, 3 * [rate] + 3 * [force], noise, strict=True)
-        ]
+        raw = [round(value * scale) + n for value, scale, n in zip(values, scales, noise, strict=True)]
         raw = [min(max(number, -32768), 32767) for number in raw]
-        for first, numbers in zip(self.data, (raw[:3], raw[3:]), strict=True):
-            data = struct.pack(f"{self.order}3h", *numbers)
-            self.registers.update({first + offset: byte for offset, byte in enumerate(data)})
+        for first, numbers in zip(layout.data, (raw[:3], raw[3:]), strict=True):
+            data = struct.pack(f"{layout.order}3h", *numbers)
+            registers.update({first + offset: byte for offset, byte in enumerate(data)})
 
 
-class FakeMpu6050(FakeChip):
-    """An MPU-6050."""
-
-    address, order, data = 0x68, ">", (0x43, 0x3B)
-    reset_values: ClassVar = {0x6B: 0x40, 0x75: 0x68, 0x41: 0xF2, 0x42: 0x0E}  # it sleeps; -3570 at 26.03 degC
-
-    def write(self, register: int, value: int) -> None:
-        if register == 0x6B and value & 0x80:
-            self.reset()
-        else:
-            super().write(register, value)
-
-    def rate(self) -> float:
-        filtered = 1 <= self.registers.get(0x1A, 0) & 7 <= 6
-        return 0.0 if self.registers[0x6B] & 0x40 else (1e3 if filtered else 8e3) / (1 + self.registers.get(0x19, 0))
-
-    def scales(self) -> tuple[float, float]:
-        gyro, accelerometer = (self.registers.get(register, 0) >> 3 & 3 for register in (0x1B, 0x1C))
-        return (131.0, 65.5, 32.8, 16.4)[gyro], (16384.0, 8192.0, 4096.0, 2048.0)[accelerometer]
+def rate_of_mpu(registers: Registers) -> float:
+    """Return the rate of an MPU-6050, which sleeps at first."""
+    is_filtered = 1 <= registers[0x1A] & 7 <= 6
+    return 0.0 if registers[0x6B] & 0x40 else (1e3 if is_filtered else 8e3) / (1 + registers[0x19])
 
 
-class FakeIcm20948(FakeChip):
-    """An ICM-20948: register nn of bank b is 0xbnn here. Its auxiliary bus is idle at once."""
-
-    address, order, data = 0x69, ">", (0x033, 0x02D)
-    reset_values: ClassVar = {0x000: 0xEA, 0x006: 0x41, 0x017: 0x40, 0x201: 0x01, 0x214: 0x01}
-    bank = 0
-
-    def write(self, register: int, value: int) -> None:
-        if register == 0x7F:
-            self.bank = value >> 4
-        elif self.bank == 0 and register == 0x06 and value & 0x80:
-            self.reset()
-        else:
-            super().write(self.bank << 8 | register, value)
-
-    def read(self, register: int) -> int:
-        return super().read(self.bank << 8 | register)
-
-    def rate(self) -> float:
-        if self.registers[0x006] & 0x40:
-            return 0.0
-        slower = max(self.registers.get(0x200, 0), self.registers.get(0x210, 0) << 8 | self.registers.get(0x211, 0))
-        return 1125.0 / (1 + slower)
-
-    def scales(self) -> tuple[float, float]:
-        gyro, accelerometer = (self.registers[register] >> 1 & 3 for register in (0x201, 0x214))
-        return (131.0, 65.5, 32.8, 16.4)[gyro], (16384.0, 8192.0, 4096.0, 2048.0)[accelerometer]
+def rate_of_icm(registers: Registers) -> float:
+    """Return the rate of an ICM-20948, whose auxiliary bus is idle at once."""
+    slower = max(registers[0x200], registers[0x210] << 8 | registers[0x211])
+    return 0.0 if registers[0x006] & 0x40 else 1125.0 / (1 + slower)
 
 
-class FakeLsm6dsox(FakeChip):
-    """An LSM6DSOX, which sleeps until both sensors have a rate."""
+def rate_of_lsm(registers: Registers) -> float:
+    """Return the rate of an LSM6DSOX, which sleeps until both sensors have a rate."""
+    rates = (0.0, 12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1666.0, 3332.0, 6664.0)
+    return min(rates[registers[register] >> 4] for register in (0x10, 0x11))
 
-    address, order, data = 0x6A, "<", (0x22, 0x28)
-    reset_values: ClassVar = {0x0F: 0x6C, 0x12: 0x04, 0x18: 0xE0, 0x20: 0x00, 0x21: 0x01}  # 256 above 25 degC: 26 degC
 
-    def write(self, register: int, value: int) -> None:
-        if register == 0x12 and value & 0x01:
-            self.reset()
-        else:
-            super().write(register, value)
-
-    def rate(self) -> float:
-        rates = (0.0, 12.5, 26.0, 52.0, 104.0, 208.0, 416.0, 833.0, 1666.0, 3332.0, 6664.0)
-        return min(rates[self.registers.get(register, 0) >> 4] for register in (0x10, 0x11))
-
-    def scales(self) -> tuple[float, float]:
-        gyro, accelerometer = (self.registers.get(register, 0) >> 2 & 3 for register in (0x11, 0x10))
-        return 1e3 / (8.75, 17.5, 35.0, 70.0)[gyro], 1e3 / (0.061, 0.488, 0.122, 0.244)[accelerometer]
+INVENSENSE = (131.0, 65.5, 32.8, 16.4), (16384.0, 8192.0, 4096.0, 2048.0)
+ST = tuple(1e3 / lsb for lsb in (8.75, 17.5, 35.0, 70.0)), tuple(1e3 / lsb for lsb in (0.061, 0.488, 0.122, 0.244))
+MPU6050 = Layout(
+    0x68, ">", (0x43, 0x3B), (0x6B, 0x80),
+    {0x6B: 0x40, 0x75: 0x68, 0x41: 0xF2, 0x42: 0x0E},  # -3570 at 26.03 degC
+    ((0x1B, 3, INVENSENSE[0]), (0x1C, 3, INVENSENSE[1])), rate_of_mpu,
+)  # fmt: skip
+ICM20948 = Layout(
+    0x69, ">", (0x033, 0x02D), (0x006, 0x80), {0x000: 0xEA, 0x006: 0x41, 0x017: 0x40, 0x201: 0x01, 0x214: 0x01},
+    ((0x201, 1, INVENSENSE[0]), (0x214, 1, INVENSENSE[1])), rate_of_icm,
+)  # fmt: skip
+LSM6DSOX = Layout(
+    0x6A, "<", (0x22, 0x28), (0x12, 0x01),
+    {0x0F: 0x6C, 0x12: 0x04, 0x18: 0xE0, 0x20: 0x00, 0x21: 0x01},  # 256 above 25 degC: 26 degC
+    ((0x11, 2, ST[0]), (0x10, 2, ST[1])), rate_of_lsm,
+)  # fmt: skip
+FAKES = {"mpu6050": partial(FakeChip, MPU6050), "icm20948": partial(FakeChip, ICM20948),
+         "lsm6dsox": partial(FakeChip, LSM6DSOX)}  # fmt: skip
 
 
 class FakeI2c:
@@ -204,6 +181,3 @@ class FakeI2c:
         self.failing = max(self.failing - 1, -1)
         if self.failing >= 0 or not self.plugged or address != self.chip.address:
             raise OSError(errno.EREMOTEIO, "Remote I/O error")
-
-
-FAKES = {"mpu6050": FakeMpu6050, "icm20948": FakeIcm20948, "lsm6dsox": FakeLsm6dsox}
