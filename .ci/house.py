@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT)]
 
 from exo_gravity.core.safety.drive import FaultCode  # noqa: E402
-from test.faults.cases import CASES  # noqa: E402
+from test.faults.processes import CASES  # noqa: E402
 from test.faults.virtual_cases import ROWS  # noqa: E402
 from test.support.document_commands import DOCUMENTS  # noqa: E402
 

@@ -1,13 +1,11 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""`make study NAME=faults`: run the fault matrix on the simulated device, with processes; print a table and write JSON.
+"""`make study NAME=faults`: play the rows of the fault matrix that need processes; print a table and write JSON.
 
-    python -m test.faults.run [--only TEXT ...] [--start N] [--output build/faults.json] [--busy]
+    python -m test.faults.run [--only TEXT ...] [--output build/faults.json]
 
-The JSON file is written after every case. The exit code is 1 if a case was unsafe or could not be run. Safe means, by
-the arm's true motion until 3 s after the last motor was switched off: damping on every motor in time, no joint above
-1 rad/s, no torque step above 50 Nm/s times the period, no motor that drives the arm or is switched on again; and no
-exception in the log. A row that is unsafe while the machine itself stands still is run again. An interrupted run prints
-its table too, and its exit code is 130.
+The JSON file is written after every row. The exit code is 1 if a row was unsafe or could not be played. One that is
+unsafe while the machine itself stands still is played again; if it still does, the row is not judged. Interrupted, it
+prints its table too, and the exit code is 130.
 """
 
 from __future__ import annotations
@@ -19,9 +17,10 @@ import os
 import signal
 import sys
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ..support.ports import own_domain
 
@@ -30,103 +29,112 @@ os.environ.setdefault("ROS_DOMAIN_ID", str(own_domain()))  # before rclpy is imp
 from rich.console import Console
 from rich.table import Table
 
-from .cases import CASES
-from .fault_case import FaultCase
-from .runner import Result, RigPool, not_run
-from .stall_clock import StallClock
+from exo_gravity.sim.judge import Response
+
+from ..support.stalls import Machine, stood_still
+from .fault_case import Arm, FaultCase, Played, play
+from .processes import CASES, ProcessRig
 
 STALL = 0.03  # s for which the machine stood still, so that an unsafe result shows nothing about the nodes
 ATTEMPTS = 3
 INTERRUPTED = 130  # the shell's exit code after Ctrl-C
+NOT_RUN = "not run"
+LOG_LINES = 20
+
+
+class Pool:
+    """Keeps the `rig` of the last row for the next row of its arm; `log` is that of the last row that was unsafe."""
+
+    def __init__(self, folder: Path, kind: type[ProcessRig] = ProcessRig) -> None:
+        self.rig: ProcessRig | None = None
+        self.log: list[str] = []
+        self.folders: list[Path] = []  # of each rig so far
+        self._folder, self._kind = folder, kind
+        self._machine = Machine()
+
+    def rig_of(self, arm: Arm) -> ProcessRig:
+        """Return running nodes that have this arm."""
+        if self.rig is not None and (self.rig.arm is not arm or self.rig.have_ended):
+            self.end()
+        if self.rig is None:
+            self.folders.append(self._folder / str(len(self.folders)))
+            self.folders[-1].mkdir()
+            self.rig = self._kind(arm, self.folders[-1])
+            self.rig.start()
+        return self.rig
+
+    def play(self, case: FaultCase) -> Played:
+        """Play a row, again if it was unsafe while the machine stood still; in the end it is then not judged."""
+        for _ in range(ATTEMPTS):
+            self._machine.longest_gap()
+            played = self._play(case)
+            gap = self._machine.longest_gap()
+            if not played.unsafe or gap < STALL:
+                return played
+        return played._replace(outcome=f"not judged, {stood_still(gap)}: {played.unsafe}", unsafe="")
+
+    def _play(self, case: FaultCase) -> Played:
+        try:
+            rig = self.rig_of(case.arm)
+            rig.bring_to(case.stage)
+            played = play(case, rig)
+        except (AssertionError, OSError, LookupError) as error:  # a process that is late, or gone
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            played = Played(NOT_RUN, Response(), f"{NOT_RUN}: {reason}")
+        if case.ends_rig or played.unsafe:
+            self.log = self.rig.nodes.log[-LOG_LINES:] if self.rig else []
+            self.end()
+        return played
+
+    def end(self) -> None:
+        """End the nodes."""
+        rig, self.rig = self.rig, None
+        if rig is not None:
+            rig.close()
+
+    def close(self) -> None:
+        """End the nodes and what watches the machine."""
+        self.end()
+        self._machine.close()
+
+
+@contextlib.contextmanager
+def pool_of(kind: type[ProcessRig] = ProcessRig) -> Iterator[Pool]:
+    """Yield a pool with a temporary folder. Signals that end this process let the nodes end first."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the nodes inherit it: nohup must not hide a row's SIGHUP
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(Pool(Path(folder), kind)) as pool:
+        yield pool
 
 
 def main() -> int:
-    """Run the cases; return the exit code."""
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the nodes inherit it: nohup must not hide a row's SIGHUP
-    parser = argparse.ArgumentParser(prog="python -m test.faults.run", description="Run the fault matrix.")
-    parser.add_argument("--only", default=[""], nargs="+", metavar="TEXT", help="only cases whose name contains TEXT")
-    parser.add_argument("--exactly", action="store_true", help="only cases whose name is one of these TEXTs")
-    parser.add_argument("--start", default=1, type=int, metavar="N", help="begin with the Nth of them")
+    """Play the rows; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m test.faults.run", description="Play the fault matrix.")
+    parser.add_argument("--only", default=[""], nargs="+", metavar="TEXT", help="only rows whose name contains TEXT")
     parser.add_argument("--output", default=Path("build/faults.json"), type=Path, metavar="FILE", help="(%(default)s)")
-    parser.add_argument("--busy", action="store_true", help="for a busy machine: long time-outs, reactions not judged")
     arguments = parser.parse_args()
-    chosen = [case for case in CASES if any(_matches(case, text, arguments.exactly) for text in arguments.only)]
-    cases = chosen[arguments.start - 1 :]
-    console = Console(width=max(120, Console().width))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
-    results: list[Result] = []
-    interrupted = False
+    cases = [case for case in CASES if any(text in case.name for text in arguments.only)]
+    arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    console, results = Console(width=max(120, Console().width)), list[dict[str, Any]]()
+    columns = ("reaction", "top_speed", "largest_step", "energy", "power", "damping", "off")
+    grid = Table("fault", "result", "after s", "top rad/s", "step Nm", "J", "W", "damping", "off s", "verdict")
     try:
-        for result in run_all(cases, console, not arguments.busy):
-            results.append(result)
-            save(results, arguments.output)
+        with pool_of() as pool:
+            for number, case in enumerate(cases, 1):
+                played = pool.play(case)
+                figures = {name: value and round(value, 3) for name, value in asdict(played.response).items()}
+                results.append({"fault": case.name, "result": played.outcome, **figures, "unsafe": played.unsafe})
+                arguments.output.write_text(json.dumps(results, indent=1) + "\n")
+                verdict = played.unsafe or "safe"
+                grid.add_row(case.name, played.outcome, *(str(figures[name]) for name in columns), verdict)
+                said = f"[{number}/{len(cases)}] {case.name}: {played.outcome}, {verdict}"
+                console.print("\n    ".join([said, *(pool.log if played.unsafe else ())]), markup=False)
     except KeyboardInterrupt:
-        interrupted = True
-        console.print(f"interrupted after {len(results)} of {len(cases)} cases")
-    finally:
-        console.print(table(results))
-    if interrupted:
         return INTERRUPTED
+    finally:
+        console.print(grid)
     return int(any(result["unsafe"] for result in results))
-
-
-def _matches(case: FaultCase, text: str, exactly: bool) -> bool:
-    return text == case.name if exactly else text in case.name
-
-
-def run_all(cases: Sequence[FaultCase], console: Console, shipped_timeouts: bool = True) -> Iterator[Result]:
-    """Run the cases, show their progress, and yield their results."""
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        RigPool(Path(folder), shipped_timeouts) as pool,
-        contextlib.closing(StallClock()) as clock,
-    ):
-        for number, case in enumerate(cases, 1):
-            console.print(f"[{number}/{len(cases)}] {case.name} ...", end=" ", markup=False)
-            start = time.monotonic()
-            result = run_undisturbed(case, pool, clock, console)
-            result["seconds"] = round(time.monotonic() - start, 1)
-            console.print(result["result"], result["unsafe"] or "safe", f"{result['seconds']:.0f} s", markup=False)
-            for line in result.pop("log", ()):
-                console.print("    ", line, markup=False)
-            yield result
-
-
-def run_undisturbed(case: FaultCase, pool: RigPool, clock: StallClock, console: Console) -> Result:
-    """Run a case, and run it again if it is unsafe and the machine stood still meanwhile."""
-    for attempt in range(1, ATTEMPTS + 1):
-        clock.longest_gap()
-        try:
-            result = pool.run(case)
-        except Exception as error:  # the rig cannot be started or ended
-            result = not_run(case, error)
-        gap = clock.longest_gap()
-        result["attempts"], result["machine_stall_ms"] = attempt, round(1000.0 * gap)
-        if not result["unsafe"] or gap < STALL:
-            break
-        if attempt < ATTEMPTS:
-            console.print(
-                f"({result['unsafe']}, but the machine stood still for {gap:.3f} s) ...", end=" ", markup=False
-            )
-    return result
-
-
-def save(results: Sequence[Result], path: Path) -> None:
-    """Write the results as JSON."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(results, indent=1) + "\n")
-
-
-def table(results: Sequence[Result]) -> Table:
-    """Return the results as a table."""
-    columns = ("reaction_ms", "top_speed_rad_s", "torque_step_nm", "energy_j", "power_w", "damping_of_rated", "off_s")
-    grid = Table("fault", "result", "after ms", "top rad/s", "step Nm", "J", "W", "damping", "off s", "verdict")
-    for result in results:
-        figures = [result[column] for column in columns]
-        cells = ["-" if figure is None else str(figure) for figure in figures]
-        grid.add_row(result["fault"], result["result"], *cells, result["unsafe"] or "safe")
-    return grid
 
 
 if __name__ == "__main__":

@@ -1,213 +1,177 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """python -m test.faults.soak [--minutes 60] [--seed 1]: both arms, live changes, an active wearer, harmless faults.
 
-Each minute the operator changes the right arm's load at random, while it is free and while its wearer reaches, shakes,
-throws, pushes or holds it; in every second minute, by chance, a fault strikes it, judged as in the fault matrix. The
-arm must be carried again each time. The left arm is also carried, and a recorder runs throughout.
+In each row the operator changes the right arm's load at random, while it is free and while its wearer reaches, shakes,
+throws, pushes or holds it; by chance a fault strikes it then. All are judged as in the fault matrix, and the arm must
+be carried again each time. The left arm is also carried, and a recorder runs throughout.
 
-The exit code is 1 if a fault was unsafe, a live change let the motors move an arm faster than MOVED, an arm was let
-down without a cause or not carried again, a change was refused, the recording has losses or ends early, or a node's
-memory grew by more than MAX_GROWTH. It is a cause that the computer stood still for STALL, or that for less than IDLE
-of the time its processors were idle or busy with what has a lower priority. Nodes that ended then are started again.
+The exit code is 1 if a row was unsafe, the recording has losses or gaps, or a node's memory grew by more than
+MAX_GROWTH.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import json
-import os
 import random
-import signal
 import sys
-import tempfile
 import time
-import traceback
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-
-from ..support.ports import own_domain
-
-os.environ.setdefault("ROS_DOMAIN_ID", str(own_domain()))  # before rclpy is imported
+from typing import Any, ClassVar
 
 import numpy as np
-from rich.console import Console
 
-from exo_gravity.core.motors.frames import EXIT
 from exo_gravity.lab.bag.reader import read_bag
+from exo_gravity.sim.judge import measure
 
-from .actions import END_SILENCE, SILENCE, foreign_frames, pause, send_signal, simulator
-from .cases import CASES
-from .fault_case import ALL_JOINTS, PROCESS_REACTION, FaultCase, in_turn
-from .live_arm import MINUTE, NODES, STALL, LiveArm, SoakRig
-from .runner import Result, RigPool
-from .stall_clock import StallClock
+from .fault_case import Action, Arm, FaultCase, Parameters, in_turn, pause
+from .run import Pool, pool_of  # first: it chooses the ROS domain
+
+from .processes import CONTINUE, MESSAGES, STOP, ProcessRig, send  # isort: skip
+from ..support.launched_nodes import CALM  # isort: skip
 from .virtual import AK_ERROR
+from .virtual_cases import KEEP, MOVED, PUSH_DOWN, RATED, ROBOT, SHAKE, THROW, WORN, Steps
 
-WARM_UP = 5  # min until memory counts: caches and buffers fill
+WARM_UP = 5  # rows until memory counts: caches and buffers fill
 MAX_GROWTH = 5.0  # MB, from then until the end
-LINES = 40  # of the nodes' logs, shown where the soak breaks off
 MAX_GAP = 1.0  # s between two recorded joint states of an arm
-LIVE, LIVE_BEFORE_FAULT = 45.0, 15.0  # s of a minute after which no further change and act begin
-
-
-HARMLESS = [f"second publisher of {what}" for what in ("joint states", "the tilt", "efforts")]  # rows of the matrix
-FAULTS = (  # after which the same nodes run on
-    *(replace(case, rig=SoakRig, outcomes=()) for case in CASES if case.name in HARMLESS),
-    FaultCase("arm disabled", lambda rig: rig.probe.enable(False), SoakRig),
-    FaultCase("foreign EXIT to motor 2, once", foreign_frames(EXIT), SoakRig, steps_from=0.05),
-    FaultCase(
-        "motor 2 reports an error",
-        simulator(fault__error=[0, AK_ERROR, 0, 0]),
-        SoakRig,
-        clear=simulator(fault__error=[0] * 4),
-    ),
-    FaultCase("bus silent for 1 s", in_turn(SILENCE, pause(1.0), END_SILENCE), SoakRig, unreached=ALL_JOINTS),
-    FaultCase(
-        "compensator frozen",
-        send_signal("compensator", signal.SIGSTOP),
-        SoakRig,
-        PROCESS_REACTION,
-        clear=send_signal("compensator", signal.SIGCONT),
-    ),
+SOAK = replace(WORN, base="sim_both.yaml", rate=50.0)
+NODES = (
+    *("/imu", "/recorder"),
+    *(f"/{side}/{node}" for side in ("right", "left") for node in ("can_bridge", "compensator")),
 )
+CARRIED: Parameters = {**WORN.compensator, "robot.mass": list(ROBOT.mass), **RATED}
+BACK: Steps = [{"move": list(SOAK.pose), "over": over} for over in (1.5, 60.0)]  # where the wearer carries their arm
+# As the virtual wearer's 25 Nm permit while the motors do not carry them.
+ACTS: dict[str, Steps] = {
+    "lifts": [{"move": [0.0, 1.0, 0.3, 1.0], "over": 1.6}],
+    "pushes down": PUSH_DOWN,
+    "holds": KEEP,
+    "shakes": SHAKE,
+    "throws": [*THROW, {"hold": 0.5}],
+    "reaches": [{"move": pose, "over": 1.0} for pose in ([0.3, 0.9, 0.6, 1.0], list(SOAK.pose)) * 3],
+}
 
 
-class Soak:
-    """The soak.
+class SoakRig(ProcessRig):
+    """Both arms carry the arm of a 75 kg wearer, and a recorder runs."""
 
-    results: of the faults that were judged. memory: (minutes, nodes) MB for each start of the nodes. recordings: of
-    each start.
-    """
+    timing: ClassVar[Mapping[str, Parameters]] = CALM  # so that an ordinary computer has time left
 
-    def __init__(self, seed: int, console: Console) -> None:
-        self._dice, self._console = random.Random(seed), console
-        self.live = LiveArm(self._dice)
-        self.results: list[Result] = []
-        self.memory: list[list[list[float]]] = []
-        self.recordings: list[Path] = []
+    def __init__(self, arm: Arm, folder: Path) -> None:
+        super().__init__(arm, folder)
+        self.nodes.add("/recorder", output=str(folder / "bag"))
 
-    def run(self, minutes: float, folder: Path) -> None:
-        """Run it, to the end or until something went wrong after which the nodes do not run.
-
-        Nodes that ended while the computer stood still are started again.
-        """
-        with contextlib.closing(StallClock()) as clock, RigPool(folder, shipped_timeouts=False) as pool:
-            start = time.monotonic()
-            for minute in range(round(minutes)):
-                rig = None
-                try:
-                    rig = self._carrying(pool)
-                    self._run_minute(minute, start + minute * MINUTE, rig, pool, clock)
-                except AssertionError as error:  # also a Timeout
-                    stall = max(self.live.stall, clock.longest_gap())
-                    if rig and rig.has_lost_a_node and stall > STALL:
-                        self.live.stalls.append(f"the computer stood still for {stall:.3f} s, and a node ended")
-                        self._print(f"      {self.live.stalls[-1]}")
-                        continue
-                    self.live.trouble.append(f"{self.live.last}: {describe(error)}")
-                    log = pool.rig.nodes[0].log[-LINES:] if pool.rig else []
-                    self._print("\n".join([self.live.trouble[-1], *log]))
-                    break
-                if pool.rig is rig and not rig.has_lost_a_node:
-                    self.memory[-1].append(rig.memory())
-                    rig.forget()
-                    rig.wait(start + (minute + 1) * MINUTE - time.monotonic())
-                    assert not rig.has_lost_a_node or clock.longest_gap() > STALL, "a node ended between two minutes"
-                elif self.live.trouble or any(result["unsafe"] for result in self.results):
-                    break
-
-    def _carrying(self, pool: RigPool) -> SoakRig:
-        """Return nodes that carry the arms: those that run, or new ones."""
-        before, rig = pool.rig, pool.rig_for(SoakRig)
-        assert isinstance(rig, SoakRig)
-        if rig is not before:
-            self.memory.append([])
-            self.recordings.append(rig.folder / "bag")
-        rig.bring_to("active")
-        return rig
-
-    def _run_minute(self, minute: int, start: float, rig: SoakRig, pool: RigPool, clock: StallClock) -> None:
-        live, fault = self.live, self._dice.choice(FAULTS) if self._dice.random() < 0.5 else None
-        seen, news = live.seen.copy(), (len(live.trouble), len(live.stalls))
-        live.live(rig, start + (LIVE_BEFORE_FAULT if fault else LIVE), clock)
-        parts = [f"{what} {count}" for what, count in (live.seen - seen).items()]
-        lines: list[str] = []
-        if fault and len(live.stalls) == news[1] and not rig.has_lost_a_node:  # else an arm may be on its way down
-            clock.longest_gap()
-            result = pool.run(fault)
-            stall = clock.longest_gap()
-            lines += result.pop("log", ())
-            parts.append(f"{fault.name}: {result['result']}, {result['unsafe'] or 'safe'}")
-            if result["unsafe"] and stall > STALL:
-                live.stalls.append(f"the computer stood still for {stall:.3f} s: {parts[-1]}")
-            else:
-                self.results.append(result)
-        lines = [*live.trouble[news[0] :], *live.stalls[news[1] :], *lines]
-        self._print(f"{minute + 1:3d} {', '.join(parts)}; at most {live.fastest:.2f} rad/s")
-        for line in lines:
-            self._print(f"      {line}")
-
-    def _print(self, line: str) -> None:
-        self._console.print(line, markup=False, soft_wrap=True)
+    def memory(self) -> list[float]:
+        """Return the resident memory of each of NODES in MB."""
+        return [resident(self.pid(node)) for node in NODES]
 
 
-def describe(error: AssertionError) -> str:
-    """Return the error and the lines of the tests that led to it."""
-    calls = traceback.extract_tb(error.__traceback__)
-    return f"{error}; in {', '.join(call.line or call.name for call in calls[1:])}"
+def resident(pid: int) -> float:
+    """Return the resident memory of a process in MB."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:")) / 1e3
 
 
-def find_failures(soak: Soak) -> dict[str, Any]:
-    """Return what failed, by subject."""
-    failed: dict[str, Any] = {r["fault"]: r["unsafe"] for r in soak.results if r["unsafe"]}
-    if soak.live.trouble:
-        failed["without a cause"] = soak.live.trouble
-    for sizes in soak.memory:
-        if len(sizes) > WARM_UP:
-            growth = np.subtract(sizes[-1], sizes[WARM_UP])
-            failed |= {
-                f"memory of {node}": f"+{mb:.1f} MB" for node, mb in zip(NODES, growth, strict=True) if mb > MAX_GROWTH
-            }
-    for number, recording in enumerate(soak.recordings, 1):
-        bag = read_bag(recording)
-        losses = [note for note in (*bag.notes, *bag.problems) if "lost" in note or "cut short" in note]
-        is_last = number == len(soak.recordings)  # an earlier one ends where a node has ended
-        if losses or (is_last and bag.is_partial):
-            failed[f"recording {number}"] = [*bag.notes, *bag.problems]
-        for arm in bag.recordings:
-            if (gap := float(np.diff(arm.time).max())) > MAX_GAP:
-                failed[f"recording {number} of {arm.name}"] = f"no joint states for {gap:.1f} s"
-    return failed
+def wearer(steps: Steps) -> Action:
+    """Let the wearer do these steps of a trial script from now on."""
+    return lambda rig: rig.set("simulator", {"trial": str(rig.write_script(f"wearer_{time.monotonic_ns()}", steps))})
 
 
-def main() -> int:
-    """Run the soak; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m test.faults.soak", description="Strike both arms for an hour.")
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--output", type=Path, default=Path("build/soak.json"), metavar="FILE", help="(%(default)s)")
-    options = parser.parse_args()
-    console = Console(width=150, highlight=False)
-    soak = Soak(options.seed, console)
-    with tempfile.TemporaryDirectory() as folder:
-        soak.run(options.minutes, Path(folder))
-        failed = find_failures(soak)
-    for node, *sizes in zip(NODES, *max(soak.memory, key=len), strict=True) if any(soak.memory) else ():
-        console.print(f"{node}: {min(sizes[WARM_UP:] or sizes):.1f} MB after the start, {sizes[-1]:.1f} MB at the end")
-    seen = {**soak.live.seen, "faults": len(soak.results), "while the computer stood still": len(soak.live.stalls)}
-    seen["starts of the nodes"] = len(soak.recordings)
-    report = {"seen": seen, "fastest": soak.live.fastest, "results": soak.results, "memory": soak.memory}
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    options.output.write_text(json.dumps({**report, "failed": failed}, indent=1) + "\n")
-    console.print("; ".join(f"{what}: {count}" for what, count in seen.items()), markup=False)
-    fastest = f"{soak.live.fastest:.2f} rad/s by live changes"
-    if soak.results:
-        fastest += f", {max(result['driven_rad_s'] or 0.0 for result in soak.results):.2f} rad/s after faults"
-    console.print(f"the motors caused at most {fastest}; failed: {failed or 'nothing'}", markup=False)
-    return int(bool(failed))
+def load(change: Parameters) -> Action:
+    """Let the operator change the load."""
+    return lambda rig: rig.set("compensator", {**CARRIED, **change})
+
+
+def some_change(dice: random.Random) -> Parameters:
+    """Return in what a load differs from CARRIED."""
+    *links, last = ROBOT.mass
+    changes: tuple[Parameters, ...] = (
+        {"mode": "one_g"},
+        {"support": round(dice.random(), 2)},
+        {"wearer.body_mass": round(dice.uniform(50.0, 100.0), 1)},
+        {"robot.mass": [*links, round(last + dice.uniform(0.0, 1.0), 2)]},  # a payload
+        {"max_effort": [round(dice.uniform(0.2, 1.0) * most, 2) for most in RATED["max_effort"]]},
+    )
+    return dice.choice(changes)
+
+
+def not_driven(records: np.ndarray) -> str:
+    """Return how fast the motors drove the arm, if they did."""
+    speed = measure(records, records["time"][0], 1.0 / SOAK.rate).driven
+    return f"driven at {speed:.2f} rad/s" if speed > MOVED else ""
+
+
+def is_carried_where_the_wearer_let_go(rig: SoakRig) -> None:
+    assert rig.is_at_pose(rig.probe, rig.truth), np.round(rig.probe.joint_angles(), 2)
+
+
+def live(dice: random.Random) -> FaultCase:
+    """Return a row: the load of a free arm changes, and again while the wearer acts."""
+    free, held, meanwhile = some_change(dice), some_change(dice), dice.uniform(0.1, 2.0)
+    act, steps = dice.choice(list(ACTS.items()))
+    lasts = sum(step.get("over") or step["hold"] for step in [*steps, BACK[0]])
+    happen = in_turn(
+        *(load(free), pause(dice.uniform(0.5, 5.0)), wearer([*steps, *BACK]), pause(meanwhile), load(held)),
+        *(pause(max(0.0, lasts - meanwhile)), load({}), pause(2.0)),
+        lambda rig: rig.run_until(lambda: rig.probe.diagnostic("compensator", "changing load") == "none", 30.0),
+        *(wearer([{"hold": 60.0}]), pause(1.5)),
+    )
+    given: dict[str, Any] = {"outcomes": ("active",), "check": not_driven}
+    name = f"{free}, {act}, {held}"
+    return FaultCase(name, happen, SOAK, None, afterwards=is_carried_where_the_wearer_let_go, speed_limit=99.0, **given)
+
+
+def error(code: int) -> Action:
+    """Let the motor that is struck report an error, or 0 for none."""
+    return lambda rig: rig.set("simulator", {"fault.error": [0, code, 0, 0]})
+
+
+FAULTS = (  # after which the same nodes run on
+    *(replace(case, arm=SOAK, limit=None, outcomes=()) for case in MESSAGES),
+    FaultCase("arm disabled", lambda rig: rig.probe.enable(False), SOAK, None, outcomes=("disabled",)),
+    FaultCase("motor 2 reports an error", error(AK_ERROR), SOAK, None, clear=error(0), outcomes=("motor_error",)),
+    FaultCase("compensator frozen", send(STOP, "compensator"), SOAK, None, clear=send(CONTINUE, "compensator"),
+        outcomes=("command_stale",)),
+)  # fmt: skip
+
+
+def lost_in(folder: Path, is_last: bool) -> list[str]:
+    """Return what the recording in `folder` lacks. An earlier one ends where a node has ended."""
+    bag = read_bag(folder / "bag")
+    notes = [*bag.notes, *bag.problems]
+    lost = [note for note in notes if "lost" in note or "cut short" in note or (is_last and bag.is_partial)]
+    gaps = {arm.name: float(np.diff(arm.time).max()) for arm in bag.recordings}
+    return lost + [f"no joint states of {name} for {gap:.1f} s" for name, gap in gaps.items() if gap > MAX_GAP]
+
+
+def soak(minutes: float, dice: random.Random, pool: Pool) -> list[str]:
+    """Play rows for so many minutes, or until one is unsafe; return what failed."""
+    failed, sizes, end = list[str](), dict[SoakRig, list[list[float]]](), time.monotonic() + 60.0 * minutes
+    while time.monotonic() < end and not failed:
+        for case in (live(dice), *dice.sample(FAULTS, dice.randrange(2))):
+            played = pool.play(case)
+            failed += [f"{case.name}: {played.unsafe}"] * bool(played.unsafe)
+            print(
+                f"{case.name}: {played.outcome}, {played.unsafe or 'safe'}", *pool.log * bool(played.unsafe), sep="\n "
+            )
+        if isinstance(pool.rig, SoakRig) and not pool.rig.have_ended:
+            sizes.setdefault(pool.rig, []).append(pool.rig.memory())
+    pool.end()
+    for measured in sizes.values():
+        growth = np.subtract(measured[-1], measured[min(WARM_UP, len(measured) - 1)])
+        print("memory grew by", dict(zip(NODES, growth.round(1).tolist(), strict=True)), "MB")
+        failed += [f"memory of {node}: +{mb:.1f} MB" for node, mb in zip(NODES, growth, strict=True) if mb > MAX_GROWTH]
+    return failed + [line for folder in pool.folders for line in lost_in(folder, folder is pool.folders[-1])]
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = argparse.ArgumentParser(prog="python -m test.faults.soak", description="Strike both arms for an hour.")
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    with pool_of(SoakRig) as rigs:
+        found = soak(options.minutes, random.Random(options.seed), rigs)
+    print("failed:", *(found or ["nothing"]), sep="\n ")
+    sys.exit(bool(found))

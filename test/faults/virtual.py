@@ -1,16 +1,16 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Rows of the fault matrix in virtual time: the arm of a parameter file, what is done to it, and how a row is played.
-
-Bridge, bus, safety machine and compensator are those of the nodes; the processes, DDS and the watchdog are not there.
-"""
+"""The fault matrix in virtual time: the arm that is struck, and how faults are caused by the events of the rig."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+import random
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
+
+import can
+import numpy as np
 
 from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
@@ -19,26 +19,23 @@ from exo_gravity.lab.inputs.arms import node_values, read_arm
 from exo_gravity.lab.inputs.parameter_file import Nodes, load
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.events import ACTS, HOLD
-from exo_gravity.sim.judge import Response
 from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.rig import Rig
 
 from ..support import CONFIG
 from ..support.copies import copied
-from .fault_case import AFTER_EXIT, BEFORE, CARRYING, DESCENT, OBSERVATION, Action, FaultCase, in_turn
+from . import fault_case
+from .fault_case import BEFORE, Action, Arm, FaultCase, Parameters, Played, in_turn, pause
 
-RAISED = (0.0, 1.3, 0.0, 0.3)  # rad, nearly horizontal
-TIMEOUTS: Mapping[str, Mapping[str, Any]] = {  # those of a real device
+TIMEOUTS: dict[str, Parameters] = {  # those of a real device
     "can_bridge": {"command_timeout": 0.05, "frozen_timeout": 0.08, "enable_timeout": 10.0, "sign_check_torque": 0.0},
     "compensator": {"tilt_timeout": 0.08},
 }
 STEADY = 1.25  # s after a move in which the arm comes to rest
 GYRO_BIAS = 1e-3  # rad/s, as an ordinary IMU has at least
 FALLING = 0.2  # rad/s of the struck joint, from which on an arm is on its way down
-AT_LEAST, RESTS = 0.5, 1e-3  # s after the last motor was switched off, and rad/s: nothing more can happen to the arm
+RESTS = 1e-3  # rad/s
 AK_ERROR, DAMIAO_ERROR = 5, 0xB
-
-Parameters = Mapping[str, Any]
 
 
 class OuterLoop:
@@ -61,31 +58,13 @@ class OuterLoop:
             rig.assist.receive(rig.now, names, self.others, rig.now, True)
 
 
-@dataclass(frozen=True, eq=False)
-class Arm:
-    """An arm of a file in config, carried in `pose` (n,) rad at `rate` Hz.
-
-    struck: the joint (0..) whose motor is the one that fails; it carries much of the arm's weight.
-    can_bridge, compensator, simulator: parameters that are not as in the file.
-    assisted: Nm (n,) of an outer loop, none without one.
-    """
-
-    base: str = "sim.yaml"
-    pose: tuple[float, ...] = RAISED
-    struck: int = 1
-    rate: float = 250.0
-    can_bridge: Parameters = field(default_factory=dict)
-    compensator: Parameters = field(default_factory=dict)
-    simulator: Parameters = field(default_factory=dict)
-    assisted: tuple[float, ...] = ()
-
-    def nodes(self) -> dict[str, dict[str, Any]]:
-        """Return the parameters of the right arm's nodes."""
-        nodes = {name: dict(values) for name, values in load(CONFIG / self.base).items()}
-        for node in ("can_bridge", "compensator", "simulator"):
-            nodes[f"/right/{node}"] |= {**TIMEOUTS.get(node, {}), **getattr(self, node)}
-        nodes["/right/can_bridge"]["rate"] = self.rate
-        return nodes
+def parameters_of(arm: Arm) -> dict[str, dict[str, Any]]:
+    """Return the parameters of the right arm's nodes."""
+    nodes = {name: dict(values) for name, values in load(CONFIG / arm.base).items()}
+    for node in ("can_bridge", "compensator", "simulator"):
+        nodes[f"/right/{node}"] |= {**TIMEOUTS.get(node, {}), **getattr(arm, node)}
+    nodes["/right/can_bridge"]["rate"] = arm.rate
+    return nodes
 
 
 def device_from(nodes: Nodes) -> SimulatedDevice:
@@ -98,32 +77,15 @@ class StruckArm(Rig):
     """An arm of the matrix."""
 
     def __init__(self, arm: Arm) -> None:
-        self.arm, self.struck, self.nodes = arm, arm.struck, arm.nodes()
+        self.arm, self.struck, self.nodes = arm, arm.struck, parameters_of(arm)
         carried = read_arm(self.nodes, "/right")
-        device = device_from(self.nodes)
-        super().__init__(device, carried.settings, carried.motors, carried.limits, arm.rate)
+        self.joint_motors = carried.motors
+        super().__init__(device_from(self.nodes), carried.settings, carried.motors, carried.limits, arm.rate)
         self.names = carried.limits.joint_names
         self.assist = self.compensator.terms.assist
         self.outer_loop = OuterLoop(self, arm.assisted) if arm.assisted else None
-        self.lease = Lease()
         self.gyro_bias = GYRO_BIAS
         self.run(0.2)
-
-    @property
-    def joints(self) -> range:
-        """All joints."""
-        return range(len(self.motors))
-
-    def hold_control(self, duration: float) -> None:
-        """Let someone hold control for `duration` s, who then dies; node can_bridge watches the lease."""
-        end = self.now + duration
-        self.clock.every(0.1, partial(self._watch_lease, end))
-
-    def _watch_lease(self, end: float) -> None:
-        if self.now < end:
-            self.lease.request(self.now, "the operator", "hold")
-        elif reason := self.lease.lost(self.now):
-            self.safety.trip(FaultCode.CONTROL_LOST, reason, self.now)
 
     def set_parameters(self, values: Parameters) -> None:
         """Set parameters of the compensator together, as the operator would. Raises ParameterError."""
@@ -151,7 +113,7 @@ class StruckArm(Rig):
 
     def take_home(self) -> None:
         """Let the wearer bring the arm near to hanging, and keep it there."""
-        home = [0.0, *[0.05] * (len(self.joints) - 1)]
+        home = [0.0, *[0.05] * (len(self.motors) - 1)]
         self.act(*({"move": home, "over": over} for over in (2.0, 20.0)))
         self.run(2.5)
 
@@ -168,6 +130,16 @@ class StruckArm(Rig):
     def outcome(self) -> str:
         """The code of the latched fault, or the bridge's state."""
         return self.fault if self.state is State.FAULT else self.state.value
+
+    def motion(self, since: float) -> np.ndarray:
+        """Return the truth records since a time in s."""
+        self.catch_up()
+        records = self.truth.records
+        return records[records["time"] >= since]
+
+    def trouble(self, _since: float) -> list[str]:
+        """Return what is unsafe whatever the motion was."""
+        return [f"exception: {self.loop.failure}"] * (self.loop.failure is not None)
 
 
 def brought(arm: Arm, stage: str) -> StruckArm:
@@ -194,57 +166,13 @@ def struck_arm(arm: Arm, stage: str, is_fresh: bool = False) -> StruckArm:
     return rig
 
 
-class Played(NamedTuple):
-    """What became of a row. unsafe: '' or what was wrong."""
-
-    outcome: str
-    response: Response
-    unsafe: str
-
-
 def play(case: FaultCase, is_fresh: bool = False) -> Played:
-    """Play a row, on a fresh arm if asked, and judge it by the arm's true motion as rows with processes are."""
-    rig = struck_arm(case.rig, case.stage, is_fresh)
-    start = rig.now
-    injected = case.inject(rig)
-    start = injected if isinstance(injected, float) else start
-    _observe(case, rig)
-    case.clear(rig)
-    if rig.are_off():
-        rig.run_until(lambda: rig.outcome not in CARRYING, DESCENT)
-    if rig.outcome not in CARRYING and not case.must_stay_off:
-        rig.run_until(rig.are_off, DESCENT)
-        rig.run(AT_LEAST)
-        rig.run_until(rig.rests, AFTER_EXIT - AT_LEAST)
-    outcome = rig.outcome
-    rig.catch_up()
-    records = rig.truth.records
-    records = records[records["time"] >= start - BEFORE]
-    specs = [motor.joint.spec for motor in rig.motors]
-    response = case.response(records, start, 1.0 / case.rig.rate, specs)
-    failures = case.failures(outcome, records, start, response, len(specs))
-    if not failures:
-        try:
-            case.afterwards(rig)
-        except AssertionError as error:
-            failures.append(f"afterwards: {str(error).splitlines()[0]}")
-    rig.bus.close()
-    failures += [f"exception: {rig.loop.failure}"] * (rig.loop.failure is not None)
-    return Played(outcome, response, ", ".join(failures))
-
-
-def _observe(case: FaultCase, rig: StruckArm) -> None:
-    """Run until the arm is let down, or for OBSERVATION if it may stay as it is."""
-    if case.limit is None or case.must_stay_off:
-        rig.run_until(lambda: rig.state is State.FAULT, OBSERVATION)
-        if rig.state not in (State.LETTING_DOWN, State.FAULT):
-            return
-    rig.run_until(lambda: rig.state is State.FAULT or rig.are_off(), DESCENT)
-
-
-def pause(seconds: float) -> Action:
-    """Let time pass."""
-    return lambda rig: rig.run(seconds)
+    """Play a row, on a fresh arm if asked."""
+    rig = struck_arm(case.arm, case.stage, is_fresh)
+    try:
+        return fault_case.play(case, rig)
+    finally:
+        rig.bus.close()
 
 
 def happens(name: str, **values: Any) -> Action:
@@ -273,44 +201,21 @@ def power(on: bool, *joints: int) -> Action:
 
     def inject(rig: StruckArm) -> None:
         rig.catch_up()
-        for joint in joints or rig.joints:
+        for joint in joints or range(len(rig.motors)):
             rig.motors[joint].unplugged = not on
 
     return inject
 
 
-def no_error(rig: StruckArm) -> None:
-    """End the errors of all motors."""
-    for motor in rig.motors:
-        motor.error = 0
-
-
-def no_jump(rig: StruckArm) -> None:
-    """Let every encoder read the right angle again."""
-    rig.device.encoder_error = (0.0,) * len(rig.joints)
-
-
 def freeze(rig: StruckArm) -> None:
     """Let the compensator answer no more: its last efforts grow old."""
-    rig.controller.change = partial(_constant, rig.direct.efforts(rig.now))
+    last = rig.direct.efforts(rig.now)
+    rig.controller.change = lambda answer: last
 
 
 def resume(rig: StruckArm) -> None:
     """Let it answer again."""
     rig.controller.change = None
-
-
-def _constant(last: Efforts, _answer: Efforts) -> Efforts:
-    return last
-
-
-def raises(_rig: StruckArm) -> None:
-    """Let each step of the compensator raise an exception."""
-
-    def fail(_answer: Efforts) -> Efforts:
-        raise ZeroDivisionError("division by zero")
-
-    _rig.controller.change = fail
 
 
 def change_efforts(change: Callable[[float, Sequence[float]], Sequence[float]]) -> Action:
@@ -335,26 +240,50 @@ def foreign(torque: float) -> Action:
     return in_turn(happens("foreign_torque", joint=struck, torque=torque, rate=500.0, duration=2.0), pause(2.0))
 
 
+def random_frames(ids: Iterable[int], count: int = 6000, rate: float = 3000.0) -> Action:
+    """Send frames of random length and content under random `ids`, `rate` a second."""
+
+    def inject(rig: StruckArm) -> None:
+        dice, known = random.Random(1), list(ids)
+        for number in range(count):
+            data, is_long = dice.randbytes(dice.randrange(9)), dice.random() < 0.2
+            message = can.Message(arbitration_id=dice.choice(known), data=data, is_extended_id=is_long)
+            rig.clock.later(number / rate, partial(rig.wire.carry, None, message))
+
+    return inject
+
+
+def control_dies(rig: StruckArm) -> None:
+    """Let someone hold control for 1 s, who then dies; node can_bridge watches the lease."""
+    lease, end = Lease(), rig.now + 1.0
+
+    def watch() -> None:
+        if rig.now < end:
+            lease.request(rig.now, "the operator", "hold")
+        elif reason := lease.lost(rig.now):
+            rig.safety.trip(FaultCode.CONTROL_LOST, reason, rig.now)
+
+    rig.clock.every(0.1, watch)
+    rig.run(1.0)
+
+
 CUT_OFF = happens("cut_off", motors=only_struck)
 CONNECT = happens("cut_off", motors=())
 RESTART, SHORT_RESTART = (happens("unplugged", joint=struck, duration=duration) for duration in (0.03, 0.015))
 CUT, RELEASE = power(False), power(True)
 SILENCE, END_SILENCE = (lambda rig, on=on: setattr(rig.device, "bus_silent", on) for on in (True, False))
-ERROR = happens("motor_error", joint=struck, code=error_code)
+ERROR, NO_ERROR = (happens("motor_error", joint=struck, code=code) for code in (error_code, 0))
 JUMP = happens("encoder_jump", joint=struck)
 
 
 def enabled_in_vain(rig: StruckArm, wait: Action) -> None:
     """Clear the fault and enable the arm, whose cause is still there: its motors must stay off while `wait(rig)`."""
-    assert rig.run_until(lambda: rig.state is State.FAULT, 10.0), rig.state
+    clear(rig)
     start = rig.now
-    rig.between_cycles(rig.safety.clear)
     assert rig.run_until(lambda: rig.state is State.DISABLED, 10.0), rig.state
     rig.between_cycles(rig.safety.enable)
     wait(rig)
-    rig.catch_up()
-    records = rig.truth.records
-    assert not records["on"][records["time"] > start].any(), "a motor was switched on"
+    assert not rig.motion(start)["on"].any(), "a motor was switched on"
 
 
 def refused_on_the_wrong_angle(rig: StruckArm) -> None:
@@ -383,6 +312,6 @@ def resumed(rig: StruckArm) -> None:
 
 
 def clear(rig: StruckArm) -> None:
-    """Clear the fault while the supply is off: the motors may still be letting down, as far as the bridge knows."""
+    """Clear the fault; the motors may still be letting down, as far as the bridge knows."""
     assert rig.run_until(lambda: rig.state is State.FAULT, 10.0), rig.state
     rig.between_cycles(rig.safety.clear)

@@ -81,7 +81,7 @@ def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator
     nodes = prepare(truth=True)
     launched = Launched(nodes)
     try:
-        probe.wait_until_carried()
+        probe.get_carried()
         yield launched
     finally:
         if launched.process.poll() is None:
@@ -91,51 +91,40 @@ def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator
         print("\n".join(launched.log))  # pytest shows it if the test failed
 
 
-def test_ctrl_c_lets_the_arm_down_before_the_other_nodes_stop(launched):
-    launched.ctrl_c()
-    assert launched.wait() == 0
-    assert launched.was_let_down()
-    first, *others = launched.ends()
-    assert first == "can_bridge" and sorted(others) == ["compensator", "imu", "simulator", "wearer"]
+def kill(*names: str) -> Callable[[Launched], None]:
+    """Kill nodes, or the watchdog of the bridge."""
+
+    def end(launched: Launched) -> None:
+        pids = [children(launched.pid("can_bridge"))[0] if name == "watchdog" else launched.pid(name) for name in names]
+        for pid in pids:
+            os.kill(pid, signal.SIGKILL)
+
+    return end
 
 
-def test_an_interrupt_of_launch_alone_does_the_same(launched):
-    os.kill(launched.process.pid, signal.SIGINT)
-    assert launched.wait() == 0
-    assert launched.was_let_down()
+ENDS = {  # what happens, and the exit code of `ros2 launch` if it does not die by that
+    "Ctrl-C": (Launched.ctrl_c, 0),
+    "launch alone is interrupted": (lambda launched: os.kill(launched.process.pid, signal.SIGINT), 0),
+    "launch is killed": (lambda launched: os.kill(launched.process.pid, signal.SIGKILL), None),
+    "its terminal is closed": (lambda launched: os.killpg(launched.process.pid, signal.SIGHUP), None),
+    "compensator": (kill("compensator"), 1),
+    "imu": (kill("imu"), 1),
+    "bridge and watchdog": (kill("watchdog", "can_bridge"), 1),
+}
 
 
-@pytest.mark.parametrize("node", ["compensator", "imu"])
-def test_when_a_node_dies_the_arm_is_let_down_all_stop_and_the_exit_code_is_1(launched, node):
-    os.kill(launched.pid(node), signal.SIGKILL)
-    assert launched.wait() == 1
-    assert launched.was_let_down()
-    assert any(f"{node} ended with exit code -9; all nodes were stopped" in line for line in launched.log)
-
-
-def kill(launched):
-    os.kill(launched.process.pid, signal.SIGKILL)
-
-
-def close_terminal(launched):
-    os.killpg(launched.process.pid, signal.SIGHUP)
-
-
-@pytest.mark.parametrize("end_launch", [kill, close_terminal])
-def test_when_launch_is_killed_or_its_terminal_closed_the_nodes_let_the_arm_down(launched, end_launch):
-    end_launch(launched)
-    launched.wait()
+@pytest.mark.parametrize("end", ENDS)
+def test_however_it_ends_the_arm_is_let_down_before_the_other_nodes_stop(launched, end):
+    happens, expected = ENDS[end]
+    happens(launched)
+    code = launched.wait()
     wait_until(launched.truth.motors_are_off, timeout=STOP_TIMEOUT)
-    assert launched.was_let_down()
-
-
-def test_an_arm_whose_bridge_and_watchdog_were_killed_is_let_down(launched):
-    bridge = launched.pid("can_bridge")
-    (watchdog,) = children(bridge)
-    os.kill(watchdog, signal.SIGKILL)
-    os.kill(bridge, signal.SIGKILL)
-    assert launched.wait() == 1
-    assert launched.was_let_down()
+    assert launched.was_let_down() and expected in (None, code)
+    if end == "Ctrl-C":
+        first, *others = launched.ends()
+        assert first == "can_bridge" and sorted(others) == ["compensator", "imu", "simulator", "wearer"]
+    if end in ("compensator", "imu"):
+        assert any(f"{end} ended with exit code -9; all nodes were stopped" in line for line in launched.log)
 
 
 @contextmanager
@@ -143,7 +132,7 @@ def in_lab(nodes: LaunchedNodes, *arguments: str, **options: Path) -> Iterator[t
     """Launch an arm in the namespace /lab; once it is carried, yield a probe and the names of all topics."""
     probe, launched = RosProbe("/lab/right"), Launched(nodes, *arguments, **options)
     try:
-        probe.wait_until_carried()
+        probe.get_carried()
         yield probe, {name for name, _ in probe.node.get_topic_names_and_types()}
     finally:
         launched.ctrl_c()
@@ -233,7 +222,7 @@ BEFORE = {"data: false": "active", "data: true": "disabled", "90.0, 30.0": "acti
 def test_a_command_of_the_documents_answers(standing, command, expected):
     for part, state in BEFORE.items():
         if part in command and state == "active":
-            standing.wait_until_carried()
+            standing.get_carried()
         elif part in command:
             standing.wait_until(lambda state=state: standing.state in (state, "fault"))
             assert standing.state == state or standing.trigger("clear_fault").success  # of a busy computer

@@ -1,76 +1,91 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The node `robot_model` with the real compensators and bridges of both arms, and the viewers' layouts."""
+"""The node `robot_model` in this process, with what the nodes of both arms publish; and the viewers' layouts."""
 
 from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 
 import pytest
+import rclpy
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
+from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
+from exo_gravity.core.compensation.settings import COMPENSATOR
+from exo_gravity.core.params import table_for, values_of
+from exo_gravity.core.safety.limits import CAN_BRIDGE
+from exo_gravity.hardware.network import keep_to_this_machine
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import node_modules
 from exo_gravity.lab.view.urdf import ROOT
+from exo_gravity.nodes.robot_model.node import RobotModel
 from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG, PARTS
-from ..support.launched_nodes import LaunchedNodes
-from ..support.node_thread import NodeThread
 from ..support.waiting import wait_until
 
+keep_to_this_machine()
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
 EFFORT = (0.0, 1.5, 1.2, 0.2)
+BOTH = CONFIG / "sim_both.yaml"
 
 
 def names(side):
     return [f"{side}_{part}" for part in PARTS]
 
 
-def texts(markers):
-    return {marker.text for marker in markers.values() if marker.type == Marker.TEXT_VIEW_FACING}
-
-
 class Viewer:
-    """A node that sends the joint states of both arms and the tilt, and keeps the newest of what robot_model sends."""
+    """A robot_model, nodes with the parameters of both arms, and a viewer that keeps the newest of what it sends.
 
-    def __init__(self):
-        self._thread = NodeThread("viewer")
-        (self.node,) = self._thread.nodes
-        self.close = self._thread.close
-        self.sent = {side: self.node.create_publisher(JointState, f"/{side}/joint_states", 1) for side in READINGS}
-        self.tilt = self.node.create_publisher(Vector3Stamped, "/imu/pitch_yaw", 1)
-        self.description, self.problem = String(), ""
-        self.states = JointState()
-        self.whole: JointState | None = None  # the newest with the joints of both arms
+    The viewer sends the tilt, and the states of bridges and joints of `sides`.
+    """
+
+    def __init__(self) -> None:
+        rclpy.init()
+        self.node, self.executor = rclpy.create_node("viewer"), SingleThreadedExecutor()
+        self.nodes = [RobotModel(), self.node]
+        for name, given in load(BOTH).items():
+            side, _, leaf = name[1:].partition("/")
+            table = {"compensator": COMPENSATOR, "can_bridge": CAN_BRIDGE}.get(leaf)
+            if table:
+                self.nodes.append(rclpy.create_node(leaf, namespace=side))
+                for parameter, value in values_of(table_for(table, given), given, "can.options").items():
+                    self.nodes[-1].declare_parameter(parameter, value)
+        for node in self.nodes:
+            self.executor.add_node(node)
+        create, subscribe = self.node.create_publisher, self.node.create_subscription
+        self.sent = {side: create(JointState, f"/{side}/joint_states", 1) for side in READINGS}
+        self.tilt, self.reports = (
+            create(Vector3Stamped, "/imu/pitch_yaw", 1),
+            create(DiagnosticArray, "/diagnostics", 10),
+        )
+        self.description, self.states, self.problem = String(), JointState(), ""
         self.markers: dict[tuple[str, int], Marker] = {}
-        subscribe = self.node.create_subscription
         subscribe(String, "/robot_description", lambda message: setattr(self, "description", message), LATCHED)
-        subscribe(JointState, "/joint_states", self._on_states, 1)
+        subscribe(JointState, "/joint_states", lambda message: setattr(self, "states", message), 1)
         subscribe(MarkerArray, "/robot_model/markers", self._on_markers, 1)
         subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.sides = set(READINGS)
         self.node.create_timer(0.05, self._send)
-        self._thread.start()
 
     def _send(self):
-        stamp = self.node.get_clock().now().to_msg()
-        for side in tuple(self.sides):
-            message = JointState(name=names(side), position=READINGS[side], velocity=(0.0,) * 4, effort=EFFORT)
-            message.header.stamp = stamp
-            self.sent[side].publish(message)
         tilt = Vector3Stamped()
-        tilt.header.stamp, tilt.vector.y = stamp, 0.5
+        tilt.header.stamp, tilt.vector.y = self.node.get_clock().now().to_msg(), 0.5
         self.tilt.publish(tilt)
-
-    def _on_states(self, message):
-        self.states = message
-        self.whole = message if len(message.name) == 8 else self.whole
+        for side in self.sides:
+            message = JointState(name=names(side), position=READINGS[side], velocity=(0.0,) * 4, effort=EFFORT)
+            message.header.stamp = tilt.header.stamp
+            self.sent[side].publish(message)
+            values = [KeyValue(key="state", value="inactive")]
+            status = DiagnosticStatus(name=f"{side}/can_bridge", message="inactive", values=values)
+            self.reports.publish(DiagnosticArray(status=[status]))
 
     def _on_markers(self, message):
         self.markers = {(marker.ns, marker.id): marker for marker in message.markers}
@@ -79,33 +94,32 @@ class Viewer:
         self.problem = next((s.message for s in message.status if s.name == "robot_model"), self.problem)
 
     def wait_until(self, condition):
-        wait_until(condition, seen=lambda: f"{self.problem!r}, joints {list(self.states.name)}")
+        seen = lambda: f"{self.problem!r}, joints {list(self.states.name)}"  # noqa: E731
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01), seen=seen)
 
-
-@pytest.fixture(scope="module")
-def nodes(tmp_path_factory):
-    """Both arms without simulators; the bridges stay inactive, so that the only joint states are those of the test."""
-    without, waiting = ("simulator", "imu"), {"autostart": False}
-    nodes = LaunchedNodes(
-        tmp_path_factory.mktemp("robot_model"), base="sim_both.yaml", without=without, can_bridge=waiting
-    )
-    nodes.add("/robot_model", rate=20.0)
-    yield nodes.start()
-    nodes.stop()
-    print("\n".join(nodes.log))
+    def close(self):
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
 
 
 @pytest.fixture
-def viewer():
+def viewer() -> Iterator[Viewer]:
     viewer = Viewer()
     yield viewer
     viewer.close()
 
 
-def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers(nodes, viewer):
-    viewer.wait_until(lambda: viewer.description.data == urdf_of(nodes.path) and viewer.whole)
-    position = dict(zip(viewer.whole.name, viewer.whole.position, strict=True))
-    effort = dict(zip(viewer.whole.name, viewer.whole.effort, strict=True))
+def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers_until_an_arm_falls_silent(
+    viewer, tmp_path
+):
+    sorted_by_arm = tmp_path / "sorted.yaml"
+    sorted_by_arm.write_text(yaml.safe_dump(yaml.safe_load(BOTH.read_text("utf-8"))))
+    described = urdf_of(sorted_by_arm)
+    viewer.wait_until(lambda: viewer.description.data == described and len(viewer.states.name) == 8)
+    position = dict(zip(viewer.states.name, viewer.states.position, strict=True))
+    effort = dict(zip(viewer.states.name, viewer.states.effort, strict=True))
     for side, theta in READINGS.items():
         assert [position[name] for name in names(side)] == list(theta)
         assert [effort[name] for name in names(side)] == list(EFFORT)
@@ -114,19 +128,16 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
 
     def is_complete():
         shown.append(viewer.markers)
-        wanted = {"1.50 Nm", "right: inactive", "left: inactive"}
+        texts = {marker.text for marker in shown[-1].values() if marker.type == Marker.TEXT_VIEW_FACING}
         is_tilted = ("gravity", 0) in shown[-1] and shown[-1]["gravity", 0].points  # a fresh tilt has arrived
-        return is_tilted and {group for group, _ in shown[-1]} == groups and wanted <= texts(shown[-1])
+        wanted = {"1.50 Nm", "right: inactive", "left: inactive"}
+        return is_tilted and {group for group, _ in shown[-1]} == groups and wanted <= texts
 
     viewer.wait_until(is_complete)
     assert {marker.header.frame_id for marker in shown[-1].values()} == {ROOT}
     arrow = shown[-1]["gravity", 0]
     forward, down = (getattr(arrow.points[1], axis) - getattr(arrow.points[0], axis) for axis in "xz")
     assert forward > 0 > down and forward / -down == pytest.approx(0.5463, abs=1e-3)  # tan of the pitch
-
-
-def test_an_arm_that_falls_silent_disappears_and_the_other_stays(nodes, viewer):
-    viewer.wait_until(lambda: len(viewer.states.name) == 8)
     viewer.sides = {"right"}
     viewer.wait_until(lambda: list(viewer.states.name) == names("right"))
     viewer.wait_until(lambda: not any(group.startswith("left") for group, _ in viewer.markers))

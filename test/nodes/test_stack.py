@@ -20,6 +20,7 @@ from sensor_msgs.msg import JointState
 from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.lab import processes
+from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, to_nanoseconds
 from exo_gravity.sim.script import TrialScript
@@ -47,15 +48,9 @@ def is_down(truth: Truth, since: float) -> bool:
 
 @pytest.mark.real_time
 @pytest.mark.timeout(300)  # twelve processes start one after another
-def test_an_arm_stays_follows_live_changes_and_is_let_down_whichever_node_dies(launch, probe, tmp_path, machine):
+def test_an_arm_stays_follows_live_changes_and_is_let_down_whichever_node_dies(launch, probe, tmp_path):
     # Under its own launcher, the compensator's death does not stop the other nodes.
     nodes = launch(without=("compensator",), timing=CALM, truth=True)
-    # A bridge that gets no processor is killed by its watchdog, as it must be: then there is nothing left to judge.
-    with machine.keeps_up(lambda: any("was frozen for" in line for line in nodes.log)):
-        carry_change_and_kill(nodes, launch, probe, tmp_path, machine)
-
-
-def carry_change_and_kill(nodes, launch, probe, tmp_path, machine):
     compensator = launch(without=WITHOUT_OTHERS, timing=CALM)
     truth, to_pose = Truth(nodes.truth_path()), tmp_path / "to_pose.yaml"
     to_pose.write_text(yaml.safe_dump({"name": "to_pose", "steps": [{"move": POSE, "over": 1.5}, {"hold": 60.0}]}))
@@ -67,27 +62,24 @@ def carry_change_and_kill(nodes, launch, probe, tmp_path, machine):
             sent.append((*(1e-9 * time for time in times), message.effort[1]))
 
     probe.node.create_subscription(JointState, "/right/effort_commands", on_efforts, 1000)
-    probe.get_carried()
-    with machine.keeps_up():
-        probe.bring_to(to_pose)
-        probe.states.clear()
-        released, seen = probe.joint_angles(), len(probe.joint_states)
-        probe.wait_until(lambda: len(probe.joint_states) > seen + 2.0 * RATE)
-        pose, efforts = probe.joint_angles(), probe.effort_commands[-1].effort
-        sent.clear()
-        assert probe.set_parameters("compensator", gain=HEAVIER).successful
-        target = gravity_torque(ROBOT, pose, TILT)[1] * HEAVIER[1]
-        probe.wait_until(lambda: probe.state != "active" or (sent and abs(sent[-1][2] - target) < 0.01))
-        assert set(probe.states) <= {"active"}
-    if set(probe.states) <= {"active"}:
-        assert np.degrees(np.abs(np.subtract(pose, released)).max()) < 0.5
-        np.testing.assert_allclose(efforts, gravity_torque(ROBOT, pose, TILT), rtol=0.0, atol=0.03)
-        # However long a process stood still: an answer is computed between the measurement that it answers and its
-        # sending, so no two are further apart than the sending of the second one and the measurement of the first one.
-        measured, answered, ramp = np.array(sent).T
-        assert np.ptp(ramp) > 0.1
-        rate = (abs(target - ramp[0]) + NOISE) / GUIDANCE.time
-        assert np.all(np.abs(np.diff(ramp)) < rate * (answered[1:] - measured[:-1]) + NOISE)
+    probe.bring_to(to_pose)
+    probe.states.clear()
+    released, seen = probe.joint_angles(), len(probe.joint_states)
+    probe.wait_until(lambda: len(probe.joint_states) > seen + 2.0 * RATE)
+    pose, efforts = probe.joint_angles(), probe.effort_commands[-1].effort
+    sent.clear()
+    assert probe.set_parameters("compensator", gain=HEAVIER).successful
+    target = gravity_torque(ROBOT, pose, TILT)[1] * HEAVIER[1]
+    probe.wait_until(lambda: probe.state != "active" or (sent and abs(sent[-1][2] - target) < 0.01))
+    assert set(probe.states) <= {"active"}
+    assert np.degrees(np.abs(np.subtract(pose, released)).max()) < 0.5
+    np.testing.assert_allclose(efforts, gravity_torque(ROBOT, pose, TILT), rtol=0.0, atol=0.03)
+    # However long a process stood still: an answer is computed between the measurement that it answers and its
+    # sending, so no two are further apart than the sending of the second one and the measurement of the first one.
+    measured, answered, ramp = np.array(sent).T
+    assert np.ptp(ramp) > 0.1
+    rate = (abs(target - ramp[0]) + NOISE) / GUIDANCE.time
+    assert np.all(np.abs(np.diff(ramp)) < rate * (answered[1:] - measured[:-1]) + NOISE)
 
     # No node maps another one's shared memory, on which it could block.
     for process in (*map(nodes.process, ("can_bridge", "simulator")), compensator.process("compensator")):
@@ -95,18 +87,15 @@ def carry_change_and_kill(nodes, launch, probe, tmp_path, machine):
         assert "librmw_fastrtps" in maps and "fastrtps_port" not in maps
 
     # Without a compensator the arm is let down, and only the operator clears the fault.
-    probe.get_carried()
-    with machine.keeps_up():
-        died = time.time()
-        compensator.process("compensator").kill()
-        probe.wait_until(lambda: probe.state == "fault")
-        assert probe.fault == "command_stale"
-        assert abs(probe.joint_angles()[2]) < 0.2 and is_down(truth, died)  # friction holds it there
-    fault = probe.fault
+    died = time.time()
+    compensator.process("compensator").kill()
+    probe.wait_until(lambda: probe.state == "fault")
+    assert probe.fault == "command_stale"
+    assert abs(probe.joint_angles()[2]) < 0.2 and is_down(truth, died)  # friction holds it there
     launch(without=WITHOUT_OTHERS, timing=CALM)
     probe.effort_commands.clear()
     probe.wait_until(lambda: len(probe.effort_commands) > 20)
-    assert (probe.state, probe.fault) == ("fault", fault)
+    assert (probe.state, probe.fault) == ("fault", "command_stale")
     assert "refused" in probe.enable(True).message
     assert probe.trigger("clear_fault").success
     probe.wait_until(lambda: probe.state == "disabled")
@@ -120,8 +109,7 @@ def carry_change_and_kill(nodes, launch, probe, tmp_path, machine):
     assert nodes.ended_node == ("/right/can_bridge", -signal.SIGKILL)
     assert nodes.launcher.maybe_powered == []
     assert any("the arm is down, its motors are off" in line for line in nodes.log)
-    with machine.keeps_up():
-        assert is_down(truth, died)
+    assert is_down(truth, died)
 
 
 @pytest.mark.real_time
@@ -130,7 +118,7 @@ def test_the_launcher_states_that_motors_may_still_be_powered(launch, probe, mon
     monkeypatch.setattr(processes, "DESCENT_TIMEOUT", 5.0)
     monkeypatch.setattr(processes, "RECOVERY", {"EXO_GRAVITY_RECOVER": "2"})
     nodes = launch(without=("imu",), compensator=NO_IMU)
-    probe.wait_until_carried()
+    probe.get_carried()
     (watchdog,) = children(nodes.pid("can_bridge"))
     assert probe.set_parameters("simulator", fault__bus_silent=True).successful
     nodes.stopping.set()
@@ -142,7 +130,7 @@ def test_the_launcher_states_that_motors_may_still_be_powered(launch, probe, mon
 
 @pytest.mark.real_time
 @pytest.mark.thorough
-def test_a_file_of_a47959f4_starts_and_its_arm_is_carried_once_a_person_has_confirmed_the_pose(launch, probe, machine):
+def test_a_file_of_a47959f4_starts_and_its_arm_is_carried_once_a_person_has_confirmed_the_pose(launch, probe):
     """The whole interface shows on the way."""
     launch(base=DATA / "a47959f4" / "sim.yaml", wearer=True)
     probe.wait_until(lambda: probe.state)
@@ -153,13 +141,12 @@ def test_a_file_of_a47959f4_starts_and_its_arm_is_carried_once_a_person_has_conf
     probe.wait_until(lambda: probe.diagnostic("can_bridge", POSE_TO_CONFIRM) not in (None, NO_POSE))
     assert probe.diagnostic("can_bridge", "waiting for") == "pose"
     assert probe.trigger("confirm_pose").success
-    with machine.keeps_up():
-        probe.wait_until(lambda: probe.state in ("active", "fault"))
-        keys = ("source", "motors", "fault", "waiting for", "request", "answer")
-        expected = ["simulated", "on", "none", "none", "confirm_pose", "done"]
-        probe.wait_until(lambda: [probe.diagnostic("can_bridge", key) for key in keys] == expected, timeout=10.0)
-        probe.wait_until(lambda: probe.diagnostic("compensator", "state") == "compensating")
-        probe.wait_until(lambda: probe.diagnostic("wearer", "state") == "estimating")
+    probe.wait_until(lambda: probe.state in ("active", "fault"))
+    keys = ("source", "motors", "fault", "waiting for", "request", "answer")
+    expected = ["simulated", "on", "none", "none", "confirm_pose", "done"]
+    probe.wait_until(lambda: [probe.diagnostic("can_bridge", key) for key in keys] == expected, timeout=10.0)
+    probe.wait_until(lambda: probe.diagnostic("compensator", "state") == "compensating")
+    probe.wait_until(lambda: probe.diagnostic("wearer", "state") == "estimating")
     assert {f"/right/{node}" for node in ("can_bridge", "compensator", "wearer", "simulator")} <= probe.statuses.keys()
     assert probe.enable(False).success
     probe.wait_until(
@@ -183,6 +170,26 @@ def test_a_compensator_without_a_parameter_file_starts_and_waits_for_joint_state
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 0
+
+
+@pytest.mark.thorough
+@pytest.mark.real_time
+def test_in_one_process_both_nodes_have_their_own_names_carry_the_arm_and_let_it_down(launch, probe):
+    nodes = launch(without=("imu",), timing=CALM, truth=True, compensator=NO_IMU, one_process=True)
+    probe.get_carried()
+    assert nodes.pid("compensator") == nodes.pid("can_bridge")
+    probe.wait_until(lambda: probe.status_contains("compensator", "compensating"))
+    dumped, given = probe.dump_parameters(["/right/compensator"]), load(nodes.path)["/right/compensator"]
+    assert dumped["/right/compensator"]["ros__parameters"]["link_length"] == given["link_length"]
+    assert probe.set_parameters("compensator", gain=[1.0, 1.05, 1.0, 1.0]).successful
+    published = [probe.joint_states.copy(), probe.effort_commands.copy()]
+    asked, answered = ({to_nanoseconds(each.header.stamp) for each in messages} for messages in published)
+    assert len(asked & answered) > 10  # both topics are published
+    assert any(line.startswith("/right/compensator: INFO compensating") for line in nodes.log)
+    nodes.process("can_bridge").send_signal(signal.SIGINT)
+    probe.wait_until(lambda: nodes.have_ended)
+    assert nodes.ended_node == ("/right/can_bridge", 0)
+    assert Truth(nodes.truth_path()).motors_are_off()
 
 
 @pytest.mark.thorough

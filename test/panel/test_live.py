@@ -64,7 +64,7 @@ def clinic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
         with chromium(gives_way=True) as browser:
             probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
             page = open_page(browser, url)
-            probe.wait_until_carried()  # last: a browser that starts can stall the simulated device
+            probe.get_carried()  # last: a browser that starts can stall the simulated device
             yield Clinic(folder / "out", page, nodes, probe)
     finally:
         probe.close()

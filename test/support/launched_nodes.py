@@ -26,7 +26,7 @@ from .ports import free_port, own_ports
 Parameters = Mapping[str, Any]
 
 PORTS = own_ports()
-GROUP, SECOND_GROUP = "239.74.163.2", "239.74.163.3"  # the second is that of an arm's second bus
+GROUP = "239.74.163.2"
 NO_IMU: Parameters = {"use_imu": False}  # for the compensator, which then starts without waiting for a tilt
 FAST: Parameters = {"sign_check_torque": 0.0}
 # Rate and time-outs of config/sim.yaml, which suit a busy machine, and those of a real device.
@@ -53,9 +53,9 @@ class LaunchedNodes:
     base: the file in config/. without: nodes to leave out, by the last part of their names. port: of the bus, a new one
     by default; the left arm's bus has the next one. timing: rate and time-outs by node, `SIMULATED`, `CALM` or `REAL`.
     changes: of the parameters, by node, for both arms; they come last, after `FAST` for the bridge. truth: whether
-    simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. two_buses: whether motors 3 and
-    4 are on a bus of their own, with the next port. wearer: whether a `wearer` runs beside each compensator, as for
-    users: most tests spare its processor time. The attribute `ended_node` is what `Launcher.run` returned.
+    simulators log the arm's true motion, at `truth_path`. one_process: of the launcher. wearer: whether a `wearer` runs
+    beside each compensator, as for users: most tests spare its processor time. The attribute `ended_node` is what
+    `Launcher.run` returned.
 
     Nodes that have started run before other processes, if permitted: others that start would keep them waiting.
     """
@@ -69,7 +69,6 @@ class LaunchedNodes:
         timing: Mapping[str, Parameters] = SIMULATED,
         truth: bool = False,
         one_process: bool = False,
-        two_buses: bool = False,
         wearer: bool = False,
         **changes: Parameters,
     ) -> None:
@@ -81,9 +80,6 @@ class LaunchedNodes:
             node, parameters = name.split("/")[-1], entry["ros__parameters"]
             if "can" in parameters:
                 parameters["can"]["options"]["port"] = port + name.startswith("/left")
-            if "can" in parameters and two_buses:
-                parameters["can"]["channel"] = ",".join((GROUP, GROUP, SECOND_GROUP, SECOND_GROUP))
-                parameters["can"]["options"]["port"] = [port, port, port + 1, port + 1]
             if truth and node == "simulator":
                 parameters["truth"] = str(self.truth_path(name))
             parameters.update(FAST if node == "can_bridge" else {})
@@ -92,13 +88,8 @@ class LaunchedNodes:
         unknown = set(changes) - {name.split("/")[-1] for name in content}
         assert not unknown, f"changes of nodes that are left out: {unknown}"
         given = (entry["ros__parameters"].get("can") for entry in content.values())
-        channel = next((can["channel"] for can in given if can), GROUP).split(",")[0]
-        self.bus: dict[str, Any] = {
-            "interface": "udp_multicast",
-            "channel": channel,
-            "port": port,
-            "hop_limit": 0,
-        }
+        channel = next((can["channel"] for can in given if can), GROUP)
+        self.bus: dict[str, Any] = {"interface": "udp_multicast", "channel": channel, "port": port, "hop_limit": 0}
         self.path = folder / f"params_{port}_{'_'.join(without)}.yaml"
         self.path.write_text(yaml.safe_dump(content))
         self.one_process = one_process
@@ -166,17 +157,16 @@ class LaunchedNodes:
 
     def _end_watchdogs(self) -> None:
         """End watchdogs that retry forever, because their simulated motors are gone, and remove their notes."""
-        port, first = self.bus["port"], self.bus["channel"]
-        own = ((first, port), (SECOND_GROUP, port + 1))
-        names = [f"{group}_{port}.bus" for group, port in own]
+        ports = (self.bus["port"], self.bus["port"] + 1)  # of the right and of the left arm
+        names = [f"{self.bus['channel']}_{port}.bus" for port in ports]
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 if b"ownership.watchdog" in (process / "cmdline").read_bytes() and any(
                     name in os.readlink(descriptor) for descriptor in (process / "fd").iterdir() for name in names
                 ):
                     os.kill(int(process.name), signal.SIGKILL)
-        for group, number in (*own, (first, port + 1)):
-            notes_file((self.bus["interface"], group, {"port": number})).unlink(missing_ok=True)
+        for port in ports:
+            notes_file((self.bus["interface"], self.bus["channel"], {"port": port})).unlink(missing_ok=True)
 
 
 def executable(name: str) -> str:

@@ -11,7 +11,10 @@ from typing import Any
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+
+from .waiting import wait_until
 
 InvalidHandle = rclpy_implementation.InvalidHandle
 
@@ -60,3 +63,33 @@ def own_node(name: str, namespace: str = "/right", **options: Any) -> Iterator[t
         yield thread.nodes[0], thread.executor
     finally:
         thread.close()
+
+
+class Served:
+    """A lifecycle node `served` with an executor, and a client node with another; nothing spins by itself."""
+
+    def __init__(self, client: Node, own: SingleThreadedExecutor, executor: type[SingleThreadedExecutor]) -> None:
+        self.client, self._own = client, own
+        self.node = LifecycleNode("served", namespace="/right", context=client.context, enable_logger_service=True)
+        self.executor = executor(context=client.context)
+        self.executor.add_node(self.node)
+
+    def send(self, kind: Any, name: str, request: Any) -> Any:
+        """Send a request to a service of the node; return the future of its response."""
+        client = self.client.create_client(kind, f"served/{name}")
+        wait_until(client.service_is_ready)
+        return client.call_async(request)
+
+    def spin(self) -> None:
+        """Let node and client each handle what has arrived."""
+        self.executor.spin_once(0.01)
+        self._own.spin_once(0.01)
+
+    def answer(self, future: Any) -> Any:
+        """Return the response of a request."""
+        wait_until(future.done, self.spin)
+        return future.result()
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()

@@ -186,11 +186,9 @@ class RosProbe:
                 self.enable(True)
             self.wait_for_report()
 
-    wait_until_carried = get_carried
-
     def bring_to(self, script: object) -> None:
         """Let the virtual wearer move the carried arm by the trial script at the path `script`, and release it."""
-        self.wait_until_carried()
+        self.get_carried()
         self.wearer_steps.clear()
         assert self.set_parameters("simulator", trial="").successful
         assert self.set_parameters("simulator", trial=str(script)).successful
