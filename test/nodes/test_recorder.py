@@ -219,15 +219,15 @@ def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_re
 def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_path):
     process = start(tmp_path / "bag", env=dict(os.environ, EXO_GRAVITY_SUPERVISED="1"))
     arm.wait_until(arm.is_recorded)
-    k, now = 0, time.monotonic()
-    death, end = now + 0.3, now + 1.3
-    while (now := time.monotonic()) < end:  # the bridge lets the arm down
-        arm.publish(k := k + 1)
-        if now > death:
-            process.stdin.close()  # the launcher has died
+    k = 0
+    for duration in (0.3, 1.0):
+        end, before = time.monotonic() + duration, k
+        while time.monotonic() < end:  # the bridge lets the arm down
+            arm.publish(k := k + 1)
+        process.stdin.close()  # the launcher has died
     assert process.poll() is None
     assert process.wait(PATIENCE) == 0
-    assert round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0] / STEP) == k
+    assert before < round(recorded(tmp_path / "bag", "/right/joint_states")[-1][1].position[0] / STEP) <= k
     assert (tmp_path / "bag" / "metadata.yaml").exists()
 
 
