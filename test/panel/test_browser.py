@@ -96,27 +96,17 @@ def test_an_arm_is_enabled_or_activated_after_one_question_about_the_settings_in
         assert stage.arms.calls[-1] == (does, "right")
 
 
-ASTRAY = {"joints outside limits": "right_elbow_flexion", "turn back (deg)": "-0.1"}
-
-
-def test_a_start_that_waits_says_for_what_in_degrees_and_asks_whether_the_arm_hangs_so(visit, stage):
-    stage.arms.states["right"], stage.arms.reports["right"] = "checking", {"waiting for": "joint_limits", **ASTRAY}
-    page = visit()
-    wait_for_text(page, of_arm(".sentence"), "Elbow flexion: turn it back by 0.1°.")
-    page.click(of_arm(".home"))  # of a simulated arm
-    stage.arms.reports["right"], stage.arms.asked["right"] = {}, "0, -2, 1, 23"
+def test_a_start_asks_whether_the_arm_hangs_as_it_is_drawn(page, stage):
+    stage.arms.states["right"], stage.arms.asked["right"] = "checking", "0, -2, 1, 23"
     question = page.locator('.pose[data-arm="right"]')
     question.wait_for()
     assert "Elbow flexion 23°" in question.inner_text() and not page.is_visible('.pose[data-arm="left"]')
+    page.click(of_arm(".home"))  # of a simulated arm
     page.evaluate("scrollTo(0, 0)")
     page.click(of_arm(".look"))
     assert page.locator("#picture").evaluate("picture => picture.getBoundingClientRect().top < innerHeight / 2")
     question.get_by_role("button").click()
     question.wait_for(state="hidden")
-    stage.arms.states["right"] = "disabled"
-    for refusal, said in (("joint_limits", "Elbow flexion"), ("motor_on", "A motor was on already.")):
-        stage.arms.reports["right"] = {"refusal": refusal, **(ASTRAY if refusal == "joint_limits" else {})}
-        wait_for_text(page, of_arm(".sentence"), "The motors stayed off.", said)
     stage.arms.states["right"] = "active"
     wait_for_state(page, "active")
     assert page.is_disabled(of_arm(".home"))
@@ -178,14 +168,27 @@ def test_one_arm_alone_can_be_let_down_and_what_is_not_confirmed_is_an_alarm(pag
 
 # 3. A fault
 
+ELBOW, ABDUCTION = "right_elbow_flexion", "right_shoulder_abduction"
 FINE = {"longest stall (ms)": "3", "longest silence (ms)": "14", "disconnected": "no"}
 BUSY = {**FINE, "longest silence (ms)": "212"}
 CUT_OFF = "Hold the arm and press the emergency stop."
-OF_ELBOW = {"right": {"fault joint": "right_elbow_flexion"}}
-# What a fault and the devices say, what its operator is told, and what not.
+ASTRAY = {"joints outside limits": ELBOW, "turn back (deg)": "-0.1"}
+OUTSIDE = {"reports": {"right": {"waiting for": "joint_limits", **ASTRAY}}}
+STAYED = "The motors stayed off."
+
+
+def moving(joint: str, speed: float) -> dict[str, Any]:
+    """Return how an arm sinks by `speed` rad/s while the load of a joint changes."""
+    return {"compensator": {"changing load": joint}, "sinking": speed}
+
+
+# The right arm's state or fault, what else the devices say, what its operator is told, and what not.
 TOLD: list[tuple[str, dict[str, Any], tuple[str, ...], str]] = [
+    ("checking", OUTSIDE, ("Elbow flexion: turn it back by 0.1°.",), STAYED),
+    ("disabled", {"reports": {"right": {"refusal": "joint_limits", **ASTRAY}}}, (STAYED, "Elbow flexion"), "already"),
+    ("disabled", {"reports": {"right": {"refusal": "motor_on"}}}, (STAYED, "A motor was on already."), "flexion"),
     (
-        "over_temperature", {"reports": OF_ELBOW},
+        "over_temperature", {"reports": {"right": {"fault joint": ELBOW}}},
         ("Elbow flexion: A motor is too hot", "Wait until it has cooled", "Then press Clear fault."), "changed",
     ),
     ("motor_silent", {}, ("CAN cable",), "busy"),
@@ -200,16 +203,23 @@ TOLD: list[tuple[str, dict[str, Any], tuple[str, ...], str]] = [
         "command_withdrawn", {"compensator": {"state": "withdrawn", "reason": "late_tilt"}},
         ("The compensator stopped.", "tilt is late"), "engineer",
     ),
+    ("active", {}, ("Carrying", "The arm is carried."), "stopped"),
+    ("active", moving(ELBOW, 0.2), ("Sinking", "The load is changing"), "The arm is carried."),
+    ("active", moving(ELBOW, -0.2), ("Moving", "The load is changing"), "The arm is carried."),
+    ("active", moving("none", -0.2), ("Moving", "If the wearer does not move it"), "The arm is carried."),
 ]  # fmt: skip
 
 
-def test_each_fault_says_what_happened_and_what_to_do(page, stage):
-    for code, devices, told, untold in TOLD:
-        for name, value in {"reports": {}, "compensator": {}, "simulator": FINE, **devices}.items():
+def test_each_state_and_fault_says_what_happens_and_what_to_do(page, stage):
+    usual = {"reports": {}, "compensator": {}, "simulator": FINE, "sinking": 0.0}
+    for state, devices, told, untold in TOLD:
+        for name, value in {**usual, **devices}.items():
             setattr(stage.arms, name, value)
-        stage.arms.fail("right", code)
-        wait_for_text(page, of_arm(".tell"), *told)
-        assert untold not in page.inner_text(of_arm(".tell")), code
+        stage.arms.fail("right", state)
+        if state in ("checking", "disabled", "active"):
+            stage.arms.states["right"], stage.arms.faults = state, {}
+        wait_for_text(page, of_arm(".lead"), *told)
+        assert untold not in page.inner_text(of_arm(".lead")), state
 
 
 def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_cleared_or_resumed(visit, stage):
@@ -333,7 +343,6 @@ def test_a_load_is_weighed_after_a_question_and_carried_after_another(page, stag
 
 # 5. What the arms do
 
-ELBOW, ABDUCTION = "right_elbow_flexion", "right_shoulder_abduction"
 SHARE, BAND = "share of the wearer (%)", "share band (%)"
 # The share that is reported with its band, and the text of the bar, its part and its band as shares of the bar.
 SHARES = [("111", "9", "111 %", 1.0, None), ("40", "10", "40 %", 0.4, 0.2), ("-30", "10", "-30 %", 0.0, None)]
@@ -363,25 +372,12 @@ def test_the_share_that_the_wearer_carries_is_shown_with_its_band_while_it_means
     assert page.inner_text(figure) == "–"
 
 
-# The joint whose load changes, rad/s at which the arm sinks, and what is shown where.
-MOTIONS = [
-    (ELBOW, 0.2, ".state", "Sinking"),
-    (ELBOW, -0.2, ".state", "Moving"),
-    (ELBOW, -0.2, ".sentence", "The load is changing"),
-    ("none", -0.2, ".remedy", "If the wearer does not move it"),
-    ("none", 0.0, ".state", "Carrying"),
-    ("none", 0.0, ".sentence", "The arm is carried."),
-]
-
-
-def test_an_arm_that_moves_is_not_called_carried_and_a_plot_without_a_curve_says_why(visit, stage):
-    stage.arms.states["right"], stage.arms.silent = "active", {"left"}
-    stage.arms.reports["right"] = {f"right_{leaf} temperature (degC)": "unknown" for leaf in PARTS}
+def test_a_plot_without_a_curve_says_why_and_all_are_as_wide_as_their_place(visit, stage):
+    stage.arms.silent = {"left"}
+    stage.arms.reports["right"] = {f"right_{part} temperature (degC)": "unknown" for part in PARTS}
     page = visit(width=1280)  # two plots in a row
     wait_for_text(page, "#plots-blank", "Left arm: Blank: no angles have arrived")
     wait_for_text(page, ".blank", "report no temperature")
-    for stage.arms.compensator["changing load"], stage.arms.sinking, place, text in MOTIONS:
-        wait_for_text(page, of_arm(place), text)
     stage.arms.reports.clear()
     stage.arms.silent = set()
     wait_until(page, lambda: page.locator(".blank:has-text('temperature')").count() == 0)
@@ -569,7 +565,7 @@ def test_at_1280_by_800_a_training_is_on_one_screen_and_on_a_phone_the_remedy_co
 
 
 def test_the_page_is_german_when_its_user_or_their_browser_wants_it(page, browser, stage):
-    stage.arms.states["right"], stage.arms.reports["right"] = "checking", {"waiting for": "joint_limits", **ASTRAY}
+    stage.arms.states["right"], stage.arms.reports = "checking", OUTSIDE["reports"]
     page.select_option("#language", "de")
     wait_for_text(page, of_arm(".sentence"), "Ellenbogen Beugung: um 0,1° zurückdrehen.")
     texts = page.inner_text("body")
