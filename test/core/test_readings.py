@@ -16,7 +16,6 @@ import pytest
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, MotorLoad
-from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.gate import SwitchOnCheck
 from exo_gravity.core.safety.power import MotorPower, Power, PowerChange
 from exo_gravity.core.safety.trust import Readings
@@ -317,6 +316,13 @@ TOLD = {  # changes; then whether each reply says that the motor is on, None for
             (False, lambda power: power.is_told_off),
         ],
     ),
+    "a motor has left once it says so, and not before": (  # it did not hear EXIT at first
+        (*IS_ON, PowerChange.SWITCH_OFF),
+        [
+            *[(True, lambda power: power.state is Power.LEAVING)] * 20,
+            (False, lambda power: power.state is Power.OFF),
+        ],
+    ),
     "silence takes back what was told": (
         IS_ON, [(on, lambda power: not power.is_told_off) for on in (False, None, False)],
     ),
@@ -335,18 +341,6 @@ def test_replies_that_say_whether_a_motor_is_on_are_believed_as_the_row_says(nam
     for change in changes:
         power.change(change)
     for n, (on, holds) in enumerate(replies, 1):
+        power.send((n - 1) * PERIOD)
         tell(power, n * PERIOD, on)
         assert holds(power), (n, power.state)
-
-
-def test_a_motor_has_left_once_it_says_so_and_not_before() -> None:
-    power = MotorPower(replies=True)
-    for change in (*IS_ON, PowerChange.SWITCH_OFF):
-        power.change(change)
-    for n in range(20):  # it did not hear EXIT
-        assert power.send(n * PERIOD) is Send.EXIT
-        tell(power, (n + 1) * PERIOD, True)
-    assert power.state is Power.LEAVING
-    power.send(20 * PERIOD)
-    tell(power, 21 * PERIOD, False)
-    assert power.state is Power.OFF
