@@ -40,26 +40,21 @@ from ..support.simulated_device import OFF, drive_of, joints_of, make_device, se
 from ..support.waiting import PATIENCE, pause, wait_until
 from .test_motor_bus import WEIGHTLESS
 
-BITRATES = {"S0": 10, "S1": 20, "S2": 50, "S3": 100, "S4": 125, "S5": 250, "S6": 500, "S7": 800, "S8": 1000}  # kbit/s
-OK, REFUSED = b"\r", b"\a"
 FRAME_SENT = (b"z\r", b"Z\r")  # with an 11-bit or a 29-bit ID
 
 
 class FakeSlcan:
     """A LAWICEL adapter, plugged in at `path` until `close`; `bus` is its wire.
 
-    Commands end with a carriage return (Lawicel, CANUSB manual): S0 to S8 set the bit rate, O opens, L opens for
-    listening only, C closes; each is acknowledged with a carriage return. tiiildd.. and Tiiiiiiiildd.. send a frame
-    with an 11-bit or a 29-bit ID and are acknowledged with z or Z; received frames arrive in the same form. A command
-    that is refused is answered with BEL.
+    Commands end with a carriage return (Lawicel, CANUSB manual): S0 to S8 set the bit rate, 1 Mbit/s last, O opens, C
+    closes; each is acknowledged with a carriage return. tiiildd.. and Tiiiiiiiildd.. send a frame with an 11-bit or a
+    29-bit ID and are acknowledged with z or Z; received frames arrive in the same form.
 
-    kbit_s: bit rate that was set. is_open: whether O was received. passed: frames of the program that were sent and
-    acknowledged.
+    bit_rate: the command that set it. is_open: whether O was received. passed: frames of the program that were sent.
     """
 
     def __init__(self, path: Path, bus: can.BusABC) -> None:
-        self.kbit_s = 0
-        self.passed = 0
+        self.bit_rate, self.passed = "", 0
         self.acknowledges = True
         self._path = path
         self._bus = bus
@@ -116,21 +111,14 @@ class FakeSlcan:
             os.write(self._master, data)
 
     def _obey(self, line: str) -> bytes:
-        if line in BITRATES and not self.is_open:
-            self.kbit_s = BITRATES[line]
-        elif line in ("O", "L", "C"):
-            self.is_open = line != "C"
-        elif line[:1] in ("t", "T") and self.is_open:
-            digits = 3 if line[0] == "t" else 8
-            data = bytes.fromhex(line[digits + 2 :])
-            if len(data) != int(line[digits + 1]):
-                return REFUSED
-            frame_id = int(line[1 : digits + 1], 16)
-            self._bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=digits == 8))
-            return FRAME_SENT[digits == 8]
-        elif line:
-            return REFUSED
-        return OK
+        self.bit_rate = line if line.startswith("S") else self.bit_rate
+        self.is_open = line == "O" or (self.is_open and line != "C")
+        if line[:1] not in ("t", "T"):
+            return b"\r"
+        digits = 3 if line[0] == "t" else 8
+        frame_id, data = int(line[1 : digits + 1], 16), bytes.fromhex(line[digits + 2 :])
+        self._bus.send(can.Message(arbitration_id=frame_id, data=data, is_extended_id=digits == 8))
+        return FRAME_SENT[digits == 8]
 
 
 def _line(message: can.Message) -> bytes:
@@ -303,7 +291,7 @@ def test_frames_pass_the_adapter_both_ways_also_once_it_was_unplugged_and_plugge
         assert motors.exchange(ON, within())
     assert [sample.position for sample in motors.samples] == pytest.approx(POSE, abs=0.01)
     assert [sample.effort for sample in motors.samples] == pytest.approx(ON.effort, abs=0.02)
-    assert device.powered and adapter.kbit_s == 1000 and not motors.ignored
+    assert device.powered and adapter.bit_rate == "S8" and not motors.ignored
     adapter.unplug()
     error = ""
     while "opening it again" not in error:  # the first errors are not yet a failed bus
