@@ -32,7 +32,8 @@ SPRING = {"terms": TermSettings(spring=Spring((4.0, 14.0, 7.0, 3.9), (0.0, 0.0, 
 CLAMPED = {"max_effort": (0.5,) * 4}
 HALVED = {"robot": ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)}
 
-guided_arm = partial(raised_usual_arm, rate=RATE)
+BARE = {"pose": RAISED, "has_wearer": False, "mode": "one_g"}
+guided_arm = partial(raised_usual_arm, rate=RATE, peak=PEAK, use_imu=True)  # with few options: each takes seconds
 
 
 def fastest_driven(arm: CarriedArm) -> float:
@@ -127,19 +128,19 @@ def test_an_empty_arm_whose_load_is_not_as_believed_when_it_is_carried_again_mov
     assert 0.1 < fastest_driven(arm) < SAFE_SPEED
 
 
-LOOSE = [({"pose": RAISED, "has_wearer": False, "mode": "one_g"}, 30.0), ({}, 30.0), ({}, 60.0)]
+LOOSE = [(BARE, 30.0), ({}, 30.0), ({}, 60.0)]
 
 
 @pytest.mark.parametrize(("given", "roll"), quick(LOOSE[:1], LOOSE), ids=["empty, 30 degrees", "worn, 30", "worn, 60"])
 def test_an_imu_that_comes_loose_drives_the_arm_slowly(given, roll):
-    arm = guided_arm(peak=PEAK, use_imu=True, **given)
+    arm = guided_arm(**given)
     ACTS["imu_wrong"](arm, 0.0, math.radians(roll), 0.2)
     arm.run(4.2)
     assert 0.1 < fastest_driven(arm) < SAFE_SPEED
 
 
 def test_a_trunk_that_falls_takes_the_arm_along_and_one_that_bows_is_not_felt():
-    arm, damped = usual_arm(rate=RATE, use_imu=True), []
+    arm, damped = guided_arm(), []
     for angle, duration in ((0.5, 1.0), (0.0, 1.0), (1.4, 0.8)):
         arm.forget()
         arm.act({"bow": angle, "over": duration})
@@ -161,8 +162,7 @@ UPON = [(True, [*WORN, *LEFT]), (False, [ZERO_G, ONE_G] * 4), (False, ALL)]
     ("has_wearer", "changes"), quick([UPON[0], UPON[2]], UPON), ids=["worn", "mode", "gain, mode and max_effort"]
 )
 def test_changes_upon_changes_are_as_calm_as_one(has_wearer, changes):
-    worn = {} if has_wearer else {"has_wearer": False, "mode": "one_g"}
-    arm = guided_arm(pose=RAISED, peak=PEAK, **worn)
+    arm = guided_arm(**({"pose": RAISED} if has_wearer else BARE))
     for change in changes:
         arm.change(**change)
         arm.run(0.3)
@@ -172,7 +172,7 @@ def test_changes_upon_changes_are_as_calm_as_one(has_wearer, changes):
 
 
 def test_one_wrong_velocity_takes_no_load_from_the_hand():
-    arm = guided_arm(peak=PEAK)
+    arm = guided_arm()
     arm.lead(Leading(CARRIED_IN, 0.0))
     arm.device.arm.carry(2.0)
     arm.change(payload_mass=2.0)
