@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core.arm.wearer import Wearer
@@ -26,6 +25,7 @@ from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio
 
 from .support import ROBOT, ROOT
+from .support.node_thread import NodeThread
 from .support.waiting import wait_until
 
 LOAD = Wearer(body_mass=75.0).on_links(ROBOT.length)
@@ -125,34 +125,24 @@ def test_the_cascade_follows_what_is_surely_the_wearers_within_its_bounds_and_da
     assert after(9.0, still, [99.0, -99.0, 99.0, 99.0], deviation=0.0).tolist() == [1.0, -2.0, 1.0, 1.0]  # as a spring
 
 
-class Environment:
-    """A node that plays what is around an example's node, made by `make`."""
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        self.node, self.executor = rclpy.create_node("environment", namespace="/right"), SingleThreadedExecutor()
-        self.heard: list[JointState] = []
-        self.node.create_subscription(JointState, "assist_efforts", self.heard.append, 10)
-        self.example = make()
-        for node in (self.example, self.node):
-            self.executor.add_node(node)
-
-    def spin(self) -> None:
-        self.executor.spin_once(timeout_sec=0.1)
-
-    def assert_silent(self) -> None:
-        """Assert that no efforts come any more, but for those on their way."""
-        for seconds in (0.5, 0.3):
-            count, end = len(self.heard), time.monotonic() + seconds
-            wait_until(lambda end=end: time.monotonic() > end, self.spin)
-        assert len(self.heard) == count
-
-
 @pytest.fixture
 def around():
-    """What plays the surroundings of a node."""
-    rclpy.init()
-    yield Environment
+    """A node that plays what is around an example's node, and the efforts that it heard."""
+    rclpy.init()  # for the example
+    thread, heard = NodeThread("environment", namespace="/right"), list[JointState]()
+    thread.nodes[0].create_subscription(JointState, "assist_efforts", heard.append, 10)
+    thread.start()
+    yield thread.nodes[0], heard
+    thread.close()
     rclpy.shutdown()
+
+
+def assert_silent(heard: list[JointState], spin: Callable[[], object]) -> None:
+    """Assert that no efforts come any more, but for those on their way."""
+    for seconds in (0.5, 0.3):
+        count, end = len(heard), time.monotonic() + seconds
+        wait_until(lambda end=end: time.monotonic() > end, spin)
+    assert len(heard) == count
 
 
 @pytest.mark.thorough
@@ -164,14 +154,16 @@ def test_the_cascade_node_assists_an_arm_of_three_joints_only_while_the_wearers_
         "wearer_efforts": JointState(name=names, effort=[0.0, 2.0, 0.0]),
         "wearer_efforts_std": JointState(name=names, effort=[0.1] * 3),
     }
-    arm = around(lambda: example("admittance.py")["AdmittanceNode"]("/right", names, carried.settings))
-    publishers = {topic: arm.node.create_publisher(JointState, topic, 1) for topic in parts}
-    timers = [arm.node.create_timer(0.01, partial(publishers[topic].publish, parts[topic])) for topic in parts]
-    wait_until(lambda: any(message.effort[1] > 0.5 for message in arm.heard), arm.spin)
-    newest = arm.heard[-1]
+    node, heard = around
+    cascade = example("admittance.py")["AdmittanceNode"]("/right", names, carried.settings)
+    spin = partial(rclpy.spin_once, cascade, timeout_sec=0.1)
+    publishers = {topic: node.create_publisher(JointState, topic, 1) for topic in parts}
+    timers = [node.create_timer(0.01, partial(publishers[topic].publish, parts[topic])) for topic in parts]
+    wait_until(lambda: any(message.effort[1] > 0.5 for message in heard), spin)
+    newest = heard[-1]
     assert list(newest.name) == list(names) and newest.effort[0] == newest.effort[2] == 0.0
     timers[1].cancel()
-    arm.assert_silent()
+    assert_silent(heard, spin)
 
 
 @pytest.mark.parametrize(("volts", "activation"), [(0.01e-3, 0.0), (0.21e-3, 0.5), (0.9e-3, 1.0)])
@@ -185,15 +177,16 @@ def test_a_muscle_is_as_active_as_its_mean_rectified_signal_on_whatever_offset(v
 @pytest.mark.thorough
 def test_the_biceps_bends_and_the_triceps_stretches_the_elbow_and_without_emg_nothing_is_sent(around, capfd):
     variables = example("emg_assistance.py")
-    arm = around(variables["EmgAssistance"])
-    arm.example.report()
+    (_, heard), muscles = around, variables["EmgAssistance"]()
+    spin = partial(rclpy.spin_once, muscles, timeout_sec=0.1)
+    muscles.report()
     assert "waiting for /emg (std_msgs/Float32MultiArray" in capfd.readouterr().err
-    before = set(arm.example.timers)
-    variables["pretend"](arm.example)
+    before = set(muscles.timers)
+    variables["pretend"](muscles)
     for sign in (1.0, -1.0):
-        wait_until(lambda sign=sign: any(sign * message.effort[3] > 1.0 for message in arm.heard), arm.spin)
-    assert arm.heard[-1].name[3] == "right_elbow_flexion"
-    assert not any(any(message.effort[:3]) for message in arm.heard)
-    for timer in set(arm.example.timers) - before:
+        wait_until(lambda sign=sign: any(sign * message.effort[3] > 1.0 for message in heard), spin)
+    assert heard[-1].name[3] == "right_elbow_flexion"
+    assert not any(any(message.effort[:3]) for message in heard)
+    for timer in set(muscles.timers) - before:
         timer.cancel()
-    arm.assert_silent()
+    assert_silent(heard, spin)

@@ -81,13 +81,14 @@ def test_an_arm_is_enabled_or_activated_after_one_question_about_the_settings_in
     wait_for_text(page, "#ask-text", "2.0 % of the wearer")
     assert stage.arms.calls == []
     # Let down ends an enable whose settings are still being read.
-    stage.arms.delay, reads = 1.0, stage.arms.reads
+    stage.arms.holds, reads = True, stage.arms.reads
     page.click("#ask-yes")
     page.keyboard.press("Space")
+    wait_until(page, lambda: stage.arms.calls == BOTH_DOWN)
+    stage.arms.holds = False
     wait_until(page, lambda: stage.arms.reads > reads)
     page.evaluate(HANDLED)
     assert stage.arms.calls == BOTH_DOWN and not page.is_visible("#ask")
-    stage.arms.delay = 0.0
     for state, does in (("disabled", "enable"), ("inactive", "activate")):
         stage.arms.states["right"] = state
         wait_for_text(page, of_arm(".remedy"), "press Enable")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -26,16 +25,6 @@ from ..support.panel_browser import IN_BROWSER, chromium, enable, open_page, wai
 pytestmark = [*IN_BROWSER, pytest.mark.real_time]
 
 
-@dataclass
-class Clinic:
-    """The nodes with a panel, a probe, and the page; out: where the panel writes."""
-
-    out: Path
-    page: Page
-    nodes: LaunchedNodes
-    probe: RosProbe
-
-
 RECORDING = 50_000  # bytes of a file into which joint states are written
 LONG = {"name": "long", "steps": [{"move": [0.0, 0.3, 0.3, 0.3], "over": 1.0}, {"hold": 120.0}]}
 AWAY = {"name": "away", "steps": [{"move": [0.0, 0.9, 0.6, 0.8], "over": over} for over in (2.0, 60.0)]}
@@ -49,15 +38,14 @@ def panel_diagnostics(bag: Path) -> list[str]:
     return [status.message for array in arrays for status in array.status if status.name == "panel"]
 
 
-@pytest.fixture(scope="module")
-def clinic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
-    """The nodes of the right arm, with trials, and the open page; one set of them for all tests."""
-    folder = tmp_path_factory.mktemp("clinic")
-    (folder / "scripts").mkdir()
-    (folder / "scripts" / "long.yaml").write_text(yaml.safe_dump(LONG))
-    (folder / "away.yaml").write_text(yaml.safe_dump(AWAY))
-    nodes = LaunchedNodes(folder, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
-    url = nodes.add_panel(trials=str(folder / "scripts"))
+@pytest.fixture
+def clinic(tmp_path: Path) -> Iterator[tuple[LaunchedNodes, RosProbe, Page]]:
+    """The nodes of the right arm, which is carried, with trials; a probe, and the open page."""
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "scripts" / "long.yaml").write_text(yaml.safe_dump(LONG))
+    (tmp_path / "away.yaml").write_text(yaml.safe_dump(AWAY))
+    nodes = LaunchedNodes(tmp_path, compensator={"wearer": {"body_mass": 60.0}, "support": 0.0}, wearer=True)
+    url = nodes.add_panel(trials=str(tmp_path / "scripts"))
     nodes.start()
     probe = RosProbe()
     try:
@@ -65,20 +53,15 @@ def clinic(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Clinic]:
             probe.wait_until(lambda: any("the panel is at" in line for line in nodes.log))
             page = open_page(browser, url)
             probe.get_carried()  # last: a browser that starts can stall the simulated device
-            yield Clinic(folder / "out", page, nodes, probe)
+            yield nodes, probe, page
     finally:
         probe.close()
         nodes.stop()
         print("\n".join(nodes.log))
 
 
-def let_down(page: Page) -> None:
-    page.keyboard.press("Space")
-    wait_for_state(page, "disabled")
-
-
-def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
-    page, probe, out = clinic.page, clinic.probe, clinic.out
+def test_a_session_is_recorded_and_reported_an_arm_put_back_and_the_panels_death_changes_nothing(clinic, tmp_path):
+    (nodes, probe, page), out = clinic, tmp_path / "out"
     page.click("#record")
     page.wait_for_selector("#record-stop:enabled")
     probe.wait_until(lambda: any(path.stat().st_size > RECORDING for path in out.glob("recording_*/bag/*.mcap")))
@@ -88,7 +71,8 @@ def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
     page.focus(".support input:enabled")
     page.keyboard.press("ArrowRight")
     probe.wait_until(lambda: float(probe.diagnostic("compensator", "support") or 0.0) == pytest.approx(0.005))
-    let_down(page)
+    page.keyboard.press("Space")
+    wait_for_state(page, "disabled")
     page.click("#record-stop")
     page.wait_for_selector("#record:enabled")
     (recording,) = out.glob("recording_*")
@@ -98,17 +82,12 @@ def test_what_the_operator_does_is_recorded_logged_and_saved(clinic):
     page.wait_for_selector("#saved:has-text('params.yaml')")
     (saved,) = out.glob("parameters_*/params.yaml")
     assert yaml.safe_load(saved.read_text())["/right/compensator"]["ros__parameters"]["mode"] == "zero_g"
-    assert probe.set_parameters("simulator", trial=str(out.with_name("away.yaml"))).successful
+    # An arm that hangs astray is put back.
+    assert probe.set_parameters("simulator", trial=str(tmp_path / "away.yaml")).successful
     probe.wait_until(lambda: probe.joint_states[-1].position[1] > 0.8)
-    page.click(".home")  # an arm that hangs astray is put back
+    page.click(".home")
     probe.wait_until(lambda: max(map(abs, probe.joint_states[-1].position)) < 0.15)
-    enable(page)
-    wait_for_state(page, "active")
-
-
-def test_a_trial_that_is_stopped_is_reported_with_subject_and_marker_and_the_panels_death_changes_nothing(clinic):
-    page, probe = clinic.page, clinic.probe
-    let_down(page)
+    # A trial of a subject, with a marker, is stopped and reported.
     page.fill("#session [name=subject]", "P01")
     page.click("#session button:not([type])")
     page.wait_for_selector("#session-text:has-text('P01')")
@@ -121,14 +100,14 @@ def test_a_trial_that_is_stopped_is_reported_with_subject_and_marker_and_the_pan
     page.wait_for_selector("#message:has-text('marker')")
     page.click("#trial-stop")
     page.wait_for_selector("#trial-report:visible")
-    (trial,) = clinic.out.glob("P01/*-*-*/long_*")
+    (trial,) = out.glob("P01/*-*-*/long_*")
     bag = read_bag(trial / "bag")
     assert bag.session.subject == "P01" and [marker.text for marker in bag.markers] == ["marker"]
     report = (trial / "report.html").read_text(encoding="utf-8")
     assert "stopped by the operator" in report and "Subject: P01" in report
-    assert any("wearer: done" in line for line in clinic.nodes.log)
-    clinic.nodes.process("/panel").kill()  # the last test: the panel does not start again
+    assert any("wearer: done" in line for line in nodes.log)
+    nodes.process("/panel").kill()
     wait_for_state(page, "unseen")
     seen = len(probe.joint_states)
     probe.wait_until(lambda: len(probe.joint_states) > seen + 200)  # 2 s
-    assert probe.state == "active" and not clinic.nodes.have_ended
+    assert probe.state == "active" and not nodes.have_ended

@@ -66,7 +66,7 @@ class PlayedArms:
     reports: dict[str, dict[str, str]] = field(default_factory=dict)  #: further keys of the bridges, by arm
     #: settings that the panel still shows of an arm, in place of those in force
     shown: dict[str, dict[str, Any]] = field(default_factory=dict)
-    delay: float = 0.0  #: s until the settings are read
+    holds: bool = False  #: whether the settings are not read yet
     reads: int = 0  #: how often they were
     silent: set[str] = field(default_factory=set)  #: arms of which no joint states arrive
     #: what the simulators report
@@ -93,7 +93,8 @@ class PlayedArms:
         return self.others.get(arm, "")
 
     async def settings_of(self, arm: str) -> dict[str, Any]:
-        await asyncio.sleep(self.delay)
+        while self.holds:
+            await asyncio.sleep(0.01)
         self.reads += 1
         if self.problem:
             raise ExoGravityError(self.problem)
