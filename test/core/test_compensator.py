@@ -17,6 +17,8 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
 from exo_gravity.core.compensation.support import NAME, REQUEST
+from exo_gravity.core.compensation.terms.catalogue import Spring
+from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.trunk.inputs import TILT
@@ -92,17 +94,22 @@ def test_after_a_break_nothing_is_left_of_a_change():
     assert answer.effort == pytest.approx(gravity_torque(ROBOT, THETA)) and answer.remainder == ()
 
 
-def test_a_change_of_mode_reaches_the_arm_without_a_step():
+SPRING = TermSettings(spring=Spring((2.0, 4.0, 2.0, 1.0), pose=(0.5, 0.3, 0.3, 0.4), max_effort=(1.0,) * 4))
+
+
+@pytest.mark.parametrize(
+    "change", [{"mode": "zero_g"}, {"max_effort": (0.5,) * 4}, {"terms": SPRING}], ids=["mode", "limits", "a spring"]
+)
+def test_a_change_reaches_the_arm_without_a_step_and_is_taken_back_as_gently(change):
     run = CompensatorRun()
-    run.cycle(1.5)
-    run.efforts.clear()
-    run.compensator.apply(settings_with(mode="zero_g"))
-    one, two = (gravity_torque(settings_with(mode=mode).arm, THETA) for mode in ("one_g", "zero_g"))
-    duration = np.maximum(GUIDANCE.time, np.abs(two - one) / GUIDANCE.rate)
-    run.cycle(0.5)
-    np.testing.assert_allclose(run.efforts[-1], one + 0.5 / duration * (two - one), rtol=0.01)
-    run.cycle(duration.max() - 0.5 + PERIOD)
-    np.testing.assert_allclose(run.efforts[-1], two, rtol=1e-12)
+    one, two = (np.array(each.cycle(1.5).effort) for each in (run, CompensatorRun(**change)))
+    for settings, before, after in ((settings_with(**change), one, two), (settings_with(), two, one)):
+        run.compensator.apply(settings)
+        duration = np.maximum(GUIDANCE.time, np.abs(after - before) / GUIDANCE.rate)
+        run.cycle(0.5)
+        np.testing.assert_allclose(run.efforts[-1], before + 0.5 / duration * (after - before), atol=0.02)
+        run.cycle(duration.max() - 0.5 + PERIOD)
+        np.testing.assert_allclose(run.efforts[-1], after, rtol=1e-12)
     assert run.largest_step <= GUIDANCE.rate * PERIOD * 1.001
 
 
