@@ -9,7 +9,7 @@ changes the torque: what changes it by more than a few per cent is refused, the 
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
@@ -94,7 +94,7 @@ def links_of(root: Element, model: Any) -> Iterator[Link]:
         products = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         inertia = tuple(float(parts.get("inertia", {}).get(own, "0")) for own in products)
         is_drawn = any(link.find(shape) is not None for shape in SHAPES)
-        joint = model.frames[model.getBodyId(name)].parentJoint
+        joint = model.frames[model.getBodyId(name)].parentJoint if model.existBodyName(name) else 0
         yield Link(name, float(mass), tuple(map(float, cog.split())), inertia, is_drawn, joint)
 
 
@@ -147,22 +147,14 @@ def mimics_of(robot: Element) -> dict[str, dict[str, str]]:
     return {joint.get("name", ""): mimic.attrib for joint in joints for mimic in joint.findall("mimic")}
 
 
-def _mimic_circles(robot: Element) -> Found:
-    return _circles({name: mimic.get("joint", "") for name, mimic in mimics_of(robot).items()})
-
-
-def _link_circles(robot: Element) -> Found:
-    return _circles({child: joint.findall("parent")[-1].get("link", "") for joint, child in _children(robot)})
-
-
-def _circles(before: Mapping[str, str]) -> Found:
-    """Yield what has no beginning. before: what each has before it."""
-    for name, first in before.items():
-        end = first
-        for _ in before:
-            end = before.get(end, "")
-        if end:  # after more steps than there are
-            yield name, first
+def _circles(robot: Element) -> Found:
+    leaders = {name: mimic.get("joint", "") for name, mimic in mimics_of(robot).items()}
+    for name, leader in leaders.items():
+        end = leader
+        for _ in leaders:
+            end = leaders.get(end, "")
+        if end:  # after more steps than there are joints
+            yield name, leader
 
 
 def _two_joints(robot: Element) -> Found:
@@ -170,9 +162,13 @@ def _two_joints(robot: Element) -> Found:
 
 
 def _children(robot: Element) -> Iterator[tuple[Element, str]]:
-    """Yield each joint that has a parent and a child, and its child."""
-    joints = robot.findall("joint[parent][child]")
-    return ((joint, child.get("link", "")) for joint in joints for child in joint.findall("child"))
+    """Yield each joint and its child."""
+    return ((joint, child.get("link", "")) for joint in robot.findall("joint") for child in joint.findall("child"))
+
+
+def _left_out(joints: Any) -> Found:
+    left_out = [link.name for link in joints.links if not joints.model.existBodyName(link.name)]
+    return [("", left_out)] if left_out else ()
 
 
 def _followers(joints: Any) -> Found:
@@ -254,11 +250,11 @@ FINDINGS = {
         Finding(_xacro, "urdf", "a URDF without xacro elements: run xacro first"),
         Finding(_no_numbers, "{}", "{}, as 1.2"),
         Finding(_negative_masses, "mass of the link {}", "0 kg or more"),
-        Finding(_mimic_circles, "mimic of {}", "a joint that does not follow it in turn"),
+        Finding(_circles, "mimic of {}", "a joint that does not follow it in turn"),
         Finding(_two_joints, "joints that move {}", "1"),
-        Finding(_link_circles, "parent of {}", "a link that it does not carry in turn"),
     ),
     "joints": (
+        Finding(_left_out, "links", "carried by the root link: these carry each other"),
         Finding(_followers, "joint_names", "{}, which that joint follows"),
         Finding(_not_turning, "joint_names", "turning joints of the URDF ({})"),
         Finding(_no_directions, "axis of {}", "a direction, as 0 1 0"),

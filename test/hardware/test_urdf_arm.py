@@ -330,7 +330,6 @@ TEXTS = [
     (one('value="1"', 'value="-1"'), J, "mass of the link link = -1.0: must be 0 kg or more"),
     (one("<axis", "<mimic joint='j'/><axis"), J, "mimic of j = 'j': must be a joint that does not follow it in turn"),
     (chain(*THREE[:4], *CIRCLE), ["j1"], "mimic of j2 = 'j3': must be a joint that does not follow it in turn"),
-    (one('parent link="base"', 'parent link="link"'), J, "parent of link = 'link': must be a link that it does not"),
     (one("</robot>", TWICE), J, "joints that move link = 2: must be 1"),
 ]  # fmt: skip
 # And what the law cannot use.
@@ -339,6 +338,7 @@ REFUSED = [
     (one('xyz="0 1 0"', 'xyz="0 0 0"'), J, "axis of j = '0 0 0': must be a direction"),
     (one('<axis xyz="0 1 0"/>', "<axis/>"), J, "axis of j = None: must be a direction"),
     (one("revolute", "prismatic"), J, "it has none"),
+    (one('parent link="base"', 'parent link="link"'), J, r"links = \['link'\]: must be carried by the root link"),
     (ONE, ["k"], r"turning joints of the URDF \(j\)"),
     (one('value="1"', 'value="0"'), J, "0.05 to 40 kg in all"),
     (one('value="1"', 'value=" 1.2 "'), J, "mass of link = 1.2: .* it reads 0 kg"),  # as urdfdom drops the inertial
