@@ -50,7 +50,6 @@ DRIVEN, ENERGY = 0.6, 0.3  # rad/s and J that motors may cause
 AFTER_EXIT = 0.5  # s for which a joint that was dropped would turn
 FIRST, SECOND = f"first{os.getpid()}", f"second{os.getpid()}"  # buses
 ON_TWO = f"{FIRST},{FIRST},{SECOND},{SECOND}"  # motors 1 and 2 on the first bus, 3 and 4 on the second
-_PORTS = own_ports()
 
 
 class JudgedArm(Rig):
@@ -216,7 +215,7 @@ class SimulatedRig:
 
     def __init__(self, device: SimulatedDevice, interface: str = "virtual") -> None:
         sys.setswitchinterval(2e-4)  # as in nodes/ros/run.py: with 5 ms the threads here would delay each other
-        port = next(_PORTS)
+        port = next(own_ports())
         channel, options = f"simulated_rig_{port}", {}
         if interface == "udp_multicast":
             channel, options = "239.74.163.2", {"port": port, "hop_limit": 0}

@@ -101,9 +101,6 @@ def bridge() -> Bridge:
     return Bridge()
 
 
-Ending = Callable[[Bridge], float]
-
-
 def freezes_patiently(bridge: Bridge) -> float:
     limits = replace(bridge.arm.on_bus.limits, frozen_timeout=2.0)
     bridge.pipe.messages[:] = [replace(bridge.arm.on_bus, limits=limits)]
@@ -119,7 +116,7 @@ def hand_over(bridge: Bridge, is_dead: bool = False) -> None:
 
 
 # How a bridge ends, what the watchdog says, and within how many s it kills the bridge; None where it does not.
-ENDINGS: dict[str, tuple[Ending, str, float | None]] = {
+ENDINGS: dict[str, tuple[Callable[[Bridge], float], str, float | None]] = {
     "died": (lambda bridge: bridge.at(1.0, bridge.die), "has died", None),
     "frozen": (
         lambda bridge: bridge.at(1.0, bridge.freeze), "was frozen for 80 ms and has been killed",
