@@ -364,13 +364,12 @@ NOTED = [
 ]  # fmt: skip
 
 
-def simulated(text: str, names: list[str]) -> UrdfConfig:
-    return UrdfConfig(text=text, joint_names=names)
-
-
 @pytest.mark.parametrize(
     ("read", "text", "names", "problem"),
-    [(read, *row) for read, rows in ((UrdfArm, TEXTS + REFUSED), (simulated, TEXTS)) for row in rows],
+    [
+        *((UrdfArm, *row) for row in TEXTS + REFUSED),
+        *((lambda text, names: UrdfConfig(text=text, joint_names=names), *row) for row in TEXTS),
+    ],
 )
 def test_a_description_that_cannot_be_used_is_refused_with_the_reason(read, text, names, problem):
     with pytest.raises(ParameterError, match=problem):
