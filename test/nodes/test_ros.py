@@ -157,8 +157,12 @@ def test_an_exception_in_the_callback_ends_the_thread_and_is_kept(pair):
         ([500, 501, 1, 2, 3], [2], 0),
         ([500, 1, 501, 2, 502, 4], [1, 3, 5], 1),
         ([7, 8, 1, 9, 2], [2, 4], 0),
+        ([10, 11, 1, 12, 13, 14, 15, 4], [2, 7], 2),
     ],
-    ids=["none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"],
+    ids=[
+        *("none lost", "two lost", "a publisher that was started again", "two publishers, one lost", "two publishers"),
+        "a publisher that is seldom heard",
+    ],
 )
 def test_publishers_are_distinguished_and_their_losses_counted_by_the_numbers_of_their_messages(
     numbers, others, missed
