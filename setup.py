@@ -129,6 +129,7 @@ setup(
             *(f"{name} = exo_gravity.nodes.{name}.node:main" for name in nodes),
             *(f"{name} = exo_gravity.nodes.{name}:main" for name in small_nodes),
             *(f"{name} = exo_gravity.tools.{name}:main" for name in tools),
-        ]
+        ],
+        "exo_gravity.laws": ["anfis = exo_gravity.lab.anfis:law"],
     },
 )

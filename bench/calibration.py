@@ -23,9 +23,9 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.paper import ArmModel
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import Observation
@@ -186,7 +186,7 @@ def errors(device: Device, result: CalibrationResult, temperature: float) -> tup
     assert result.identified is not None
     given: dict[str, Any] = {change.name: change.value for change in result.changes}
     none, count, bridge = [0.0] * len(ASSUMED), len(ASSUMED), ARM.can_bridge
-    spring = JointSpring(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
+    spring = Springs(given.get("joint_spring.stiffness", none), given.get("joint_spring.rest", none))
     robot = ArmModel.from_moments(DEFAULT_LINKS.length, given["robot.first_moment"], given["robot.off_axis"])
     settings = Settings("right", robot, joint_spring=spring, joint_stiffness=device.measured.tolist())
     slope = given.get("torque_scale_slope", none)

@@ -8,8 +8,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.power import SwitchingOn
 from exo_gravity.hardware.can.can_port import ArmOnBus

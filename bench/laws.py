@@ -9,8 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.arm.arm import papers
-from exo_gravity.core.arm.gravity import exact_torque
+from exo_gravity.core.arm.paper import ArmModel, papers
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
 from exo_gravity.core.params import values_of
@@ -34,7 +33,7 @@ def measure_laws(quick: bool) -> Iterator[Row]:
     pin, model = pinocchio_model(arm)
     model.gravity.linear = np.array((0.0, 0.0, arm.gravity))
     data, robot = model.createData(), toolbox_robot(arm)
-    law, tilt = exact_torque, Tilt.of("right")
+    law, tilt = ArmModel.torque, Tilt.of("right")
     pose = poses[0]
     theta = tuple(pose.tolist())
     np.testing.assert_allclose(law(arm, theta, tilt), pin.computeGeneralizedGravity(model, data, pose), atol=1e-12)

@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 from trunk_motion import LAWS, LOW, MOUNTING, POSES, USUAL, Law, simulate
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.sim import ImuConfig
 from exo_gravity.sim.trunk_motion import TrunkState, Walk
 

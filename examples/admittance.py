@@ -23,13 +23,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.arm_data import ModelError
 from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.arm.rotation import ZERO
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import ModelError, Settings
 from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import SPRING, Friction, clamp
 from exo_gravity.core.compensation.terms.terms import TermSettings

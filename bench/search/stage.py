@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 
+from exo_gravity.core.arm.interface import Payload
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.events import ACTS as SHARED
 from exo_gravity.sim.events import imu_wrong, payload_dropped
@@ -25,7 +26,7 @@ class Stage(Rig):
     def __init__(self, case: Case) -> None:
         self.played = ARMS[case.arm]
         configured = self.played.carried
-        settings = replace(configured.settings, tilt_timeout=TILT_TIMEOUT, payload_mass=case.payload)
+        settings = replace(configured.settings, tilt_timeout=TILT_TIMEOUT, payload=Payload(case.payload))
         load = self.played.load_of(BODY_MASS) if self.played.worn else None
         worn = {"wearer_mass": load.mass.tolist(), "wearer_cog": load.cog.tolist()} if load else {}
         settings = replace(settings, mode="zero_g" if case.worn else "one_g", support=1.0, **worn)

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import moments_of
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
@@ -79,7 +78,7 @@ def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     low, high = np.maximum(ARM.low, WORN.comfortable[0]), np.minimum(ARM.high, WORN.comfortable[1])
     limits = replace(ARM.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, MODEL), [hanging(limits).theta]
-    expected = moments_of(ARM.papers.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)))
+    expected = ARM.papers.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)).moments
     while len(taken) < WEARER.poses:
         best = next_pose(taken, poses, UPRIGHT, expected, MODEL)
         taken.append(tuple(poses[best].tolist()))

@@ -16,9 +16,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, Torque, exact_torque
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.numbers import NO_TORQUE, Torque
 from exo_gravity.sim import STEP, VirtualWearer
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.virtual_wearer import path_between
@@ -83,7 +83,7 @@ class Muscles(VirtualWearer):
         phase = self.phases[index]
         held = min(1.0, max(0.0, since - phase.move - 0.3) / 0.5) if phase.rests else 0.0  # lets go
         lifted = phase.lifted[0] + (phase.lifted[1] - phase.lifted[0]) * min(1.0, since / (phase.move + phase.hold))
-        weight = exact_torque(self._arm, theta, self._tilt())
+        weight = self._arm.torque(theta, self._tilt())
         path = path_between(self._from, phase.pose, since, phase.move)
         wanted, given = [], []
         for n, (position, speed) in enumerate(path):

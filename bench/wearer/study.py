@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.kinematics import turning_in_base
-from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk, turning_in_base
 from exo_gravity.core.compensation.compensator import JOINTS, Compensation, Compensator
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 from exo_gravity.core.names import imported_when_used
 
 if TYPE_CHECKING:
-    from exo_gravity.core.arm.arm import ArmModel
-    from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-    from exo_gravity.core.arm.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+    from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+    from exo_gravity.core.arm.paper import ArmModel, gravity_torque, paper_mobile_torque, paper_static_torque
     from exo_gravity.core.arm.tilt import Tilt
     from exo_gravity.core.arm.wearer import Wearer
     from exo_gravity.core.compensation.laws import LAWS
@@ -27,9 +26,8 @@ __all__ = [
     "paper_static_torque",
 ]
 MODULES = {
-    "arm.arm": ("ArmModel",),
-    "arm.arm_data": ("STANDARD_GRAVITY",),
-    "arm.gravity": ("gravity_torque", "paper_mobile_torque", "paper_static_torque"),
+    "arm.interface": ("STANDARD_GRAVITY",),
+    "arm.paper": ("ArmModel", "gravity_torque", "paper_mobile_torque", "paper_static_torque"),
     "arm.tilt": ("Tilt",),
     "arm.wearer": ("Wearer",),
     "compensation.laws": ("LAWS",),

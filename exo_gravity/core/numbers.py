@@ -12,6 +12,8 @@ Vector = Sequence[float] | np.ndarray  # numbers in joint order, or the componen
 
 JOINT_COUNT = 4  # of the paper's arm, whose values are the defaults
 MAX_JOINTS = 32  # of one arm
+Torque = tuple[float, ...]  # (n,) Nm in joint order
+NO_TORQUE: Torque = (0.0,) * JOINT_COUNT
 COVER = 1.96  # standard deviations of a 95 % band
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import (
     ZERO,
     Floats3,

@@ -22,20 +22,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from exo_gravity import packaged
-from exo_gravity.core.arm.arm_data import (
+from exo_gravity.core.arm.interface import (
     MAX_GAIN,
     MAX_GRAVITY,
     MAX_MASS,
     MAX_PAYLOAD,
     MAX_REACH,
-    NO_PAYLOAD,
+    NO_LOAD,
     STANDARD_GRAVITY,
+    Payload,
 )
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import Vector, floats, one_float
+from exo_gravity.core.numbers import Torque, Vector, floats, one_float
 from exo_gravity.hardware.urdf_checks import checked, unused_efforts
 from exo_gravity.hardware.urdf_model import LEAST_LENGTH, UrdfJoints, UrdfShape
 
@@ -101,14 +101,14 @@ class Held:
     points in all but the inertia: they move the links' centres of gravity.
     """
 
-    payload: tuple[float, float, float, float] = NO_PAYLOAD  #: kg, and its centre of gravity in m in the hand's frame
+    payload: Payload = NO_LOAD
     worn: tuple[tuple[float, float], ...] = ()  #: (n,) kg of the wearer's segment, and m from the link's joint
     moments: tuple[tuple[float, ...], ...] = ()  #: (n, 3) kg m of the wearer's arm, in place of `worn`
 
     @property
     def mass(self) -> float:
         """Kg of load and wearer."""
-        return self.payload[0] + sum(mass for mass, _ in self.worn)
+        return self.payload.mass + sum(mass for mass, _ in self.worn)
 
 
 class UrdfLinks:
@@ -198,8 +198,8 @@ class UrdfArm(UrdfShape):
         return (*self._identity, self._hand, self._rotors, self.scale, self._held, *own)
 
     @property
-    def payload(self) -> tuple[float, float, float, float]:
-        """The load in the hand: kg, and its centre of gravity in m in the frame of the hand."""
+    def payload(self) -> Payload:
+        """The load in the hand."""
         return self._held.payload
 
     @property
@@ -429,7 +429,7 @@ class UrdfArm(UrdfShape):
         if mass and not self._hand:
             raise ParameterError("payload.mass", mass, "0 without urdf.hand, which says where a load is held")
         x, y, z = floats("payload.cog", cog, 3, -MAX_REACH, MAX_REACH, "m").tolist()
-        return self._with(replace(self._held, payload=(mass, x, y, z)))
+        return self._with(replace(self._held, payload=Payload(mass, (x, y, z))))
 
     def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> UrdfArm:
         """Return this arm plus a share `support` (0..1) of the wearer's arm. Raises ParameterError.
@@ -455,7 +455,7 @@ class UrdfArm(UrdfShape):
 
     def _holding_all(self) -> UrdfArm:
         """Put load and wearer on the links, and forget the inertia of the arm that this is a copy of."""
-        self._by_mass, (mass, *place) = self._bare.copy(), self._held.payload
+        self._by_mass, (mass, place) = self._bare.copy(), self._held.payload
         if mass:
             hand = self._by_mass.frames[self._by_mass.getBodyId(self._hand)]
             self._add(hand.parentJoint, mass, hand.placement.act(np.array(place)))

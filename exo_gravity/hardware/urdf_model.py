@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from exo_gravity import pip_install
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.hardware.urdf_checks import LIMITS, checked, links_of, mimics_of, robot_of

@@ -21,10 +21,10 @@ from scipy.linalg import qr, solve_triangular
 from scipy.optimize import least_squares
 from threadpoolctl import threadpool_limits
 
-from exo_gravity.core.arm.anfis import INPUTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.lab.anfis import INPUTS, UPRIGHT, Anfis, AnfisLaw, grades, scaled
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.calibration.recorded import recording_of, tilts_of
 from exo_gravity.lab.inputs.arms import ConfiguredArm

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import papers
 from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.paper import papers
 from exo_gravity.core.arm.wearer import PAPER_LINKS, LinkLoad, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.joint_spring import JointSpring
-from exo_gravity.core.arm.wearer import Tissue
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import scale_at
@@ -116,7 +115,7 @@ def torque_at(arm: Arm, points: np.ndarray) -> np.ndarray:
 def budget(
     robot: Arm,
     load: tuple[Vector, Vector],
-    spring: JointSpring,
+    spring: Springs,
     support: float,
     bounds: np.ndarray,
     rated: Vector,
@@ -128,13 +127,13 @@ def budget(
     the device's own. bounds: of the workspace, (2, n + 2) rad. rated, peak: (n,) Nm at the joints. Raises
     ParameterError if the load does not fit the robot.
     """
-    return budget_worn(robot, robot.with_wearer(*load), (spring, Tissue()), support, bounds, rated, peak)
+    return budget_worn(robot, robot.with_wearer(*load), (spring, Springs()), support, bounds, rated, peak)
 
 
 def budget_worn(
     robot: Arm,
     full: Arm,
-    springs: tuple[JointSpring, Tissue],
+    springs: tuple[Springs, Springs],
     support: float,
     bounds: np.ndarray,
     rated: Vector,

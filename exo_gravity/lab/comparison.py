@@ -18,10 +18,9 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 
-from exo_gravity.core.arm.anfis import AnfisLaw
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque, paper_mobile_torque, paper_static_torque
+from exo_gravity.core.arm.paper import ArmModel, gravity_torque, paper_mobile_torque, paper_static_torque
 from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.lab.anfis import AnfisLaw
 from exo_gravity.lab.anfis_training import GRID, Trained, axes_of, from_gravload, rms, train_law
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.references import PAPER_ANALYTICAL, PAPER_ANFIS, PAPER_SECONDS, REFERENCES, gravload

@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The eight moments of the paper's arm as unknowns: the torque per moment, and what a known weight adds to them.
 
-`core.arm.gravity` defines the moments, and the torque that is linear in them.
+`core.arm.paper` defines the moments, and the torque that is linear in them.
 """
 
 from functools import lru_cache
@@ -9,9 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.interface import MAX_MASS, STANDARD_GRAVITY
+from exo_gravity.core.arm.paper import MAX_LENGTH, ArmModel, gravity_torque
 from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
 
 MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")

@@ -19,8 +19,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import UNKNOWN

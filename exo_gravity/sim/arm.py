@@ -6,7 +6,7 @@ It is the paper's arm (`ArmConfig`), or one from a URDF (`UrdfConfig`, sim/urdf.
 The paper's, in standard Denavit-Hartenberg, Table 1: a = link lengths, alpha = (-pi/2, +pi/2, 0, 0), d = 0, joint
 offsets (0, -pi/2, 0, 0), z0 along gravity when the trunk is upright. Joint n turns about z_{n-1}; the centre of gravity
 of link n lies at d_n along x_n, and beside the link at `cog_y` along y_n and `cog_z` along z_n. The model is built from
-these and not from the laws of `core.arm.gravity`, so that it can contradict them.
+these and not from the laws of `core.arm.paper`, so that it can contradict them.
 
 In the axes of an accelerated base, gravity is g - a: turned and scaled. If the base also turns, the Euler, centrifugal
 and Coriolis forces act on each link. They are not small: a sway of 2 degrees at 1 Hz accelerates a forearm 0.4 m from
@@ -32,12 +32,10 @@ os.environ.setdefault("MUJOCO_GL", "disabled")  # nothing is rendered: skips MuJ
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, NO_PAYLOAD
-from exo_gravity.core.arm.gravity import MAX_OFFSET
-from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
-from exo_gravity.core.arm.kinematics import ROTORS
+from exo_gravity.core.arm.interface import MAX_MASS, NO_LOAD, Payload
+from exo_gravity.core.arm.paper import MAX_LENGTH, MAX_OFFSET, ROTORS, ArmModel
 from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import MAX_TISSUE
 from exo_gravity.core.errors import ParameterError
@@ -131,10 +129,10 @@ class JointConfig:
         """The elastic joints, from 0 on: the motor of each is a separate body."""
         return [n for n, stiffness in enumerate(self.joint_stiffness) if stiffness]
 
-    def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
         """Return the arm, and the same on a base that can turn about its origin.
 
-        payload: kg in the hand, and (3,) m, its place in the frame of the hand.
+        payload: its place is in the frame of the hand.
         """
         raise NotImplementedError
 
@@ -204,7 +202,7 @@ class ArmConfig(JointConfig):
         if np.any(np.greater(self.wearer_cog, self.links.length)):
             raise ParameterError("wearer_cog", self.wearer_cog, f"at most length = {self.links.length.tolist()} m")
 
-    def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
         """Return the arm, and the same on a base that can turn about its origin."""
         xml = _mjcf(self, payload)
         on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
@@ -246,7 +244,7 @@ class SimulatedArm:
 
     def __init__(self, config: JointConfig | None = None) -> None:
         self.config = config or ArmConfig()
-        self._load(NO_PAYLOAD)
+        self._load(NO_LOAD)
         own = self.config
         columns = own.coulomb_friction, own.stribeck_friction, own.stribeck_speed, own.load_friction
         self._coulomb, self._stribeck, self._speed, self._load_share = map(np.array, columns)
@@ -264,20 +262,20 @@ class SimulatedArm:
         other._torque, other._damping = other.data.qfrc_applied, other.model.dof_damping
         return other
 
-    def carry(self, mass: float, cog: Sequence[float] = ZERO) -> None:
+    def carry(self, mass: float, cog: Floats3 = ZERO) -> None:
         """Have a point of `mass` kg in the hand from now on, at `cog` (3,) m in frame 4; 0 for none.
 
         A joint's motion goes on as it is: what is taken moves along, and what is dropped is gone.
         """
         theta, velocity, gravity = self.data.qpos.copy(), self.data.qvel.copy(), self.model.opt.gravity.copy()
         motion = self._turning_data.qvel[:3].copy(), self._turning_data.qacc[:3].copy()
-        self._load((mass, *cog))
+        self._load(Payload(mass, cog))
         self.data.qpos[:], self.data.qvel[:] = theta, velocity
         mujoco.mj_forward(self.model, self.data)
         self.move_base(gravity.tolist(), *(vector.tolist() for vector in motion))
 
-    def _load(self, payload: Sequence[float]) -> None:
-        """Make MuJoCo's structures for the arm with a load in its hand: kg, and (3,) m in frame 4."""
+    def _load(self, payload: Payload) -> None:
+        """Make MuJoCo's structures for the arm with a load in its hand."""
         # The same arm on a base that can turn: its torques for a given motion of the base.
         self.model, self._turning_model = self.config.models(payload)
         self.data = mujoco.MjData(self.model)
@@ -427,10 +425,10 @@ class SimulatedArm:
         return bias[3:]
 
 
-def _mjcf(config: ArmConfig, payload: Sequence[float] = NO_PAYLOAD) -> str:
+def _mjcf(config: ArmConfig, payload: Payload = NO_LOAD) -> str:
     """Return the arm as MuJoCo XML. The bodies have no geometry, so they cannot collide."""
     links, body = config.links, ""
-    mass, x, y, z = payload
+    mass, (x, y, z) = payload
     if mass > 0.0:
         place = f'pos="{links.length[3] + x} {y} {z}" mass="{mass}"'
         body = f'<body><inertial {place} diaginertia="1e-7 1e-7 1e-7"/></body>'

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.motors.frames import ID_BITS
 from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.sim.rig import HOLD, Act, Rig
@@ -205,7 +206,7 @@ def payload_taken(rig: Rig, mass: float, told: float) -> None:
     """Let the wearer pick up `mass` kg; the operator sets the payload to `told` times that mass."""
     rig.catch_up()
     rig.device.arm.carry(mass)
-    rig.change(payload_mass=told * mass)
+    rig.change(payload=Payload(told * mass))
 
 
 def payload_dropped(rig: Rig) -> None:

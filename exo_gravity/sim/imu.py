@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import MAX_GRAVITY, STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import MAX_GRAVITY, STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.numbers import one_float
 from exo_gravity.core.params import check_owned, owned

@@ -6,8 +6,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import MAX_GRAVITY, MAX_LENGTH, MAX_MASS, STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import MAX_GRAVITY, MAX_MASS, STANDARD_GRAVITY
+from exo_gravity.core.arm.paper import MAX_LENGTH, ArmModel
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation.settings import URDF_FILE, URDF_HAND
 from exo_gravity.core.motors.joint_motor import MAX_STATUS_RATE, MOTOR_PARAMETERS, JointMotor, motors_of

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from exo_gravity.core.arm.arm_data import MAX_PAYLOAD
+from exo_gravity.core.arm.interface import MAX_PAYLOAD
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS, floats, one_float
 

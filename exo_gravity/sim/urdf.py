@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import NO_PAYLOAD, STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import NO_LOAD, STANDARD_GRAVITY, Payload
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
@@ -57,12 +57,12 @@ class UrdfConfig(JointConfig):
             if mass and not (cog <= length and length >= LEAST_LENGTH):
                 raise ParameterError("wearer_cog", self.wearer_cog, f"at most {length:.3f} m on link {n + 1}")
 
-    def models(self, payload: Sequence[float] = NO_PAYLOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
         """Return the arm, and the same on a base that can turn about its origin.
 
-        payload: kg in the hand, and (3,) m, its place in the frame of the link.
+        payload: its place is in the frame of the link.
         """
-        mass, *place = payload
+        mass, place = payload
         if mass and not self.hand:
             raise ParameterError("load", mass, "0 without urdf.hand, which says where a load is held")
         spec = self._spec.copy()
@@ -70,7 +70,7 @@ class UrdfConfig(JointConfig):
             if worn:
                 _add_point(spec.body(name), worn, way * (cog / np.linalg.norm(way)))
         if mass:
-            _add_point(spec.body(self.hand), mass, place)
+            _add_point(spec.body(self.hand), mass, np.array(place))
         elastic = spec.copy()
         self.add_motors(elastic, self.joint_names)
         arm = self.motors_apart(self._with_mechanics(elastic.compile()))

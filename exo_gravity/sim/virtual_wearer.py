@@ -9,8 +9,7 @@ limited to the strength of a hand. Hold: no torque. Push: half a sine wave of th
 import math
 from collections.abc import Sequence
 
-from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.numbers import for_joints
+from exo_gravity.core.numbers import Torque, for_joints
 from exo_gravity.sim.script import TrialScript
 from exo_gravity.sim.trunk_motion import minimum_jerk
 

@@ -11,8 +11,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from exo_gravity.core.arm.anfis import JOINTS
 from exo_gravity.core.arm.tilt import SIDES
+from exo_gravity.lab.anfis import JOINTS
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.references import PAPER_ANFIS
 from exo_gravity.tools.cli import exit_code
@@ -34,7 +34,7 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
 
 def _run(options: argparse.Namespace) -> int:
     """Train, save the law and print its errors; return 0."""
-    from exo_gravity.lab.anfis_file import text_of
+    from exo_gravity.lab.anfis import text_of
     from exo_gravity.lab.anfis_training import RIDGE, from_bag, from_gravload, train_law
 
     output = Path(options.output)

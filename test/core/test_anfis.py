@@ -12,13 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.anfis import Anfis, AnfisLaw, grades
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME, Compensator
 from exo_gravity.core.compensation.laws import LAWS
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
-from exo_gravity.lab.anfis_file import text_of
+from exo_gravity.lab.anfis import Anfis, AnfisLaw, grades, text_of
 
 from ..support import ROBOT
 from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
@@ -127,11 +126,12 @@ def test_the_sentence_stays_the_same_as_long_as_the_reason_does():
 
 
 def learned(moments=ROBOT.first_moment[1:]):
-    """An ANFIS of constant 0.5, 1.0 and 0.25 Nm on joints 2 to 4, in a box of 0 to 1 rad."""
+    """The file of an ANFIS of constant 0.5, 1.0 and 0.25 Nm on joints 2 to 4, in a box of 0 to 1 rad."""
     rules = np.zeros((3, 8, 4))
     rules[:, :, 0] = [[0.5], [1.0], [0.25]]
     model = Anfis(np.tile([-1.0, 1.0], (3, 3, 1)), np.ones((3, 3, 2)), rules)
-    return AnfisLaw(model, (0.0,) * 3, (1.0,) * 3, moments, ROBOT.gravity, "made up", {})
+    error = {"training": [0.0] * 3, "held_out": [0.0] * 3}
+    return text_of(AnfisLaw(model, (0.0,) * 3, (1.0,) * 3, moments, ROBOT.gravity, "made up", error))
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def learned(moments=ROBOT.first_moment[1:]):
     ],
 )
 def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reason_is_given(theta, pitch, moments, why):
-    run = CompensatorRun(law="anfis", anfis=learned(moments))
+    run = CompensatorRun(law="anfis", trained=learned(moments))
     run.compensator.tilt.set_tilt(run.now, pitch, 0.0)
     answer = run.cycle(1.2, theta)
     exact = gravity_torque(ROBOT, theta, Tilt.of("left", pitch).direction)
@@ -155,7 +155,7 @@ def test_where_the_anfis_was_not_trained_the_exact_law_replaces_it_and_the_reaso
 @settings(max_examples=4, deadline=None)
 @given(st.floats(0.001, 0.2), st.floats(0.1, 10.0))
 def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_chatters(width, hertz):
-    run = CompensatorRun(law="anfis", anfis=learned())
+    run = CompensatorRun(law="anfis", trained=learned())
     run.cycle(2.0)
     run.efforts.clear()
     theta_2 = 1.0 + width * np.sin(2 * math.pi * hertz * np.arange(0.0, 3.0, PERIOD))  # about the edge of the box
@@ -169,16 +169,16 @@ def test_along_a_path_across_the_edge_of_the_box_the_torque_neither_steps_nor_ch
 
 
 def test_a_change_of_settings_in_the_cycle_that_leaves_the_box_is_bridged_too():
-    run = CompensatorRun(law="anfis", anfis=learned())
+    run = CompensatorRun(law="anfis", trained=learned())
     run.cycle(2.0)
     before = run.efforts[-1]
-    run.compensator.apply(settings_with(law="anfis", anfis=learned(), mode="zero_g"))
+    run.compensator.apply(settings_with(law="anfis", trained=learned(), mode="zero_g"))
     run.cycle(theta=(0.2, 1.001, 0.6, 0.5))
     np.testing.assert_allclose(run.efforts[-1], before, atol=0.01)
 
 
 def test_another_law_does_not_wait_for_the_anfis():
-    run = CompensatorRun(law="anfis", anfis=learned())
+    run = CompensatorRun(law="anfis", trained=learned())
     run.cycle(1.5, (0.2, 1.2, 0.6, 0.5))
     run.compensator.apply(settings_with(law="paper_static"))
     assert run.cycle(theta=(0.2, 1.2, 0.6, 0.5)).fallback == ""

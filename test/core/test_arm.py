@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.arm.gravity import moments_of
-from exo_gravity.core.arm.kinematics import links_of
+from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.wearer import SEX, TABLES, Wearer
 from exo_gravity.core.compensation.guidance import DropWatch
 from exo_gravity.lab.moments import load_moments, regressor
@@ -93,9 +92,9 @@ def test_the_regressor_times_the_moments_is_the_exact_law():
     rng = np.random.default_rng(2)
     arm = with_moments_across(random_arm(rng), rng.uniform(-0.05, 0.05, (4, 2)))
     theta, direction = random_poses(rng, 50), random_directions(rng, 50)
-    torque = regressor(theta, direction, arm.gravity) @ moments_of(arm)
+    torque = regressor(theta, direction, arm.gravity) @ arm.moments
     np.testing.assert_allclose(torque, gravity_torque(arm, theta, direction), atol=TINY)
-    one = regressor(theta[:1], direction[0]) @ moments_of(arm)
+    one = regressor(theta[:1], direction[0]) @ arm.moments
     np.testing.assert_allclose(one[0], gravity_torque(arm, theta[0], direction[0]), atol=TINY)
 
 
@@ -113,7 +112,7 @@ def test_centres_of_gravity_off_the_links_axes_agree_with_pinocchio():
 def test_a_weight_on_link_4_adds_the_moments_of_a_wearer_of_that_mass():
     arm = ArmModel(LENGTH, (0.02, 0.1, 0.2, 0.1), (0.5, 0.4, 0.6, 0.2))
     loaded = arm.with_wearer((0, 0, 0, 1.0), (0, 0, 0, 0.25))
-    np.testing.assert_allclose(moments_of(arm) + load_moments(LENGTH, 1.0, 0.25), moments_of(loaded), rtol=1e-12)
+    np.testing.assert_allclose(arm.moments + load_moments(LENGTH, 1.0, 0.25), loaded.moments, rtol=1e-12)
 
 
 LENGTHS = (0.28, 0.27, 0.086)
@@ -188,7 +187,7 @@ def test_the_mass_matrix_gets_that_of_a_point_of_mass_as_pinocchio_computes_it(b
         bare = model.copy()
         at = pin.SE3(np.eye(3), np.array((arm.length[3] + x, 0.0, 0.0)))
         model.appendBodyToJoint(4, pin.Inertia(mass, np.zeros(3), np.zeros((3, 3))), at)
-        loaded, before = links_of(known.with_payload(mass, (x, 0.0, 0.0))), links_of(known)
+        loaded, before = known.with_payload(mass, (x, 0.0, 0.0)).links, known.links
         for theta in rng.uniform(-3.0, 3.0, (5, 4)):
             added = [np.triu(pin.crba(each, each.createData(), theta)) for each in (model, bare)]
             assert np.triu(loaded.matrix(theta) - before.matrix(theta)) == pytest.approx(
@@ -201,15 +200,15 @@ def test_a_load_and_a_wearer_add_up_in_any_order_and_the_load_is_carried_in_full
     for arm in (DEFAULT_LINKS, ArmModel.from_moments(DEFAULT_LINKS.length, DEFAULT_LINKS.first_moment)):
         one = arm.with_payload(*load).with_wearer(LOAD.mass, LOAD.cog, 0.4)
         other = arm.with_wearer(LOAD.mass, LOAD.cog, 0.4).with_payload(*load)
-        assert moments_of(one) == pytest.approx(moments_of(other))
-        assert moments_of(one.with_payload(0.0)) == pytest.approx(moments_of(arm.with_wearer(LOAD.mass, LOAD.cog, 0.4)))
-    alone = moments_of(DEFAULT_LINKS.with_payload(*load)) - moments_of(DEFAULT_LINKS)
+        assert one.moments == pytest.approx(other.moments)
+        assert one.with_payload(0.0).moments == pytest.approx(arm.with_wearer(LOAD.mass, LOAD.cog, 0.4).moments)
+    alone = DEFAULT_LINKS.with_payload(*load).moments - DEFAULT_LINKS.moments
     for mode, support in (("one_g", 1.0), ("zero_g", 0.0), ("zero_g", 0.3), ("zero_g", 1.0)):
         loads = ((load[0], load[1]), (0.0, load[1]))
         given, without = (
-            settings_with(mode=mode, support=support, payload_mass=mass, payload_cog=cog).arm for mass, cog in loads
+            settings_with(mode=mode, support=support, payload=Payload(mass, cog)).arm for mass, cog in loads
         )
-        assert moments_of(given) - moments_of(without) == pytest.approx(alone)
+        assert given.moments - without.moments == pytest.approx(alone)
         assert given.total_mass - without.total_mass == pytest.approx(load[0])
 
 
@@ -231,7 +230,7 @@ def test_a_dropped_load_is_known_by_the_hands_acceleration_and_a_light_one_by_it
 
 def test_the_lifting_of_a_load_is_no_drop():
     rise = 0.4  # m/s of the hand
-    run = CompensatorRun(payload_mass=2.0)
+    run = CompensatorRun(payload=Payload(2.0))
     run.cycle(1.5)
     per_mass = gravity_torque(
         ArmModel.from_moments(DEFAULT_LINKS.length, (0.0,) * 4, gravity=1.0).with_payload(1.0), THETA

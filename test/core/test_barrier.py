@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, gravity_torque
+from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier, Shaped
 from exo_gravity.core.safety.descent import DESCENT, JointDescent
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.arm.kinematics import turning_torque
+from exo_gravity.core.arm.interface import NO_LOAD, Payload
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.guidance import CommandFade, GuidedChange
@@ -170,7 +170,7 @@ STILL = (0.0, 0.0, 0.0)
 
 MEASURED, SPIN_UP = {"use_imu": True, "inertial": True}, (1.0, 2.0, -0.5)  # and rad/s^2
 FELT = np.linalg.norm(DOWN) / 9.80665 * np.array(gravity_torque(ROBOT, THETA, DOWN / np.linalg.norm(DOWN)))
-TURNED = np.add(gravity_torque(ROBOT, THETA), turning_torque(ROBOT, "left", THETA, SPIN_UP))
+TURNED = np.add(gravity_torque(ROBOT, THETA), ROBOT.turning_torque("left", THETA, SPIN_UP))
 
 
 @pytest.mark.parametrize(
@@ -363,7 +363,7 @@ def test_a_second_sender_ends_the_support_at_once_until_it_has_been_gone_for_a_w
     [
         ({"support_adapts": False}, 0.4),
         ({"mode": "one_g"}, 0.4),
-        ({"payload_mass": 0.5}, 0.7),
+        ({"payload": Payload(0.5)}, 0.7),
         ({"support": 0.8}, 0.8),
     ],
 )
@@ -376,12 +376,12 @@ def test_a_raised_support_outlives_other_changes_of_the_settings_and_nothing_is_
     arm = Arm(**change)
     arm.asked = 0.7
     assert arm.run(4.0) == support
-    assert arm.compensator.settings.payload_mass == change.get("payload_mass", 0.0)
+    assert arm.compensator.settings.payload == change.get("payload", NO_LOAD)
 
 
 def test_a_change_that_is_not_yet_in_use_is_not_lost_when_the_support_rises() -> None:
     arm = Arm()
     arm.compensator.support_request.receive(arm.now, (NAME,), (0.6,), arm.now)
-    arm.compensator.apply(replace(SETTINGS, payload_mass=0.5))
+    arm.compensator.apply(replace(SETTINGS, payload=Payload(0.5)))
     assert arm.run(STEP) == 0.6
-    assert arm.compensator.settings.payload_mass == 0.5
+    assert arm.compensator.settings.payload.mass == 0.5

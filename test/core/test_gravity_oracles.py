@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque, paper_mobile_torque, paper_static_torque
-from exo_gravity.core.arm.gravity import exact_torque, mobile_torque, static_torque
+from exo_gravity.core.arm.paper import mobile_torque, static_torque
 from exo_gravity.lab.inputs.references import gravload, pinocchio
 
 from ..support.thorough import quick
@@ -55,7 +55,7 @@ def test_a_paper_law_equals_the_exact_law_at_link_ends_and_upright(law):
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-@pytest.mark.parametrize("law", [exact_torque, static_torque, mobile_torque])
+@pytest.mark.parametrize("law", [ArmModel.torque, static_torque, mobile_torque])
 def test_a_single_pose_in_plain_floats_agrees_with_the_arrays(law, side):
     rng = np.random.default_rng(5)
     arm = random_arm(rng)
@@ -63,7 +63,7 @@ def test_a_single_pose_in_plain_floats_agrees_with_the_arrays(law, side):
         tilt = Tilt.of(side, pitch, roll)
         on_axis = np.array((tilt.axis_angle, *theta[1:]))
         arrays = {
-            exact_torque: lambda theta=theta, tilt=tilt: gravity_torque(arm, theta, tilt.direction),
+            ArmModel.torque: lambda theta=theta, tilt=tilt: gravity_torque(arm, theta, tilt.direction),
             static_torque: lambda on_axis=on_axis: paper_static_torque(arm, on_axis),
             mobile_torque: lambda on_axis=on_axis, tilt=tilt: paper_mobile_torque(arm, on_axis, tilt.beta, tilt.phi),
         }

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.params import values_of
@@ -26,7 +26,7 @@ from ..support.chains import random_chain
 from ..support.compensator_run import THETA, settings_with
 
 STIFFNESS, REST = (0.1, 0.15, 0.2, 0.25), (0.1, -0.3, 0.8, 0.5)
-SPRING = JointSpring(STIFFNESS, REST)
+SPRING = Springs(STIFFNESS, REST)
 
 
 def assert_held(settings: Settings, arm: SimulatedArm, tilt: Tilt, gravity: Sequence[float], poses: np.ndarray) -> None:

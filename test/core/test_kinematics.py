@@ -10,7 +10,7 @@ import pytest
 
 import exo_gravity.sim.arm
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.kinematics import least_inertia, links_of, turning_torque
+from exo_gravity.core.arm.chain import least_inertia
 from exo_gravity.lab.inputs.references import OFFSET, pinocchio_model
 from exo_gravity.sim import ArmConfig, SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS, in_base
@@ -52,7 +52,7 @@ def test_torque_mass_matrix_and_momentum_agree_with_pinocchio_for_random_arms_an
         bare, (w, z, y3, y4) = random_arm(rng), rng.uniform(-beside, beside, 4)
         places = np.array(((w, 0.0), (-z, w), (y3, z), (y4, z)))
         pin, model, data = with_rods(bare, places)
-        links = links_of(with_moments_across(bare, places) if beside else bare)._replace(rotors=NO_ROTORS)
+        links = (with_moments_across(bare, places) if beside else bare).links._replace(rotors=NO_ROTORS)
         for theta, velocity, acceleration in rng.uniform(-3.0, 3.0, (20, 3, 4)):
             expected = pin.rnea(model, data, theta, velocity, acceleration)
             assert links.torque(theta, velocity, acceleration) == pytest.approx(expected, abs=ROUNDING)
@@ -75,7 +75,7 @@ def test_centres_of_gravity_anywhere_beside_the_links_leave_a_third_of_the_error
         mass = np.triu(pin.crba(model, data, theta))
         momentum = (mass + np.triu(mass, 1).T) @ velocity
         expected = momentum, pin.computeCoriolisMatrix(model, data, theta, velocity).T @ velocity
-        both = (links_of(each)._replace(rotors=NO_ROTORS) for each in (with_moments_across(arm, beside), arm))
+        both = (each.links._replace(rotors=NO_ROTORS) for each in (with_moments_across(arm, beside), arm))
         errors.append([np.subtract(links.momentum(theta, velocity), expected) for links in both])
     (momentum, coriolis), (momentum_without, coriolis_without) = np.linalg.norm(errors, axis=(0, 3))
     assert momentum < 0.5 * momentum_without and coriolis < 0.5 * coriolis_without
@@ -85,14 +85,14 @@ def test_each_rotor_turns_with_its_own_joint():
     arm, theta, acceleration = random_arm(np.random.default_rng(2)), (0.1, 0.2, 0.3, 0.4), (1.0, -2.0, 3.0, 5.0)
     rotors = (0.1, 0.2, 0.3, 0.4)
     with_rotors, without = (
-        links_of(arm)._replace(rotors=each).torque(theta, NO_ROTORS, acceleration) for each in (rotors, NO_ROTORS)
+        arm.links._replace(rotors=each).torque(theta, NO_ROTORS, acceleration) for each in (rotors, NO_ROTORS)
     )
     assert np.subtract(with_rotors, without) == pytest.approx(np.multiply(rotors, acceleration))
 
 
 def test_the_least_inertia_is_below_that_of_any_pose():
     arm = ArmModel((0.05, 0.13, 0.30, 0.30), (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
-    links, rng = links_of(arm), np.random.default_rng(3)
+    links, rng = arm.links, np.random.default_rng(3)
     poses = rng.uniform((-1.6, 0.0, 0.0, 0.0), (1.6, 2.6, 2.5, 2.6), (300, 4))
     felt = np.array([1.0 / np.diag(np.linalg.inv(links.matrix(pose))) for pose in poses])
     assert np.all(felt > 0.97 * np.array(least_inertia(links)))
@@ -116,7 +116,7 @@ def test_the_torque_takes_an_arm_of_slender_rods_along_with_its_base(side, monke
     rng = np.random.default_rng(5)
     for _ in range(30):
         theta, turning = rng.uniform((-1.5, 0, -0.7, 0), (1.5, 3, 2, 3)), rng.uniform(-3, 3, 3)
-        torque = turning_torque(DEFAULT_LINKS, side, theta, turning)
+        torque = DEFAULT_LINKS.turning_torque(side, theta, turning)
         np.testing.assert_allclose(left_behind(side, turning, theta, torque), 0.0, atol=1e-4)
 
 
@@ -125,7 +125,7 @@ def test_an_arm_given_by_its_moments_needs_about_the_same():
     rng = np.random.default_rng(6)
     theta, turning = rng.uniform(0.0, 1.5, (30, 4)), rng.uniform(-3, 3, (30, 3))
     exact, guessed = (
-        np.array([turning_torque(links, "left", *row) for row in zip(theta, turning, strict=True)])
+        np.array([links.turning_torque("left", *row) for row in zip(theta, turning, strict=True)])
         for links in (DEFAULT_LINKS, arm)
     )
     assert np.sqrt(np.mean((guessed - exact) ** 2)) < 0.15 * np.sqrt(np.mean(exact**2))
@@ -134,5 +134,5 @@ def test_an_arm_given_by_its_moments_needs_about_the_same():
 def test_the_gains_scale_the_torque():
     half = ArmModel(DEFAULT_LINKS.length, DEFAULT_LINKS.cog, DEFAULT_LINKS.mass, (0.5,) * 4)
     pose, turning = (0.1, 0.4, 0.5, 1.0), (1.0, 2.0, 0.0)
-    whole = turning_torque(DEFAULT_LINKS, "left", pose, turning)
-    np.testing.assert_allclose(turning_torque(half, "left", pose, turning), 0.5 * np.array(whole))
+    whole = DEFAULT_LINKS.turning_torque("left", pose, turning)
+    np.testing.assert_allclose(half.turning_torque("left", pose, turning), 0.5 * np.array(whole))

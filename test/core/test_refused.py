@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, paper_mobile_torque, paper_static_torque
-from exo_gravity.core.arm.anfis import Anfis, AnfisLaw
 from exo_gravity.core.arm.tilt import Tilt, pitch_roll, rotation_matrix
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
@@ -25,7 +24,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor, Traffic, buses_of, m
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, check_bridge, limits_of
 from exo_gravity.core.trunk.inputs import FeltMotion
-from exo_gravity.lab.anfis_file import text_of
+from exo_gravity.lab.anfis import Anfis, AnfisLaw, text_of
 from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -142,7 +141,7 @@ SETTINGS = [
     ),
     row(settings_with, "total mass", **ADAPTIVE, wearer_mass=(0.0, 0.0, 5.4, 4.2)),  # at full support
     row(settings_with, "anfis_file", law="anfis"),
-    row(settings_with, "robot.first_moment = .*0 for law anfis", law="anfis", anfis=learned(), robot=BY_MOMENTS),
+    row(settings_with, "robot.first_moment = .*0 for law anfis", law="anfis", trained=learned(), robot=BY_MOMENTS),
     row(Settings, "joint_stiffness", "left", DEFAULT_LINKS, joint_stiffness=(0.0, 2.6, 0.0, 0.0)),  # Nm per degree
     row(compensator, r"joint_spring.stiffness", joint_spring__stiffness=[0.0, -0.1, 0.0, 0.0]),
     row(compensator, r"joint_spring.stiffness", joint_spring__stiffness=[2.1] * 4),

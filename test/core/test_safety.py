@@ -12,9 +12,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.numbers import Rate
+from exo_gravity.core.numbers import NO_TORQUE, Rate
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck

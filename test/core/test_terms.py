@@ -20,8 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, Tilt
-from exo_gravity.core.arm.gravity import NO_TORQUE, exact_torque
-from exo_gravity.core.arm.kinematics import least_inertia, links_of
+from exo_gravity.core.arm.chain import least_inertia
 from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.terms.assist import ASSIST as TUNING
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
@@ -40,6 +39,7 @@ from exo_gravity.core.compensation.terms.catalogue import (
 )
 from exo_gravity.core.compensation.terms.terms import SUM, Terms, TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.motors.frames import ENTER
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.params import values_of
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -51,7 +51,7 @@ UPRIGHT = Tilt.of("right")
 POSE = (0.2, 0.7, 0.6, 0.7)  # rad
 # What the controller knows of the arm: masses and centres of gravity are wrong by 2 %.
 LINKS = ArmModel(DEFAULT_LINKS.length, 0.98 * DEFAULT_LINKS.cog, 1.02 * DEFAULT_LINKS.mass)
-LEAST = np.array(least_inertia(links_of(LINKS)))
+LEAST = np.array(least_inertia(LINKS.links))
 STIFFEST = tuple((0.999 * LEAST / (4.0 * DELAY**2)).tolist())  # Nm/rad up to which springs are accepted
 COULOMB, VISCOUS = np.array((0.2, 0.4, 0.2, 0.2)), (0.02, 0.05, 0.01, 0.03)  # Nm and Nm s/rad of the true joints
 IDENTIFIED = tuple(0.9 * COULOMB)
@@ -88,7 +88,7 @@ class TermsRun:
         self.terms = Terms(JOINTS, settings.on_arm(LINKS), LINKS)
         self.energy: list[tuple[float, float]] = []
         self.positions = [self.device.arm.positions]
-        self._sent = deque([(exact_torque(LINKS, pose, UPRIGHT), NO_TORQUE)], max(1, round(delay / PERIOD)))
+        self._sent = deque([(LINKS.torque(pose, UPRIGHT), NO_TORQUE)], max(1, round(delay / PERIOD)))
         for motor in self.device.motors:
             self.device.exchange(motor.joint.can_id, motor.joint.command(0.0, 0.0))
             self.device.exchange(motor.joint.can_id, ENTER)
@@ -103,7 +103,7 @@ class TermsRun:
             replies = [joint.sample(frame[1], device.time) for joint, frame in frames]
             theta, velocity = [reply.position for reply in replies], [reply.velocity for reply in replies]
             added = self.terms.torque(100.0 + device.time, theta, velocity)
-            self._sent.append((exact_torque(LINKS, theta, UPRIGHT), tuple(added)))
+            self._sent.append((LINKS.torque(theta, UPRIGHT), tuple(added)))
             device.advance(PERIOD)
             moved = np.subtract(device.arm.positions, self.positions[-1])
             self.positions.append(device.arm.positions)
@@ -247,7 +247,7 @@ def test_whatever_the_terms_give_their_sum_is_bounded(sums):
 
 def test_soft_limits_are_no_stiffer_than_is_stable():
     stiff = TermSettings(limits=SoftLimits(LOWER, UPPER)).on_arm(DEFAULT_LINKS).limits.stiffness
-    most = np.array(least_inertia(links_of(DEFAULT_LINKS))) / (4.0 * DELAY**2)
+    most = np.array(least_inertia(DEFAULT_LINKS.links)) / (4.0 * DELAY**2)
     assert ALL.on_arm(DEFAULT_LINKS) == ALL
     assert stiff == pytest.approx(np.minimum(10.0, 0.8 * most))
 

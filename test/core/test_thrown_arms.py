@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm import ArmModel, papers
-from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.arm.paper import ArmModel, papers
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.settings import Settings
@@ -21,6 +20,7 @@ from exo_gravity.core.compensation.terms.assist import Assist
 from exo_gravity.core.compensation.terms.catalogue import Friction, Inertia, Spring
 from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.ak import MIT
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.motion_monitor import MOTION

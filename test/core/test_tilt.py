@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.gravity import exact_torque, mobile_torque, static_torque
+from exo_gravity.core.arm.paper import ArmModel, mobile_torque, static_torque
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TILT, FeltMotion, TiltInput
@@ -60,7 +60,7 @@ def test_the_tilt_of_a_gravity_vector_is_that_of_its_pitch_and_roll(side):
             np.testing.assert_allclose(one, other, atol=1e-12)
 
 
-@pytest.mark.parametrize("law", [exact_torque, static_torque, mobile_torque])
+@pytest.mark.parametrize("law", [ArmModel.torque, static_torque, mobile_torque])
 def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity(law):
     tilt = Tilt.of("left", 0.2, -0.1)
     felt = law(ROBOT, THETA, tilt._replace(magnitude=1.5))

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm_data import ModelError
-from exo_gravity.core.arm.gravity import exact_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import ModelError, Settings
 from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.safety.limits import Limits
@@ -124,7 +122,7 @@ def weighed(mass: float, pose: Sequence[float], empty: Weighed | None = None) ->
     """Return a weighing that found `mass` kg."""
     weighing = Weighing(SETTINGS, JOINTS, RATE, empty)
     weighing.torque(0.01, pose, STILL, TILT, STILL)
-    weighing.result = Weighed(mass, 0.004, np.array(exact_torque(SETTINGS.unit_load, pose, TILT)))
+    weighing.result = Weighed(mass, 0.004, np.array(SETTINGS.unit_load.torque(pose, TILT)))
     return weighing
 
 

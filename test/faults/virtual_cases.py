@@ -227,7 +227,7 @@ def expired(rig: StruckArm) -> None:
 
 def load_is_withdrawn(rig: StruckArm) -> None:
     """Check that the compensator has noticed that the hand is empty."""
-    assert rig.compensator.settings.payload_mass == 0.0, rig.compensator.settings.payload_mass
+    assert rig.compensator.settings.payload.mass == 0.0, rig.compensator.settings.payload.mass
 
 
 def await_refusal(rig: StruckArm) -> float:

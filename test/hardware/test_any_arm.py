@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from exo_gravity.core.arm.interface import NO_LOAD, Payload
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
 from exo_gravity.core.errors import ParameterError
@@ -120,7 +121,7 @@ def test_a_wearer_and_a_load_are_carried_on_any_links_under_any_tilt(held: dict[
     config = UrdfConfig(
         text=text, joint_names=names, hand="hand", wearer_mass=[0.6 * m for m in mass], wearer_cog=cog, gravity=9.80665
     )
-    load = (held["payload.mass"], *held["payload.cog"]) if held else (0.0,) * 4
+    load = Payload(held["payload.mass"], held["payload.cog"]) if held else NO_LOAD
     model, _ = config.models(load)
     random, tilt = np.random.default_rng(5), Tilt.of("left", pitch, -0.5 * pitch)
     model.opt.gravity = 9.80665 * np.array(tilt.gravity_in_trunk)
@@ -139,7 +140,7 @@ def test_inertia_and_momentum_agree_with_mujocos() -> None:
     text, names = random_chain(count, seed=3)
     arm = UrdfArm(text, names, "hand").with_payload(0.8, (0.05, 0.0, 0.02))
     config = UrdfConfig(text=text, joint_names=names, hand="hand", rotor_inertia=(0.0,) * count)
-    model, _ = config.models((0.8, 0.05, 0.0, 0.02))
+    model, _ = config.models(Payload(0.8, (0.05, 0.0, 0.02)))
     model.opt.gravity = np.zeros(3)
     model.dof_damping[:] = model.dof_frictionloss[:] = 0.0
     data, random = mujoco.MjData(model), np.random.default_rng(4)

@@ -13,10 +13,10 @@ from functools import partial
 import can
 import pytest
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import WireFormat
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -246,10 +246,17 @@ def plug_in(arm: CarriedArm, name: str) -> None:
 
 SILENT = (silence, FaultCode.MOTOR_SILENT, "no motor on {} replies: the bus is lost, or the supply is cut")
 BROKEN = (break_down, FaultCode.BUS_ERROR, "No buffer space available")
+
+
+def name_of(value: object) -> str:
+    """Return the name of a function for a test's ID, which has no channel: that has the process's ID."""
+    return getattr(value, "__name__", "")
+
+
 LOST = [(MIT, SECOND, *SILENT), (MIT, FIRST, *SILENT), (MIT_V3, SECOND, *SILENT), (MIT, SECOND, *BROKEN)]
 
 
-@pytest.mark.parametrize(("wire_format", "dead", "lose", "code", "said"), quick([LOST[0], LOST[-1]], LOST))
+@pytest.mark.parametrize(("wire_format", "dead", "lose", "code", "said"), quick([LOST[0], LOST[-1]], LOST), ids=name_of)
 def test_a_bus_that_is_lost_lets_the_whole_arm_down_and_its_motors_once_they_are_reached(
     wire_format: WireFormat, dead: str, lose: Callable[[CarriedArm, str], None], code: FaultCode, said: str
 ) -> None:

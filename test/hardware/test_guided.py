@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
+from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.safety.drive import Efforts, State
@@ -175,7 +176,7 @@ def test_one_wrong_velocity_takes_no_load_from_the_hand():
     arm = guided_arm()
     arm.lead(Leading(CARRIED_IN, 0.0))
     arm.device.arm.carry(2.0)
-    arm.change(payload_mass=2.0)
+    arm.change(payload=Payload(2.0))
     arm.run(5.0)
     arm.act()
     arm.run(0.5)
@@ -189,5 +190,5 @@ def test_one_wrong_velocity_takes_no_load_from_the_hand():
     arm.compensator.step = once_wrong
     arm.run(1.5)
     assert next(calls) > 100
-    assert arm.compensator.dropped == 0.0 and arm.compensator.settings.payload_mass == 2.0
+    assert arm.compensator.dropped == 0.0 and arm.compensator.settings.payload.mass == 2.0
     assert arm.fastest < 0.1

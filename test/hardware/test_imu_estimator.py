@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY as G
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY as G
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import TUNING, ImuSample, TrunkEstimator

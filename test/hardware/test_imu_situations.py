@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY as G
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY as G
 
 from ..support.imu_motion import (
     RECORDED,

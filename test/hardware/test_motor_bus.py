@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from can.interfaces.socketcan import SocketcanBus
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.ak import MIT, MIT_V3, pack_reply
 from exo_gravity.core.motors.families import MOTORS
@@ -27,6 +26,7 @@ from exo_gravity.core.motors.frames import (
     unpack_command,
 )
 from exo_gravity.core.motors.joint_motor import LARGEST_WARMING, JointMotor
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import Drive, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.hardware.can.can_port import CanPort, message_of

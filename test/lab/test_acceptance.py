@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 
-from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import Source
@@ -165,4 +164,4 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
     bench = Bench(None, None, MOTORS, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), WEIGHT, None, None, None)
-    assert bench.moments == pytest.approx(moments_of(loaded_links()))
+    assert bench.moments == pytest.approx(loaded_links().moments)

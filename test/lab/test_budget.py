@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque
-from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.interface import Payload
+from exo_gravity.core.arm.paper import gravity_torque
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.params import values_of
@@ -39,7 +40,7 @@ RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)
 
 @functools.cache
 def needs(support=1.0, tilt=20.0, rated=RATED, peak=PEAK, robot=ROBOT):
-    return budget(robot, LOAD, JointSpring(), support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak)
+    return budget(robot, LOAD, Springs(), support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak)
 
 
 @pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
@@ -88,8 +89,7 @@ def test_an_arm_that_bends_the_other_way_gets_the_same_support():
     flexion = (-1.65, -0.17, 0.3, -0.17), (1.65, 0.5, 2.53, 3.14)  # gravity always pulls joint 3 in the same direction
     other_way = tuple(-angle for angle in flexion[1]), tuple(-angle for angle in flexion[0])
     one, other = (
-        budget(ROBOT, LOAD, JointSpring(), 1.0, workspace(*limits, 0.1), RATED, PEAK)[2]
-        for limits in (flexion, other_way)
+        budget(ROBOT, LOAD, Springs(), 1.0, workspace(*limits, 0.1), RATED, PEAK)[2] for limits in (flexion, other_way)
     )
     assert other.support == pytest.approx(one.support, abs=2e-3)
 
@@ -101,9 +101,9 @@ def test_strong_motors_support_the_whole_arm_and_none_if_the_robot_alone_needs_m
 
 
 def test_the_devices_own_springs_count():
-    tensed = JointSpring((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -1.0))
+    tensed = Springs((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -1.0))
     bounds = workspace(LOW, HIGH, 0.0)
-    plain, sprung = (budget(ROBOT, LOAD, one, 1.0, bounds, RATED, PEAK)[3] for one in (JointSpring(), tensed))
+    plain, sprung = (budget(ROBOT, LOAD, one, 1.0, bounds, RATED, PEAK)[3] for one in (Springs(), tensed))
     points = np.random.default_rng(2).uniform(LOW, HIGH, (20_000, 4))
     torque = gravity_torque(ROBOT.with_wearer(*LOAD), points)[:, 3] + 0.5 * (points[:, 3] + 1.0)
     assert plain.torque < np.abs(torque).max() <= sprung.torque + 2e-3
@@ -137,7 +137,7 @@ def test_the_budget_of_an_arm_from_a_urdf_is_what_mujoco_needs_in_its_worst_pose
     found = arm_budget(arm, Wearer(75.0), 1.0, 0.0, payload)
     load = Wearer(75.0).on_links(arm.robot.length, arm.compensator["wearer.links"])
     text = packaged_config(f"arms/{name}.urdf").read_text(encoding="utf-8")
-    oracle = WornMujocoArm(text, arm.joint_names, load.mass, load.cog, (payload, 0.0, 0.0, 0.0))
+    oracle = WornMujocoArm(text, arm.joint_names, load.mass, load.cog, Payload(payload))
     for number, joint in enumerate(found.joints):
         assert joint.torque == pytest.approx(abs(oracle.torque(joint.worst[:-2])[number]), rel=1e-4, abs=1e-3)
     if name == "elbow":

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.arm_data import ModelError
-from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.interface import Payload
+from exo_gravity.core.arm.tilt import turning_in_base
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.settings import ModelError, Settings
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.numbers import COVER
@@ -308,7 +308,7 @@ def test_a_watch_tells_torques_beyond_their_band_the_share_and_nothing_that_is_o
 
 
 def test_a_watch_follows_the_load_and_the_stiffness_of_elastic_joints_in_the_settings():
-    loaded = replace(SETTINGS, payload_mass=1.0)
+    loaded = replace(SETTINGS, payload=Payload(1.0))
     needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
     assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
     elastic = replace(SETTINGS, joint_stiffness=(150.0,) * 4)

@@ -15,12 +15,12 @@ from contextlib import contextmanager
 import can
 import pytest
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.errors import BusError
 from exo_gravity.core.motors.ak import pack_reply
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.can.motor_bus import MotorBus

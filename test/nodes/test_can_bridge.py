@@ -26,12 +26,12 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety import descent, guidance, machine
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import STEP, ArmConfig, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.arm import JOINT_LOSS, _mjcf, felt_in_base, in_base

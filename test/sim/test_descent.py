@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import Tilt, gravity_torque
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.frames import ENTER
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import Send, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.hardware.control_loop import NoController

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.sim import SimulatedDevice
 from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.sim.virtual_wearer import VirtualWearer

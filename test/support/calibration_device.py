@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core import ArmModel
-from exo_gravity.core.arm.gravity import NO_TORQUE, moments_of
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Observation, Station
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
-from exo_gravity.core.numbers import Vector
+from exo_gravity.core.numbers import NO_TORQUE, Vector
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
@@ -71,7 +70,7 @@ class Device:
         mass = np.array((0.60, 0.46, 0.61, 0.20)) * rng.uniform(0.7, 1.3, 4)
         cog = np.minimum(np.array((0.045, 0.115, 0.235, 0.13)) * rng.uniform(0.7, 1.3, 4), LENGTH)
         off_axis = off_axis_of(mass, *rng.uniform(-0.015, 0.015, (2, 4)))
-        self.moments = moments_of(ArmModel(LENGTH, cog, mass, off_axis=off_axis))
+        self.moments = ArmModel(LENGTH, cog, mass, off_axis=off_axis).moments
         self.scale = rng.uniform(0.7, 1.3, 4)
         self.friction = rng.uniform(0.1, 0.4, 4)
         self.offset = rng.normal(0.0, 0.02, 4)

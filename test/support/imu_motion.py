@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from vqf import VQF
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY as G
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY as G
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 

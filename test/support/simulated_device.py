@@ -8,11 +8,11 @@ from typing import Any
 
 import can
 
-from exo_gravity.core.arm.gravity import NO_TORQUE
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import WireFormat, pack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
+from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import mujoco
 import numpy as np
 
+from exo_gravity.core.arm.interface import NO_LOAD, Payload
 from exo_gravity.sim.urdf import UrdfConfig
 
 UPRIGHT = (0.0, 0.0, -9.80665)  # m/s^2
@@ -65,7 +66,7 @@ class WornMujocoArm:
         joint_names: Sequence[str],
         mass: Sequence[float],
         cog: Sequence[float],
-        payload: Sequence[float] = (0.0,) * 4,
+        payload: Payload = NO_LOAD,
         stiffness: Sequence[float] = (),
         rest: Sequence[float] = (),
     ) -> None:

@@ -24,8 +24,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import gravity_torque
+from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import BusError, DataError, ParameterError

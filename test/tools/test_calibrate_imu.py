@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vqf import VQF
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import angle_between, rotation_matrix
 from exo_gravity.core.errors import DataError
 from exo_gravity.lab.calibration.imu import ImuRecord, mounting, six_rests

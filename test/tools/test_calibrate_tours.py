@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.arm.joint_spring import JointSpring
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import robot_of, settings_of
 from exo_gravity.core.compensation.tracking import Observation
@@ -132,7 +132,7 @@ def test_the_file_gets_the_springs_and_the_room_that_the_safety_machine_needs_fo
     device, bridge = Device(301), {**ARM.can_bridge, "largest_moment": [1.0] * 4, "largest_addition": [0.5] * 4}
     result = moments_from(replace(ARM, can_bridge=bridge), sprung(device))
     given = {name: value(result, name) for name in ("joint_spring.stiffness", "joint_spring.rest")}
-    most = np.add(0.5, JointSpring(*given.values()).largest(ARM.low.tolist(), ARM.high.tolist()))
+    most = np.add(0.5, Springs(*given.values()).largest(ARM.low.tolist(), ARM.high.tolist()))
     np.testing.assert_allclose(value(result, "largest_addition"), most, atol=0.01)
     # Calibrated again, from the new file, nothing is added twice; and an arm without its cables loses them.
     again = {**bridge, "largest_addition": most.tolist()}

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import pytest
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.lab.anfis_file import text_of
+from exo_gravity.lab.anfis import text_of
 from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.arm.anfis import AnfisLaw
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab import anfis_training as anfis
 from exo_gravity.lab import comparison
-from exo_gravity.lab.anfis_file import text_of
+from exo_gravity.lab.anfis import AnfisLaw, text_of
 from exo_gravity.lab.inputs.arms import configured_arm, with_cog_at_link_ends
 from exo_gravity.lab.inputs.references import PAPER_ANFIS, REFERENCES
 from exo_gravity.tools import validate

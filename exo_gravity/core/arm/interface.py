@@ -1,22 +1,40 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What everything that carries an arm of n joints asks of it: gravity, inertia, and what it holds.
 
-`ArmModel` (core/arm/arm.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm
+`ArmModel` (core/arm/paper.py) is the paper's arm in closed form, `UrdfArm` (hardware/urdf_arm.py) any serial arm
 that a URDF describes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.numbers import Vector
+from exo_gravity.core.numbers import Torque, Vector
+
+STANDARD_GRAVITY = 9.80665  # m/s^2, ISO 80000-3; the paper rounds to 9.8
+
+# These bounds catch wrong units (grams for kilograms, millimetres for metres), not unusual designs.
+MAX_MASS = 20.0  # kg per link; the whole arm of a 150 kg person weighs about 8 kg
+MAX_PAYLOAD = 5.0  # kg in the hand; at 0.7 m from the shoulder it takes 34 Nm, about twice an AK80-9's peak torque
+MAX_REACH = 0.5  # m of its centre of gravity from the hand
+MAX_GAIN = 2.0
+MAX_GRAVITY = 25.0  # m/s^2
+
+
+class Payload(NamedTuple):
+    """A load in the hand."""
+
+    mass: float = 0.0  #: kg
+    cog: Floats3 = ZERO  #: m, its centre of gravity in the frame of the hand
+
+
+NO_LOAD = Payload()
 
 
 class Links(Protocol):
@@ -69,8 +87,8 @@ class Arm(Protocol):
         ...
 
     @property
-    def payload(self) -> tuple[float, float, float, float]:
-        """The load in the hand: kg, and its centre of gravity in m in the frame of the hand."""
+    def payload(self) -> Payload:
+        """The load in the hand."""
         ...
 
     @property

@@ -7,11 +7,12 @@ axes: x0 left, y0 forward, z0 down. The right arm is its mirror image: its gravi
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.rotation import rotated, unit_quaternion
+from exo_gravity.core.arm.rotation import Floats3, rotated, unit_quaternion
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Vector, one_float
 
@@ -87,6 +88,12 @@ def pitch_roll(gravity_in_trunk: Vector) -> tuple[float, float]:
     if not 0.0 < norm < math.inf:
         raise ParameterError("gravity_in_trunk", gravity_in_trunk, "a finite, non-zero vector")
     return math.atan2(x, math.hypot(y, z)), math.atan2(-y, -z)
+
+
+def turning_in_base(side: str, vector: Sequence[float]) -> Floats3:
+    """Return an angular velocity or acceleration (3,) of the trunk in the base frame of the `side` arm."""
+    x, y, z = vector
+    return (y, x, -z) if side == "left" else (y, -x, z)  # a mirror, as the right arm is of the left, reverses rotations
 
 
 def angle_between(a: Vector, b: Vector) -> float:

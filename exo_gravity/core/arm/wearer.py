@@ -12,18 +12,17 @@ wearer's shoulder and elbow. On another arm the user says which links do. A tabl
 differ from it by more than 10 %.
 
 Skin, muscles and capsule of a relaxed joint pull it towards a rest angle, in the middle of its range nearly as a spring
-(`Tissue`).
+(`springs.Springs`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, floats, one_float
-from exo_gravity.core.params import check_owned, owned
+from exo_gravity.core.numbers import Vector, floats, one_float
 
 SEX = ("female", "male")
 _WINTER = ((0.028, 0.436), (0.016, 0.430), (0.006, 0.506))
@@ -60,40 +59,6 @@ def load_by_moments(length: Vector, first_moment: Vector) -> LinkLoad:
     forearm = outer / places[1] if lower else 0.0
     arm = max(0.0, whole - forearm * upper) / places[0] if upper else 0.0
     return LinkLoad(np.array((0.0, 0.0, arm, forearm)), np.array((0.0, 0.0, *places)))
-
-
-@dataclass(frozen=True)
-class Tissue:
-    """The springs of a wearer's relaxed joints, on an arm of n joints. Raises ParameterError.
-
-    Of joint n at theta, it takes stiffness (theta - rest) Nm to hold it, and no more beyond TISSUE_REACH.
-    """
-
-    joint_stiffness: Sequence[float] = owned(
-        (0.0,) * JOINT_COUNT,
-        "of the wearer's relaxed joints, by `calibrate wearer`; zero_g compensates `support` of it",
-        (0.0, MAX_TISSUE),
-        "Nm/rad",
-        expert=True,
-    )
-    joint_rest: Sequence[float] = owned(
-        (0.0,) * JOINT_COUNT, "angle at which they rest", (-np.pi, np.pi), "rad", expert=True
-    )
-    on: bool = field(init=False, repr=False, compare=False)  #: whether any joint has one
-
-    def __post_init__(self) -> None:
-        check_owned(self)
-        object.__setattr__(self, "on", any(self.joint_stiffness))
-
-    def torque(self, theta: Sequence[float]) -> tuple[float, ...]:
-        """Return the torque (n,) in Nm that holds the relaxed joints at `theta` (n,) rad."""
-        springs = zip(self.joint_stiffness, self.joint_rest, theta, strict=True)
-        return tuple([k * max(-TISSUE_REACH, min(TISSUE_REACH, angle - rest)) for k, rest, angle in springs])
-
-    def torques(self, theta: np.ndarray) -> np.ndarray:
-        """Return the same for poses (m, n) in rad: (m, n) Nm."""
-        stretch = np.clip(theta - np.array(self.joint_rest), -TISSUE_REACH, TISSUE_REACH)
-        return np.asarray(np.array(self.joint_stiffness) * stretch)
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,14 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
 from exo_gravity.core.compensation.weighing import Weighing
-from exo_gravity.core.numbers import limited
+from exo_gravity.core.numbers import Torque, limited
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingRefused, WeighingTrouble, Withdrawal
 
@@ -127,7 +126,7 @@ class Compensator:
                 return Compensation.withdrawn(late)
             held = f"{late}: held on, torque off by at most {turn * self._largest_torque(theta):.2f} Nm"
         self._follow_request(now)
-        if self.settings.payload_mass and velocity:
+        if self.settings.payload.mass and velocity:
             self._withdraw_lost_load(now, theta, velocity)
         before = self._load_before()
         was_replaced = bool(self._fallback)
@@ -195,12 +194,15 @@ class Compensator:
         s = self.settings
         per_mass = s.unit_load.torque(theta, self.tilt.at(now))  # m that each joint lifts it, per rad
         if self.applied:  # motors that do not carry the load cannot throw the arm
-            needed = s.payload_mass * s.arm.gravity * sum(height * height for height in per_mass)
+            needed = s.payload.mass * s.arm.gravity * sum(height * height for height in per_mass)
             if sum(map(operator.mul, per_mass, self.applied)) < DROP.least_carried * needed:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
-        if self._drop_watch.step(now - self._last_time, speed, s.payload_mass):
-            self.dropped, self._pending = s.payload_mass, replace(self._pending or s, payload_mass=0.0)
+        if self._drop_watch.step(now - self._last_time, speed, s.payload.mass):
+            self.dropped, self._pending = (
+                s.payload.mass,
+                replace(self._pending or s, payload=s.payload._replace(mass=0.0)),
+            )
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""

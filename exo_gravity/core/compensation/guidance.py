@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.guidance import GUIDANCE, GuidedMotion
 
 CAUSE_TIME = 5.0  # s within which a change of load may be the cause of a fault or a motion

@@ -3,19 +3,23 @@
 
 A law is an object with two methods, and its entry in `LAWS` is what makes it for the settings in force. A law that does
 not apply in every pose says where it does not: the compensator then carries the arm by the exact law.
+
+A laboratory's own law needs no fork: a distribution that names what makes it under the entry point group GROUP is found
+here, as `anfis` of this one is (exo_gravity/lab/anfis.py). Entry points are looked up when such a law is chosen: an
+ordinary start does not pay for them.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from exo_gravity.core.arm.anfis import AnfisLaw
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import Torque, mobile_torque, static_torque
 from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.paper import ArmModel, mobile_torque, static_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.numbers import Torque
 
+GROUP = "exo_gravity.laws"
 URDF_LAW = "urdf"  # the exact law of an arm from a URDF
 
 
@@ -75,12 +79,12 @@ class LawData(Protocol):
         ...
 
     @property
-    def anfis(self) -> AnfisLaw | None:
-        """The model in `anfis_file`, if it is given."""
+    def trained(self) -> str:
+        """The text of the file that a law was trained into; '' if none is given."""
         ...
 
 
-def _with_masses(arm: Arm, law: str) -> ArmModel:
+def with_masses(arm: Arm, law: str) -> ArmModel:
     """Return the paper's arm, for a law that needs its masses. Raises ParameterError."""
     if not isinstance(arm, ArmModel):
         raise ParameterError("law", law, f"{URDF_LAW} for an arm from a URDF")
@@ -89,17 +93,11 @@ def _with_masses(arm: Arm, law: str) -> ArmModel:
 
 
 def _paper_static(given: LawData) -> Law:
-    return ArmLaw(_with_masses(given.arm, "paper_static"), static_torque)
+    return ArmLaw(with_masses(given.arm, "paper_static"), static_torque)
 
 
 def _paper_mobile(given: LawData) -> Law:
-    return ArmLaw(_with_masses(given.arm, "paper_mobile"), mobile_torque)
-
-
-def _anfis(given: LawData) -> Law:
-    if given.anfis is None:
-        raise ParameterError("law", "anfis", "used with anfis_file, a model from train_anfis")
-    return ArmLaw(_with_masses(given.arm, "anfis"), given.anfis.torque, given.anfis.outside)
+    return ArmLaw(with_masses(given.arm, "paper_mobile"), mobile_torque)
 
 
 def _urdf(given: LawData) -> Law:
@@ -108,11 +106,44 @@ def _urdf(given: LawData) -> Law:
     return ExactLaw(given.arm)
 
 
-#: what makes each law, by name. Raises ParameterError where the law does not cover such an arm
-LAWS: dict[str, Callable[[LawData], Law]] = {
-    "exact": lambda given: ExactLaw(given.arm),
-    "paper_static": _paper_static,
-    "paper_mobile": _paper_mobile,
-    "anfis": _anfis,
-    URDF_LAW: _urdf,
-}
+Maker = Callable[[LawData], Law]
+
+
+class Laws(dict[str, Maker]):
+    """What makes each law, by name. Raises ParameterError where the law does not cover such an arm."""
+
+    def __missing__(self, name: str) -> Maker:
+        """Return what makes the law `name` of another distribution. Raises KeyError, DataError."""
+        self[name] = maker = _entry(name)
+        return maker
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether the law `name` is known, or another distribution has it."""
+        try:
+            return bool(self[str(name)])
+        except KeyError:
+            return False
+
+
+def _entry(name: str) -> Maker:
+    """Return what makes the law of the entry point `name`. Raises KeyError, DataError if it does not load."""
+    from importlib.metadata import entry_points  # slow to import
+
+    for entry in entry_points(group=GROUP, name=name):
+        try:
+            maker: Maker = entry.load()
+        except Exception as error:  # the code of others
+            raise DataError(f"entry point {entry.name} = {entry.value} of {GROUP}: {error}") from error
+        return maker
+    raise KeyError(name)
+
+
+LAWS = Laws(
+    {
+        "exact": lambda given: ExactLaw(given.arm),
+        "paper_static": _paper_static,
+        "paper_mobile": _paper_mobile,
+        "anfis": lambda given: _entry("anfis")(given),
+        URDF_LAW: _urdf,
+    }
+)

@@ -2,37 +2,40 @@
 """The settings of the compensator, checked against each other, and the parameters that describe them."""
 
 import itertools
+import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
-from exo_gravity.core.arm.anfis import AnfisLaw
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import (
+from exo_gravity.core.arm.interface import (
     MAX_GAIN,
     MAX_GRAVITY,
-    MAX_LENGTH,
     MAX_MASS,
-    MAX_MOMENT,
     MAX_PAYLOAD,
     MAX_REACH,
-    MAX_WORN_BESIDE,
-    MAX_WORN_MOMENT,
+    NO_LOAD,
     STANDARD_GRAVITY,
-    ModelError,
+    Arm,
+    Payload,
 )
-from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.joint_spring import JointSpring
-from exo_gravity.core.arm.joint_stiffness import SOFTEST, STIFFEST, held
+from exo_gravity.core.arm.paper import MAX_LENGTH, MAX_MOMENT, MAX_WORN_BESIDE, MAX_WORN_MOMENT, ArmModel
+from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS, SOFTEST, STIFFEST, Springs, held
 from exo_gravity.core.arm.tilt import SIDES, Tilt
-from exo_gravity.core.arm.wearer import PAPER_LINKS, SEX, TYPICAL_LENGTH, Tissue, Wearer, load_by_moments
+from exo_gravity.core.arm.wearer import (
+    MAX_TISSUE,
+    PAPER_LINKS,
+    SEX,
+    TISSUE_REACH,
+    TYPICAL_LENGTH,
+    Wearer,
+    load_by_moments,
+)
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
 from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
-from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Vector, for_joints
+from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Torque, Vector, for_joints
 from exo_gravity.core.params import (
     JOINT_NAMES,
     REAL_TIME_PARAMETERS,
@@ -67,6 +70,39 @@ class UrdfModel(Arm, Protocol):
 
 
 @dataclass(frozen=True)
+class ModelError:
+    """How exactly an arm's model is known, as standard errors. Raises ParameterError."""
+
+    torque: Sequence[float] = owned(
+        (0.3, 0.3, 0.3, 0.1), "standard error of the robot's torque, by `calibrate`", (0.0, 5.0), "Nm"
+    )
+    scale: Sequence[float] = owned(
+        (0.1,) * JOINT_COUNT,
+        "standard error of torque_scale, as a share of it, by `calibrate`",
+        (0.0, 1.0),
+    )
+    wearer: float = owned(
+        0.15, "standard error of the wearer's arm's weight, as a share of it, by `calibrate`", (0.0, 1.0)
+    )
+    tilt: float = owned(0.0175, "standard error of the trunk's tilt", (0.0, 0.5), "rad")
+    wearer_torque: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "standard error of the torque of the wearer's passive arm beyond that share, by `calibrate`",
+        (0.0, 5.0),
+        "Nm",
+    )
+    deflection: Sequence[float] = owned(
+        (0.0,) * JOINT_COUNT,
+        "standard error of each link's angle behind its motor: play, and elasticity beyond `joint_stiffness`",
+        (0.0, 0.2),
+        "rad",
+    )
+
+    def __post_init__(self) -> None:
+        check_owned(self)
+
+
+@dataclass(frozen=True)
 class Settings:
     """What holds an arm of n joints. All but `side` and `use_imu` may change while the arm is worn.
 
@@ -85,7 +121,7 @@ class Settings:
     #: kg m, what the wearer's arm adds to the robot's moments (`Arm.with_wearer_moments`), in place of these masses in
     #: all but the inertia; () for none
     wearer_moments: Sequence[Sequence[float]] = ()
-    tissue: Tissue = field(default_factory=Tissue)  #: of the wearer's relaxed joints
+    tissue: Springs = field(default_factory=Springs)  #: of the wearer's relaxed joints
     max_effort: Sequence[float] = owned((3.0, 9.0, 3.0, 3.0), "torque limit per joint", (0.0, LARGEST_EFFORT), "Nm")
     max_effort_rate: float = owned(50.0, "fastest change of torque", (1.0, 1000.0), "Nm/s", expert=True)
     tilt_timeout: float = owned(
@@ -100,10 +136,10 @@ class Settings:
         vector=True,
     )
     use_imu: bool = True  #: False assumes an upright trunk
-    anfis: AnfisLaw | None = None  #: the model for the law 'anfis'
+    trained: str = field(default="", repr=False)  #: text of the file that a law was trained into, as `anfis`
     terms: TermSettings = field(default_factory=TermSettings)
     model_error: ModelError = field(default_factory=ModelError)  #: for the bands of what is estimated
-    joint_spring: JointSpring = field(default_factory=JointSpring)  #: the device's own; every law gets it
+    joint_spring: Springs = field(default_factory=Springs)  #: the device's own; every law gets it
     joint_stiffness: Sequence[float] = owned(
         (0.0,) * JOINT_COUNT,
         "stiffness between each motor and its link; 0: rigid. Not `joint_spring`",
@@ -112,8 +148,7 @@ class Settings:
         expert=True,
     )
     robot_by_mass: Arm | None = None  #: the robot by its masses, for `terms`; None: `robot`
-    payload_mass: float = 0.0  #: kg in the hand
-    payload_cog: Sequence[float] = (0.0, 0.0, 0.0)  #: (3,) m, its centre of gravity in the frame of the hand
+    payload: Payload = NO_LOAD  #: in the hand
     #: the robot with the load in its hand, which is carried in full in both modes, like the robot's own weight
     loaded: Arm = field(init=False, repr=False, compare=False)
     #: what is compensated: `loaded` in One-G, the same plus `support` times the wearer in Zero-G
@@ -128,10 +163,6 @@ class Settings:
         check_owned(self, len(self.robot.scale))
         for name in ("wearer_mass", "wearer_cog"):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
-        for prefix, springs in (("joint_spring.", self.joint_spring), ("wearer.", self.tissue)):
-            if springs.on:  # else the default, of any length
-                with named(prefix):
-                    check_owned(springs, len(self.robot.scale))
         if soft := [k for k in self.joint_stiffness if 0.0 < k < SOFTEST]:
             raise ParameterError("joint_stiffness", soft, f"0 for a rigid joint, or at least {SOFTEST:g} Nm/rad")
         self._carry(self.robot)
@@ -140,7 +171,7 @@ class Settings:
 
     def _carry(self, robot: Arm) -> None:
         """Compute what is carried."""
-        loaded = robot.with_payload(self.payload_mass, self.payload_cog)
+        loaded = robot.with_payload(*self.payload)
         # Computed in every mode, so that an impossible wearer is refused now and not when the mode becomes zero_g.
         whole = self.worn(loaded, self.support_now)
         if self.wearer_moments and self.mode == "zero_g" and self.law not in ("exact", URDF_LAW):
@@ -148,14 +179,14 @@ class Settings:
         wearer = sum(self.wearer_mass) * (1.0 if self.support_adapts else self.support_now)
         given = loaded.given_mass
         if given + wearer > MAX_CARRIED:
-            bare = given - self.payload_mass
-            parts = f"robot {bare:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload_mass:.2f}"
+            bare = given - self.payload.mass
+            parts = f"robot {bare:.2f}, wearer's share {wearer:.2f}, payload.mass {self.payload.mass:.2f}"
             bound = f"at most {MAX_CARRIED:g} ({parts})"
             raise ParameterError("total mass in kg", round(given + wearer, 2), bound)
         if max(robot.scale) > MAX_SCALE:
             scale = [round(value, 2) for value in robot.scale]
             raise ParameterError("gain times gravity", scale, f"at most {MAX_SCALE:g} m/s^2, twice the Earth's gravity")
-        by_mass = (self.robot_by_mass or robot).with_payload(self.payload_mass, self.payload_cog)
+        by_mass = (self.robot_by_mass or robot).with_payload(*self.payload)
         carried = by_mass.with_wearer(self.wearer_mass, self.wearer_cog, self.support_now)
         object.__setattr__(self, "terms", self.terms.on_arm(self.robot_by_mass or robot))
         object.__setattr__(self, "loaded", loaded)
@@ -174,7 +205,7 @@ class Settings:
 
         Raises ParameterError if it is not known where a load is held.
         """
-        return self.robot.massless(1.0).with_payload(1.0, self.payload_cog)
+        return self.robot.massless(1.0).with_payload(1.0, self.payload.cog)
 
     @property
     def is_adaptive(self) -> bool:
@@ -242,7 +273,10 @@ COMPENSATOR = (
           "all 0: by mass and cog", (0.0, MAX_WORN_MOMENT), "kg m", expert=True),
     Param("wearer.off_axis", [0.0] * JOINT_COUNT, "what it adds to W, Z, Y3, Y4, where wearer.first_moment is given",
           (-MAX_WORN_BESIDE, MAX_WORN_BESIDE), "kg m", expert=True),
-    *(replace(param, name=f"wearer.{param.name}") for param in params_of(Tissue)),
+    Param("wearer.joint_stiffness", [0.0] * JOINT_COUNT, "of the wearer's relaxed joints, by `calibrate wearer`; "
+          "zero_g compensates `support` of it", (0.0, MAX_TISSUE), "Nm/rad", expert=True),
+    Param("wearer.joint_rest", [0.0] * JOINT_COUNT, "angle at which they rest", (-math.pi, math.pi), "rad",
+          expert=True),
     Param("payload.mass", 0.0, "load in the hand, carried in full in both modes; 0 once it was dropped",
           (0.0, MAX_PAYLOAD), "kg"),
     Param("payload.cog", [0.0] * 3, "its centre of gravity from the end of link 4, along x_4, y_4, z_4",
@@ -253,7 +287,10 @@ COMPENSATOR = (
     param_of(Settings, "shoulder_from_imu"),
     Param("use_imu", True, "false assumes an upright trunk (the paper's seated wearer)", fixed=True),
     param_of(Settings, "tilt_timeout"),
-    *(replace(param, name=f"joint_spring.{param.name}") for param in params_of(JointSpring)),
+    Param("joint_spring.stiffness", [0.0] * JOINT_COUNT, "of the device's own springs, such as cables, by `calibrate`",
+          (0.0, MAX_STIFFNESS), "Nm/rad", expert=True),
+    Param("joint_spring.rest", [0.0] * JOINT_COUNT, "angle at which each of them is slack", (-MAX_REST, MAX_REST),
+          "rad", expert=True),
     param_of(Settings, "joint_stiffness"),
     *term_parameters(),
     *REAL_TIME_PARAMETERS,
@@ -327,41 +364,40 @@ def settings_of(
     """
     robot: Arm
     if urdf is None:
-        robot, own = _papers(values, read)
+        robot, own = _papers(values)
     else:
         robot, own = urdf.scaled(values["gain"], values["gravity"]), _of_urdf(values, urdf)
     mass, cog = wearer_of(values, robot.length)
     errors: list[Any] = [values.get(param.name, param.default) for param in MODEL_PARAMETERS]
     sized: list[Any] = [for_joints(error, len(mass), max) if isinstance(error, Sequence) else error for error in errors]
     shared = {param.name: values[param.name] for param in params_of(Settings)}
-    return Settings(
-        side=values.get("side", SIDES[0]),  # a URDF's root link is not mirrored
-        robot=robot,
-        wearer_mass=mass,
-        wearer_cog=cog,
-        use_imu=values["use_imu"],
-        terms=term_settings_of(values),
-        model_error=ModelError(*sized),
-        joint_spring=joint_spring_of(values),
-        tissue=tissue_of(values),
-        payload_mass=values["payload.mass"],
-        payload_cog=tuple(values["payload.cog"]),
-        **{**shared, **own},
-    )
-
-
-def _papers(values: Mapping[str, Any], read: Callable[[str], str] | None) -> tuple[ArmModel, dict[str, Any]]:
-    """Return the paper's arm, and what only its settings have."""
-    path = values["anfis_file"]
+    path = values.get("anfis_file", "")
     try:
-        anfis = AnfisLaw.load(read(path)) if path and read else None
+        return Settings(
+            side=values.get("side", SIDES[0]),  # a URDF's root link is not mirrored
+            robot=robot,
+            wearer_mass=mass,
+            wearer_cog=cog,
+            use_imu=values["use_imu"],
+            trained=read(path) if path and read else "",
+            terms=term_settings_of(values),
+            model_error=ModelError(*sized),
+            joint_spring=joint_spring_of(values),
+            tissue=Springs(values["wearer.joint_stiffness"], values["wearer.joint_rest"], TISSUE_REACH),
+            payload=Payload(values["payload.mass"], tuple(values["payload.cog"])),
+            **{**shared, **own},
+        )
     except (OSError, UnicodeDecodeError, DataError) as error:
         raise ParameterError("anfis_file", path, f"a file from train_anfis ({error})") from None
+
+
+def _papers(values: Mapping[str, Any]) -> tuple[ArmModel, dict[str, Any]]:
+    """Return the paper's arm, and what only its settings have."""
     with named("robot."):
         by_mass = ArmModel(values["link_length"], values["robot.cog"], values["robot.mass"])
     moments = tuple(values["wearer.first_moment"]), tuple(values["wearer.off_axis"])
     worn = {"wearer_moments": moments} if any(moments[0]) else {}
-    return robot_of(values), {"anfis": anfis, "robot_by_mass": by_mass, **worn}
+    return robot_of(values), {"robot_by_mass": by_mass, **worn}
 
 
 def _of_urdf(values: Mapping[str, Any], urdf: UrdfModel) -> dict[str, Any]:
@@ -375,10 +411,9 @@ def _of_urdf(values: Mapping[str, Any], urdf: UrdfModel) -> dict[str, Any]:
     return {"max_effort": limits, **({"wearer_moments": moments} if any(map(any, moments)) else {})}
 
 
-def joint_spring_of(values: Mapping[str, Any]) -> JointSpring:
-    """Return the device's own springs that parameter values describe, or raise ParameterError."""
-    with named("joint_spring."):
-        return JointSpring(values["joint_spring.stiffness"], values["joint_spring.rest"])
+def joint_spring_of(values: Mapping[str, Any]) -> Springs:
+    """Return the device's own springs that parameter values describe."""
+    return Springs(values["joint_spring.stiffness"], values["joint_spring.rest"])
 
 
 def robot_of(values: Mapping[str, Any]) -> ArmModel:
@@ -389,12 +424,6 @@ def robot_of(values: Mapping[str, Any]) -> ArmModel:
         if any(along):
             return ArmModel.from_moments(length, along, across, *rest)
         return ArmModel(length, values["robot.cog"], values["robot.mass"], *rest, across)
-
-
-def tissue_of(values: Mapping[str, Any]) -> Tissue:
-    """Return the springs of the wearer's relaxed joints that parameter values describe, or raise ParameterError."""
-    with named("wearer."):
-        return Tissue(*(values[f"wearer.{param.name}"] for param in params_of(Tissue)))
 
 
 def wearer_of(values: Mapping[str, Any], length: Vector) -> tuple[Sequence[float], Sequence[float]]:

@@ -23,8 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.numbers import Vector
+from exo_gravity.core.numbers import Torque, Vector
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import MAX_PAYLOAD
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import MAX_PAYLOAD
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
-from exo_gravity.core.numbers import COVER
+from exo_gravity.core.numbers import COVER, Torque
 from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingPhase, WeighingRefused, WeighingTrouble
 
 CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
@@ -104,7 +103,7 @@ class Weighing:
     def empty(self) -> Weighed | None:
         """The latest result for an empty hand, or None."""
         result = self.result
-        is_empty = result and abs(result.mass) < WEIGHING.empty and not self._settings.payload_mass
+        is_empty = result and abs(result.mass) < WEIGHING.empty and not self._settings.payload.mass
         return result if is_empty else self._empty
 
     @property
@@ -130,7 +129,7 @@ class Weighing:
         if self.result is None or self.excess is None or self.empty is self.result:
             return None
         more, band = self._beyond_empty or self.excess
-        return max(0.0, self._settings.payload_mass + more), band
+        return max(0.0, self._settings.payload.mass + more), band
 
     @property
     def _beyond_empty(self) -> tuple[float, float] | None:

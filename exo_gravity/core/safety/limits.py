@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.arm.arm_data import MAX_MOMENT
+from exo_gravity.core.arm.paper import MAX_MOMENT
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS

@@ -8,7 +8,7 @@ check against it waits until a movement cannot be the reason. The limits were se
 import math
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, cross, dot, plus, rotated, up_in_body
 from exo_gravity.core.trunk.imu_checks import Contradiction
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, plus, three_floats, up_in_body
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import NOT_REPORTED

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3, acceleration_of, plus, three_floats
 from exo_gravity.core.arm.tilt import Tilt, angle_between, gravity_in_trunk
 from exo_gravity.core.errors import ParameterError

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import up_in_body
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import State

@@ -35,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.joint_spring import MAX_REST, MAX_STIFFNESS
+from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector

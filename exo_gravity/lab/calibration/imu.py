@@ -22,9 +22,8 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.kinematics import turning_in_base
-from exo_gravity.core.arm.tilt import angle_between
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.tilt import angle_between, turning_in_base
 from exo_gravity.core.compensation.tracking import mean_direction
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Vector

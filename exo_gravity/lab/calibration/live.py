@@ -23,7 +23,6 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.arm.gravity import moments_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import ARM, BRIDGE, OF_BRIDGE, of_urdf
@@ -119,7 +118,7 @@ def tour_parameters(
         own = np.array(compensator["max_effort"])
         values["max_effort"] = np.where(own > 0.0, np.minimum(own, strongest), strongest).tolist()
     else:
-        expected = (moments_of(arm.papers) if moments is None else moments).tolist()
+        expected = (arm.papers.moments if moments is None else moments).tolist()
         values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
         values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
         values |= {"first_moment": expected[:4], "off_axis": expected[4:]}

@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibration needs of an arm: its torque, linear in k moments, and which of them it takes for known.
 
-The paper's arm has the eight moments of `core.arm.gravity`; any other those of `UrdfArm.base`, which a QR decomposition
+The paper's arm has the eight moments of `core.arm.paper`; any other those of `UrdfArm.base`, which a QR decomposition
 of its regressor leaves. Both are first moments in kg m. Both arms have
 
     count, names, moments, start   n joints; of the k moments: names, kg m as far as known, kg m from which a fit begins
@@ -24,12 +24,11 @@ from functools import cached_property
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.gravity import Torque, exact_torque, moments_of
-from exo_gravity.core.arm.kinematics import NO_LENGTH, LinkInertia, frames
+from exo_gravity.core.arm.chain import frames
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.numbers import JOINT_COUNT, NO_TORQUE, Torque
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.moments import MOMENTS, load_moments, regressor
 
@@ -85,7 +84,7 @@ class PapersMoments:
     suggested = np.radians(list(itertools.product(*GRID)))
 
     def __init__(self, arm: ArmModel, keeps_tilt: bool) -> None:
-        self.length, self.gravity, self.moments = arm.length, arm.gravity, moments_of(arm)
+        self.length, self.gravity, self.moments = arm.length, arm.gravity, arm.moments
         self.keeps_tilt = keeps_tilt
 
     def down(self, tilt: Tilt) -> np.ndarray:
@@ -109,7 +108,7 @@ class PapersMoments:
 
     def turned(self, theta: np.ndarray) -> np.ndarray:
         """Return the derivative (m, 4, 8, 3, 12) of `along_axes` by turns of the joints' places."""
-        links = np.array([frames(NO_LENGTH, pose) for pose in theta.tolist()])  # (m, 4, 3, 3): place, axis, along
+        links = np.array([frames(NO_TORQUE, pose) for pose in theta.tolist()])  # (m, 4, 5, 3), without lengths
         axes, along = links[:, :, 1], links[:, :, 2]
         beside = [axes[:, 1], axes[:, 2], *(np.cross(axes[:, 2], along[:, link]) for link in (2, 3))]
         moments = np.stack((*np.swapaxes(along, 0, 1), *beside), axis=1)
@@ -129,9 +128,7 @@ class PapersMoments:
 
         def hold(theta: Sequence[float], tilt: Tilt) -> Torque:
             pairs = enumerate(zip(arms, below, strict=True))
-            return tuple(
-                exact_torque(arm, theta, tilt)[n] - exact_torque(less, theta, tilt)[n] for n, (arm, less) in pairs
-            )
+            return tuple(arm.torque(theta, tilt)[n] - less.torque(theta, tilt)[n] for n, (arm, less) in pairs)
 
         return hold
 
@@ -146,7 +143,10 @@ class PapersMoments:
 
     def matrix(self, theta: Sequence[float], moments: np.ndarray, load: tuple[float, float]) -> np.ndarray:
         """Return the mass matrix (4, 4) in kg m^2 of an arm with these moments."""
-        return LinkInertia.of_moments(self.length, moments[:JOINT_COUNT], load).matrix(theta)
+        weight, lever = load
+        bare = np.maximum(moments - self.load(weight, lever), 0.0)[:JOINT_COUNT]
+        arm = ArmModel.from_moments(self.length, bare).with_payload(weight, (lever - self.length[3], 0.0, 0.0))
+        return arm.links.matrix(theta)
 
     def upwards(self, theta: np.ndarray) -> np.ndarray:
         """Return the sine (m,) of the largest angle of links 3 and 4 above the horizontal of an upright trunk."""

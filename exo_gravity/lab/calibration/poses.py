@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station
 from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import Vector
+from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
 from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
 from exo_gravity.lab.calibration.pose_fit import layout_of, unmeasured

@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import MAX_LENGTH, MAX_MASS, MAX_MOMENT
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import MAX_MASS
+from exo_gravity.core.arm.paper import MAX_LENGTH, MAX_MOMENT, ArmModel
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
@@ -26,6 +25,7 @@ from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, St
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
+from exo_gravity.core.numbers import Torque
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits

@@ -14,11 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import ModelError
-from exo_gravity.core.arm.joint_spring import JointSpring
-from exo_gravity.core.arm.joint_stiffness import link_angles
+from exo_gravity.core.arm.springs import Springs, link_angles
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import joint_spring_of
+from exo_gravity.core.compensation.settings import ModelError, joint_spring_of
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
@@ -255,7 +253,7 @@ def _spring_changes(arm: ConfiguredArm, found: Identified) -> Iterator[Change]:
     if not (np.any(found.stiffness) or before.on):
         return
     rest = found.rest + (found.turn[:, 0] if len(found.turn) else 0.0)
-    new = JointSpring(found.stiffness.round(4).tolist(), rest.round(4).tolist())
+    new = Springs(found.stiffness.round(4).tolist(), rest.round(4).tolist())
     note = f"Nm/rad, +-{row(found.stiffness_error)}; 0: the poses show none"
     yield Change(node, "joint_spring.stiffness", list(new.stiffness), note)
     yield Change(node, "joint_spring.rest", list(new.rest), "rad, with the offset of the motor")

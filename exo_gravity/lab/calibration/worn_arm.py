@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.arm_data import moments_along
-from exo_gravity.core.arm.gravity import MAX_OFFSET, moments_of
+from exo_gravity.core.arm.paper import MAX_OFFSET, moments_along
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, wearer_of
 from exo_gravity.core.errors import DataError, ParameterError
@@ -70,7 +69,7 @@ class PapersWorn:
         self.to_moments = worn_moments(self._robot.length)
         self._table = tuple(map(np.array, self._wearer(tabled=True)))
         self.known = _known(self._robot.length, *self._table)
-        self.expected: np.ndarray | None = moments_of(self._robot.with_wearer(*self._wearer()))
+        self.expected: np.ndarray | None = self._robot.with_wearer(*self._wearer()).moments
 
     def found(self, fit: WearerFit, theta: np.ndarray, direction: np.ndarray) -> Found:
         """Return what a fit says. Raises DataError if it is not an arm."""
@@ -103,7 +102,7 @@ class PapersWorn:
 
     def allowed(self, moments: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return `largest_moment`, (4,) kg m, and the torque of what lies beside the links, (4,) Nm."""
-        whole = moments_of(self._robot) + moments
+        whole = self._robot.moments + moments
         w, z, y3, y4 = np.abs(whole[JOINT_COUNT:])
         beside = self._robot.gravity * np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
         return whole[:JOINT_COUNT], beside

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel, papers
 from exo_gravity.core.arm.interface import Arm
+from exo_gravity.core.arm.paper import ArmModel, papers
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of

@@ -2,7 +2,7 @@
 """The two references: gravity torques by independent libraries, from the same masses and Table 1 of the paper.
 
 The Robotics Toolbox's `gravload` runs a recursive Newton-Euler algorithm over the Denavit-Hartenberg parameters;
-Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.arm.gravity` or
+Pinocchio's `computeGeneralizedGravity` runs one over spatial inertias. They share no code with `core.arm.paper` or
 with each other.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.numbers import JOINT_COUNT
 
 # Table 1 of the paper, standard Denavit-Hartenberg; a is the link's length, d is 0.

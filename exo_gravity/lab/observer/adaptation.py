@@ -20,10 +20,9 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import REQUEST
-from exo_gravity.core.numbers import COVER
+from exo_gravity.core.numbers import COVER, Torque
 from exo_gravity.lab.observer.momentum import OBSERVER, WearerEstimate
 from exo_gravity.lab.observer.share import SHARE, Known, RunningShare, Shares
 

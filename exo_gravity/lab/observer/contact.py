@@ -6,8 +6,7 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.numbers import for_joints
+from exo_gravity.core.numbers import Torque, for_joints
 from exo_gravity.lab.observer.momentum import WearerEstimate, low_passed
 
 

@@ -24,13 +24,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from exo_gravity.core.arm.gravity import Torque
-from exo_gravity.core.arm.joint_stiffness import link_angles
 from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.springs import link_angles
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.terms.catalogue import sliding
-from exo_gravity.core.numbers import COVER, for_joints
+from exo_gravity.core.numbers import COVER, Torque, for_joints
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,6 @@ def _percent(share: Known | None) -> tuple[str, str]:
 
 def _known_of(s: Settings) -> object:
     """Return what the observer depends on."""
-    load = *s.wearer_mass, *s.wearer_cog, s.payload_mass, *s.payload_cog
+    load = *s.wearer_mass, *s.wearer_cog, s.payload
     worn = s.wearer_moments, s.tissue
     return s.robot, load, worn, s.joint_spring, s.joint_stiffness, s.terms.friction, s.model_error

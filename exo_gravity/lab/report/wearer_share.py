@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.kinematics import turning_in_base
 from exo_gravity.core.arm.rotation import ZERO, Floats3
-from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError

@@ -16,8 +16,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.kinematics import frames
+from exo_gravity.core.arm.chain import frames
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import robot_of
 from exo_gravity.core.errors import ParameterError

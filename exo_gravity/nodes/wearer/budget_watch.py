@@ -11,9 +11,8 @@ from typing import Any
 
 from rclpy.node import Node
 
-from exo_gravity.core.arm.arm import ArmModel, papers
-from exo_gravity.core.arm.joint_spring import JointSpring
-from exo_gravity.core.arm.wearer import Tissue
+from exo_gravity.core.arm.paper import ArmModel, papers
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
@@ -28,7 +27,7 @@ BRIDGE_PARAMETERS = {
     "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
 }  # fmt: skip
 # robot, the same with the wearer's whole arm, springs of device and wearer, support 0..1, largest tilt in rad
-Request = tuple[ArmModel, ArmModel, tuple[JointSpring, Tissue], float, float]
+Request = tuple[ArmModel, ArmModel, tuple[Springs, Springs], float, float]
 
 
 class BudgetWatch:

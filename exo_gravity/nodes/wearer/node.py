@@ -23,10 +23,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
-from exo_gravity.core.arm.kinematics import turning_in_base
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.rotation import ZERO, Floats3
-from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.arm_data import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError

@@ -12,9 +12,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core import ArmModel, gravity_torque
-from exo_gravity.core.arm.gravity import moments_of
-from exo_gravity.core.arm.joint_stiffness import link_angles
-from exo_gravity.core.arm.kinematics import LinkInertia
+from exo_gravity.core.arm.springs import link_angles
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import MOTION, TRACKER, Line, Observation, Station, Sweep, Tracker
 from exo_gravity.core.errors import DataError
@@ -43,7 +41,7 @@ SCALES = (0.8, 1.2, 0.9, 1.0)
 
 WEIGHT = (1.0, 0.28)  # kg, m from the elbow
 
-MOMENTS, UPRIGHT, STILL = moments_of(DEFAULT_LINKS), Tilt.of("right"), (0.0,) * 4
+MOMENTS, UPRIGHT, STILL = DEFAULT_LINKS.moments, Tilt.of("right"), (0.0,) * 4
 
 LEANT = Tilt.of("right", 0.05, 0.2)
 
@@ -276,7 +274,7 @@ def test_the_mass_matrix_of_an_arm_under_a_weight_is_in_the_torque_that_each_mot
     for theta, effort in zip(poses[:6], rows @ WEIGHED / scales, strict=True):
         guess.learn(theta, effort, (0.003,) * 4)
     for theta in poses[100:120]:
-        true = LinkInertia.of_moments(DEFAULT_LINKS.length, WEIGHED[:4], WEIGHT).matrix(theta)
+        true = PapersMoments(DEFAULT_LINKS, True).matrix(theta, WEIGHED, WEIGHT)
         np.testing.assert_allclose(guess.matrix(theta, WEIGHT), true / np.reshape(scales, (4, 1)), rtol=0.12, atol=1e-9)
 
 
@@ -300,13 +298,13 @@ def test_an_arm_hangs_on_until_it_is_carried_though_its_motors_are_stronger_than
 @pytest.mark.parametrize(("mass", "lever", "tolerance"), [(0.0, 0.0, 0.012), (*WEIGHT, 0.025)])
 def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
-    moments = moments_of(DEFAULT_LINKS) + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-    inertia = LinkInertia.of_moments(DEFAULT_LINKS.length, moments[:4], (mass, lever))
+    moments = DEFAULT_LINKS.moments + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
+    model = PapersMoments(DEFAULT_LINKS, True)
     for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
         arm.reset(theta)
         true = np.zeros((4, 4))
         mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(inertia.matrix(theta), true, atol=tolerance)
+        np.testing.assert_allclose(model.matrix(theta, moments, (mass, lever)), true, atol=tolerance)
 
 
 @pytest.mark.parametrize(("moments", "tilt", "count", "again"), [(MOMENTS, UPRIGHT, 4, 2), (WEIGHED, LEANT, 8, 0)])

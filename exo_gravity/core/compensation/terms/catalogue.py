@@ -27,10 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Links
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import JOINT_COUNT, for_joints
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, for_joints
 from exo_gravity.core.params import check_owned, owned, params_of
 
 DELAY = 0.015  # s from a reading to its torque: 10 ms, and half of a 10 ms cycle in which the torque is held

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from exo_gravity.core.arm.gravity import Torque
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.compensation.guidance import PAUSE
 from exo_gravity.core.compensation.terms.assist import Assist, AssistInput
@@ -31,7 +30,7 @@ from exo_gravity.core.compensation.terms.catalogue import (
     clamp,
 )
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.numbers import for_joints
+from exo_gravity.core.numbers import Torque, for_joints
 from exo_gravity.core.params import Param, params_of
 
 

@@ -14,18 +14,20 @@ law instead. An upright trunk needs no torque of joint 1. Gains c_n and gravity 
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from exo_gravity.core.arm.arm import ArmModel
-from exo_gravity.core.arm.arm_data import MAX_GRAVITY
-from exo_gravity.core.arm.gravity import Torque
+from exo_gravity.core.arm.interface import MAX_GRAVITY
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import DataError
-from exo_gravity.core.numbers import Vector, floats, one_float
+from exo_gravity.core.compensation.laws import ArmLaw, LawData, with_masses
+from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.numbers import Torque, Vector, floats, one_float
 
 MAX_RULES = 10_000  # 6 inputs of 4 functions give 4,096; more is probably a mistake, and would exhaust the memory
 PARTS = ("centre", "sigma", "consequent")
@@ -168,3 +170,38 @@ class AnfisLaw:
 def scaled(theta: np.ndarray, low: Vector, high: Vector) -> np.ndarray:
     """Return angles (n, d) in rad, scaled to -1..1 over the box from `low` to `high` (d,)."""
     return np.asarray((2.0 * theta - low - high) / np.subtract(high, low))
+
+
+def law(given: LawData) -> ArmLaw:
+    """Return the law `anfis` of the model in `anfis_file`: an entry point of exo_gravity.laws.
+
+    Raises ParameterError without a model or with another arm than the paper's, DataError if the file is none.
+    """
+    if not given.trained:
+        raise ParameterError("law", "anfis", "used with anfis_file, a model from train_anfis")
+    trained = _loaded(given.trained)
+    return ArmLaw(with_masses(given.arm, "anfis"), trained.torque, trained.outside)
+
+
+@lru_cache(2)
+def _loaded(text: str) -> AnfisLaw:
+    """Return `AnfisLaw.load`, once for all changes of other settings."""
+    return AnfisLaw.load(text)
+
+
+def text_of(law: AnfisLaw) -> str:
+    """Return the JSON text that `AnfisLaw.load` reads, one line per rule."""
+    joints = {}
+    for i, joint in enumerate(JOINTS):
+        joints[joint] = {f"{kind}_rmse": float(values[i]) for kind, values in law.error.items()}
+        joints[joint] |= {part: getattr(law.model, part)[i].tolist() for part in PARTS}
+    content = {
+        "format": FORMAT,
+        "about": "Takagi-Sugeno models (Jang 1993) of the holding torque in Nm of joints 2 to 4, trunk upright. "
+        "Inputs: joint angles, scaled to -1..1 over the box (rad). Consequents: p_0..p_3 of each rule.",
+        "source": law.source,
+        "arm": {"first_moment": law.first_moment, "gravity": law.gravity},
+        "box": dict(zip(INPUTS, zip(law.low, law.high, strict=True), strict=True)),
+        "joints": joints,
+    }
+    return re.sub(r"\[[^\[\]]*\]", lambda found: " ".join(found[0].split()), json.dumps(content, indent=1)) + "\n"
