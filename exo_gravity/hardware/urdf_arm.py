@@ -287,10 +287,8 @@ class UrdfArm(UrdfShape):
         """
         if np.array_equal(change, self.change):
             return self
-        arm = copy.copy(self)
-        arm._bare = self._shifted(self._bare, change - self.change, "urdf.moment")
-        arm.change = np.array(change)
-        return arm._holding_all()
+        bare = self._shifted(self._bare, change - self.change, "urdf.moment")
+        return self._with(_bare=bare, change=np.array(change))
 
     def turned(self, turn: np.ndarray) -> UrdfArm:
         """Return this arm with joints whose axes lie otherwise, in place of any other turn.
@@ -300,13 +298,11 @@ class UrdfArm(UrdfShape):
         """
         if np.array_equal(turn, self.turn):
             return self
-        _, arm = self.base, copy.copy(self)  # the copy keeps the base, which is computed before
-        arm._bare = self._bare.copy()
+        _, bare = self.base, self._bare.copy()  # the arm that is returned keeps the base
         for joint, old, new in zip(self._joints, self.turn, turn, strict=True):
-            place = arm._bare.jointPlacements[joint]
+            place = bare.jointPlacements[joint]
             place.rotation = place.rotation @ self._pin.exp3(old).T @ self._pin.exp3(new)
-        arm.turn = np.array(turn)
-        return arm._holding_all()
+        return self._with(_bare=bare, turn=np.array(turn))
 
     def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> UrdfArm:
         """Return this arm plus a share `support` (0..1) of what a wearer's arm adds to the first moments of the links.
@@ -315,7 +311,7 @@ class UrdfArm(UrdfShape):
         the arm alone. Raises ParameterError.
         """
         carried = one_float("support", support, 0.0, 1.0) * np.asarray(moments, dtype=float)
-        return self._with(replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
+        return self._with(_held=replace(self._held, worn=(), moments=tuple(map(tuple, carried.tolist()))))
 
     @cached_property
     def base(self) -> tuple[tuple[int, np.ndarray], ...]:
@@ -413,12 +409,11 @@ class UrdfArm(UrdfShape):
 
     def massless(self, gravity: float) -> UrdfArm:
         """Return an arm with these joints, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
+        bare = self._bare.copy()
+        for joint in range(bare.njoints):
+            bare.inertias[joint] = self._pin.Inertia.Zero()
         arm = self.scaled(np.ones(len(self.gain)).tolist(), gravity)
-        arm._own_mass = 0.0
-        arm._bare = self._bare.copy()
-        for joint in range(arm._bare.njoints):
-            arm._bare.inertias[joint] = self._pin.Inertia.Zero()
-        return arm._with(Held())
+        return arm._with(_bare=bare, _own_mass=0.0, _held=Held())
 
     def with_payload(self, mass: float, cog: Vector = ZERO) -> UrdfArm:
         """Return this arm with a load of `mass` kg in its hand, instead of any other. Raises ParameterError.
@@ -429,7 +424,7 @@ class UrdfArm(UrdfShape):
         if mass and not self._hand:
             raise ParameterError("payload.mass", mass, "0 without urdf.hand, which says where a load is held")
         x, y, z = floats("payload.cog", cog, 3, -MAX_REACH, MAX_REACH, "m").tolist()
-        return self._with(replace(self._held, payload=Payload(mass, (x, y, z))))
+        return self._with(_held=replace(self._held, payload=Payload(mass, (x, y, z))))
 
     def with_wearer(self, mass: Vector, cog: Vector, support: float = 1.0) -> UrdfArm:
         """Return this arm plus a share `support` (0..1) of the wearer's arm. Raises ParameterError.
@@ -445,26 +440,22 @@ class UrdfArm(UrdfShape):
             if own and length < LEAST_LENGTH:
                 raise ParameterError("wearer.mass", mass, f"0 on link {number}, which has no length and no direction")
         worn = tuple(zip(carried.tolist(), distance.tolist(), strict=True))
-        return self._with(replace(self._held, worn=worn, moments=()))
+        return self._with(_held=replace(self._held, worn=worn, moments=()))
 
-    def _with(self, held: Held) -> UrdfArm:
-        """Return this arm with all that it is to hold."""
+    def _with(self, **changes: object) -> UrdfArm:
+        """Return this arm with other values of attributes, and with all that it then holds on its links."""
         arm = copy.copy(self)
-        arm._held = held
-        return arm._holding_all()
-
-    def _holding_all(self) -> UrdfArm:
-        """Put load and wearer on the links, and forget the inertia of the arm that this is a copy of."""
-        self._by_mass, (mass, place) = self._bare.copy(), self._held.payload
+        arm.__dict__.update(changes)
+        arm._by_mass, (mass, place) = arm._bare.copy(), arm._held.payload
         if mass:
-            hand = self._by_mass.frames[self._by_mass.getBodyId(self._hand)]
-            self._add(hand.parentJoint, mass, hand.placement.act(np.array(place)))
-        for joint, (worn, cog), way in zip(self._joints, self._held.worn, self.directions, strict=False):
-            self._add(joint, worn, way * cog)
-        self._model = self._shifted(self._by_mass, np.array(self._held.moments), "wearer.moment")
-        self._data = self._model.createData()
-        self.__dict__.pop("links", None)
-        return self
+            hand = arm._by_mass.frames[arm._by_mass.getBodyId(self._hand)]
+            arm._add(hand.parentJoint, mass, hand.placement.act(np.array(place)))
+        for joint, (worn, cog), way in zip(self._joints, arm._held.worn, self.directions, strict=False):
+            arm._add(joint, worn, way * cog)
+        arm._model = self._shifted(arm._by_mass, np.array(arm._held.moments), "wearer.moment")
+        arm._data = arm._model.createData()
+        arm.__dict__.pop("links", None)  # the inertia of the other arm
+        return arm
 
     def _add(self, joint: int, mass: float, place: np.ndarray) -> None:
         """Add a point of `mass` kg to the link of `joint`, at `place` (3,) m in the joint's frame."""
