@@ -37,7 +37,7 @@ from exo_gravity.core.numbers import COVER
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.imu import mounting_turn
-from exo_gravity.lab.calibration.moment_model import GRID, PapersMoments
+from exo_gravity.lab.calibration.moment_model import GRID, MomentModel
 from exo_gravity.lab.calibration.poses import Itinerary, guess_for
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.calibration.tour import DURATION, Tour, TourController
@@ -76,7 +76,7 @@ SINKING, LONGEST = 5.0, 420.0  # s for which the arm sinks to where it hangs; of
 RELAXATION, AT_REST, STEPS = 0.1, 1e-6, 600  # rad: links find their rest behind elastic joints step by step
 LITTLE = 0.02  # Nm, below which a link hangs within its play
 ARM = configured_arm(packaged_config("sim.yaml"))
-MODEL = PapersMoments(DEFAULT_LINKS, keeps_tilt=True)
+MODEL = MomentModel(DEFAULT_LINKS, True)
 ASSUMED = tuple(JointMotor(MOTORS[kind], n) for n, kind in enumerate(USUAL_MOTORS, 1))
 
 

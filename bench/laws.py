@@ -116,7 +116,7 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
     yield Row(whole, ours.median / POSES * 1e6, peer.median / LOOP * 1e6, "us", spread)
 
     theta, still, tilt = poses[0].tolist(), np.zeros(count), Tilt.of("left")
-    hold = arm.by_moments(np.tile(arm.moments, (count, 1)))
+    hold = arm.holding(np.tile(arm.moments, (count, 1)))
     np.testing.assert_allclose(hold(theta, tilt), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
     loop_pose, peer, tour_pose, regressor = race(
         (

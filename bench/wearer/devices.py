@@ -23,9 +23,9 @@ from exo_gravity.core.compensation.terms.terms import TermSettings
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
+from exo_gravity.lab.calibration.moment_model import PAPERS
 from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
-from exo_gravity.lab.calibration.worn_arm import WORN
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -75,7 +75,7 @@ class Worn:
 @cache
 def relaxed_poses() -> tuple[tuple[float, ...], ...]:
     """Return the poses of `calibrate wearer`, chosen as it does, the first ones again at the end."""
-    low, high = np.maximum(ARM.low, WORN.comfortable[0]), np.minimum(ARM.high, WORN.comfortable[1])
+    low, high = np.maximum(ARM.low, PAPERS.comfortable[0]), np.minimum(ARM.high, PAPERS.comfortable[1])
     limits = replace(ARM.limits, position_min=low.tolist(), position_max=high.tolist())
     poses, taken = candidates(limits, MODEL), [hanging(limits).theta]
     expected = ARM.papers.with_wearer(*Wearer(sum(BODY_MASS) / 2.0).on_links(LENGTH)).moments

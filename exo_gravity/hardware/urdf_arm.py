@@ -336,7 +336,7 @@ class UrdfArm(UrdfShape):
         """
         return self._rows(theta, self.gravity * np.reshape(direction, (-1, 3)), self.base)
 
-    def by_moments(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
+    def holding(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
         """Return a function that computes the torque (n,) in Nm from theta (n,) rad and tilt, with moments per joint.
 
         moments: (n, k) kg m of `base`, a row for each joint. Gains do not count. The function has

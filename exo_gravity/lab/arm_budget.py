@@ -5,7 +5,6 @@ Over all poses within the joint limits and over the trunk's tilt. Holding an arm
 decides; peak torque lasts for seconds.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -14,12 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.paper import papers
 from exo_gravity.core.arm.wearer import PAPER_LINKS, LinkLoad, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
 from exo_gravity.core.safety.motion_monitor import GRAVITY
-from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.budget import (
     JointBudget,
     budget,
@@ -30,6 +27,7 @@ from exo_gravity.lab.budget import (
     workspace,
 )
 from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.moments import chain_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,7 +40,6 @@ HEADINGS = (
 LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}{:>12}"
 CELLS = 31  # of a map, along each axis
 REST = 5  # values of each angle that a map does not show
-OTHER = (1, 2, 3, 2)  # the second axis of each joint's map: the angle that affects it most
 MOST_RESTS, RANDOM_RESTS = 625, 200  # poses of the angles that a map does not show: at random if a grid has more
 
 
@@ -56,14 +53,13 @@ class ArmBudget:
     support: float  #: 0..1, that share
     motors: Sequence[str]
     bounds: np.ndarray  #: of its workspace, (2, n + 2) rad
-    by_urdf: bool  #: whether a URDF describes it
     joints: tuple[JointBudget, ...]
 
     @property
     def others(self) -> Sequence[int]:
-        """The second axis of each map: of an arm from a URDF the next joint, or the one before, or the pitch."""
+        """The second axis of each map: the next joint, or the one before, or the pitch."""
         count = len(self.joints)
-        return OTHER if not self.by_urdf else [n + 1 if n + 1 < count else n - 1 if n else 1 for n in range(count)]
+        return [n + 1 if n + 1 < count else n - 1 if n else 1 for n in range(count)]
 
     @property
     def is_beyond(self) -> bool:
@@ -91,7 +87,7 @@ def arm_budget(
         torques = motor_torques(configured.can_bridge)
         joints = budget(robot, load, joint_spring_of(values), support, bounds, *torques)
         carrying = robot.with_wearer(*load, support)
-    return ArmBudget(configured.namespace, names, carrying, support, motors, bounds, configured.by_urdf, joints)
+    return ArmBudget(configured.namespace, names, carrying, support, motors, bounds, joints)
 
 
 def table_lines(arm: ArmBudget) -> Iterator[str]:
@@ -126,16 +122,12 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
         yield "The robot alone needs more than rated torque somewhere: no support stays within it."
     elif arm.support:
         yield f"The largest support within rated torque everywhere is {fits:g}."
-    if arm.by_urdf:
-        yield from _skeleton_lines(arm, names)
-        return
-    moments = ", ".join(f"{math.ceil(1000.0 * moment) / 1000.0:g}" for moment in papers(arm.carrying).first_moment)
-    yield f"For the can_bridge of {names}, if it never carries more: largest_moment: [{moments}]  # kg m"
+    yield from _skeleton_lines(arm, names)
 
 
 def _skeleton_lines(arm: ArmBudget, names: str) -> Iterator[str]:
-    """Yield what the can_bridge of an arm from a URDF needs to judge efforts; nothing if it is no single chain."""
-    skeleton = arm.carrying.skeleton() if isinstance(arm.carrying, UrdfArm) else None
+    """Yield what the can_bridge needs to judge efforts; nothing if the arm is no single chain."""
+    skeleton = chain_of(arm.carrying).skeleton()
     if skeleton is None:
         return
     yield f"For the can_bridge of {names}, if it never carries more; add what assistance and terms may add:"
@@ -146,7 +138,8 @@ def _skeleton_lines(arm: ArmBudget, names: str) -> Iterator[str]:
         **{f"link_{name}": column for name, column in zip("xyz", skeleton.ways.T, strict=True)},
     }
     for name, values in rows.items():
-        yield f"    {name}: {(values.round(4) + 0.0).tolist()}"
+        if len(values):
+            yield f"    {name}: {(values.round(4) + 0.0).tolist()}"
 
 
 def joint_figure(arm: ArmBudget, joint: int) -> "Figure":

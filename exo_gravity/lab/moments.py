@@ -1,47 +1,141 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The eight moments of the paper's arm as unknowns: the torque per moment, and what a known weight adds to them.
+"""The paper's arm as a chain whose moments are unknown, with what `UrdfArm` has for that.
 
+<<<<<<< HEAD
 `core.arm.paper` defines the moments, and the torque that is linear in them.
+=======
+`core.arm.paper` defines its eight moments, and the torque that is linear in them. Each is a first moment of a link
+along an axis of the link's frame of Table 1.
+>>>>>>> f7541a0f (One model of moments and one worn arm for every arm: the paper's is a chain with a base of moments, as one from a URDF)
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.interface import MAX_MASS, STANDARD_GRAVITY
-from exo_gravity.core.arm.paper import MAX_LENGTH, ArmModel, gravity_torque
-from exo_gravity.core.numbers import JOINT_COUNT, Vector, four_floats, one_float
+from exo_gravity.core.arm.chain import frames
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Arm, Links
+from exo_gravity.core.arm.paper import ArmModel, gravity_torque
+from exo_gravity.core.arm.tilt import Tilt
+from exo_gravity.core.numbers import JOINT_COUNT, Torque, Vector
+from exo_gravity.hardware.urdf_arm import UrdfArm
+from exo_gravity.hardware.urdf_model import Skeleton
 
 MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
+X, Y, Z = np.eye(3)
+BASE = ((0, X), (1, X), (2, X), (3, X), (0, Z), (1, Z), (2, Y), (3, Y))  # link, and axis of its frame, of each moment
+SAME = ((1, 1, 4), (2, 2, 5), (3, 2, 5))  # link, axis, and the moment as which it counts: both are along one axis
+NOWHERE = np.empty((0, 3))
 
 
-def load_moments(length: Vector, mass: float, lever: float) -> np.ndarray:
-    """Return what a weight of `mass` kg on link 4, `lever` m from the elbow, adds to the moments: (8,) kg m.
+class PapersChain(ArmModel):
+    """The paper's arm by its moments, with gains of 1."""
 
-    length: (4,) m. Raises ParameterError.
-    """
-    lengths = four_floats("length", length, 0.0, MAX_LENGTH, "m")
-    mass = one_float("load_mass", mass, 0.0, MAX_MASS, "kg")
-    lever = one_float("load_lever", lever, 0.0, MAX_LENGTH, "m")
-    return np.array((*(mass * lengths[:3]).tolist(), mass * lever, 0.0, 0.0, 0.0, 0.0))
+    base = BASE
+    directions = np.tile(X, (JOINT_COUNT, 1))  # of the links, in their frames
+    turns = np.tile((Z, X, Y), (JOINT_COUNT, 1, 1))  # of each joint's place, one a row, in the frames `before`
+    moved_by = np.tri(JOINT_COUNT, dtype=bool).T  # whether a joint, the first index, moves the link of another
+
+    @classmethod
+    def of(cls, arm: ArmModel) -> PapersChain:
+        """Return `arm` as a chain."""
+        return cls._of(arm.length, arm.moments, arm.gravity)
+
+    @classmethod
+    def _of(cls, length: Vector, moments: np.ndarray, gravity: float) -> PapersChain:
+        along, across = moments.reshape(2, -1)
+        return cast(PapersChain, cls.from_moments(length, along, across, gravity=gravity))
+
+    def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the torque of each joint per unit of each moment: (m, 4, 8) in Nm per kg m.
+
+        theta: (m, 4) rad. direction: (3,) or (m, 3), gravity's unit vector in the arm's base frame.
+        """
+        return regressor(theta, direction, self.gravity)
+
+    def holding(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
+        """Return a function that computes the torque (4,) in Nm from theta (4,) rad and tilt, with moments per joint.
+
+        moments: (4, 8) kg m, a row for each joint.
+        """
+        units = _unit_arms(self.gravity)
+
+        def torque(theta: Sequence[float], tilt: Tilt) -> Torque:
+            rows = np.array([unit.torque(theta, tilt) for unit in units])
+            return tuple(np.einsum("kn,nk->n", rows, moments).tolist())
+
+        return torque
+
+    def frames(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how frames are turned at `theta` (m, 4) rad, (m, 4, 3, 3) to the base frame.
+
+        First that of each joint, of the link before and the joint's axis; then that of its link.
+        """
+        links = self._links(theta)
+        axis, along = links[:, :, 1], links[:, :, 2]
+        before = np.concatenate((np.broadcast_to(X, along[:, :1].shape), along[:, :-1]), axis=1)
+        own = np.stack((before, np.cross(axis, before), axis), axis=-1)
+        return own, np.swapaxes(links[:, :, 2:], 2, 3)
+
+    def places(self, theta: np.ndarray) -> np.ndarray:
+        """Return where the joints are at `theta` (m, 4) rad, and the end of link 4: (m, 5, 3) m in the base frame."""
+        links = self._links(theta)
+        return np.concatenate((links[:, :, 0], links[:, 3:, 0] + self.length[3] * links[:, 3:, 2]), axis=1)
+
+    def _links(self, theta: np.ndarray) -> np.ndarray:
+        return np.array([frames(self.length.tolist(), pose) for pose in theta.tolist()])  # (m, 4, 5, 3)
+
+    def worn_links(self, mass: Vector, cog: Vector) -> Links:  # type: ignore[override]
+        """Return the inertia with a point on link 4: the last of `mass` (4,) kg, at the last of `cog` (4,) m."""
+        return self.with_payload(mass[-1], (cog[-1] - self.length[3], 0.0, 0.0)).links
+
+    def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> PapersChain:
+        """Return this arm plus a share `support` of first moments (4, 3) kg m of the links, in their frames."""
+        more = support * np.einsum("na,nak->k", np.asarray(moments), _by_links())
+        return self._of(self.length, self.moments + more, self.gravity)
+
+    def skeleton(self) -> Skeleton:
+        """Return the largest moments; axes and links of the paper's arm are what `can_bridge` assumes."""
+        w, z, y3, y4 = np.abs(self.off_axis).tolist()
+        beside = np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
+        return Skeleton(NOWHERE, NOWHERE, np.array(self.first_moment), beside)
+
+
+Chain = PapersChain | UrdfArm
+
+
+def chain_of(arm: Arm) -> Chain:
+    """Return an arm as a chain with a base of moments."""
+    return PapersChain.of(arm) if isinstance(arm, ArmModel) else cast(UrdfArm, arm)
 
 
 def regressor(
     theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0), gravity: float = STANDARD_GRAVITY
 ) -> np.ndarray:
-    """Return the torque of each joint per unit of each moment: (n, 4, 8) in Nm per kg m.
-
-    theta: (n, 4) rad. direction: (3,) or (n, 3), gravity's unit vector in the base frame. The torque (n, 4) in Nm is
-    `regressor(...) @ moments`. Raises ParameterError as `gravity_torque` does.
-    """
+    """Return `PapersChain.regressor`. Raises ParameterError as `gravity_torque` does."""
     poses = np.atleast_2d(np.asarray(theta, dtype=float))
     return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
 
 
 @lru_cache(4)
-def _unit_arms(gravity: float) -> list[ArmModel]:
+def _unit_arms(gravity: float) -> list[PapersChain]:
     """Return an arm for each moment, which has that moment of 1 kg m and no other."""
     rows = np.eye(len(MOMENTS))
     no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
-    return [ArmModel.from_moments(no_length, row[:JOINT_COUNT], row[JOINT_COUNT:], gravity=gravity) for row in rows]
+    return [PapersChain._of(no_length, row, gravity) for row in rows]
+
+
+@lru_cache(1)
+def _by_links() -> np.ndarray:
+    """Return what 1 kg m of each link along each axis of its frame adds to the moments, (4, 3, 8)."""
+    added = np.zeros((JOINT_COUNT, 3, len(MOMENTS)))
+    for k, (link, way) in enumerate(BASE):
+        added[link, :, k] = way
+    for link, axis, k in SAME:
+        added[link, axis, k] = 1.0
+    return added

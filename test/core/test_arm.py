@@ -13,7 +13,8 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.wearer import SEX, TABLES, Wearer
 from exo_gravity.core.compensation.guidance import DropWatch
-from exo_gravity.lab.moments import load_moments, regressor
+from exo_gravity.lab.calibration.moment_model import MomentModel
+from exo_gravity.lab.moments import regressor
 from exo_gravity.sim import SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -112,7 +113,7 @@ def test_centres_of_gravity_off_the_links_axes_agree_with_pinocchio():
 def test_a_weight_on_link_4_adds_the_moments_of_a_wearer_of_that_mass():
     arm = ArmModel(LENGTH, (0.02, 0.1, 0.2, 0.1), (0.5, 0.4, 0.6, 0.2))
     loaded = arm.with_wearer((0, 0, 0, 1.0), (0, 0, 0, 0.25))
-    np.testing.assert_allclose(arm.moments + load_moments(LENGTH, 1.0, 0.25), loaded.moments, rtol=1e-12)
+    np.testing.assert_allclose(arm.moments + MomentModel(arm, True).load(1.0, 0.25), loaded.moments, rtol=1e-12)
 
 
 LENGTHS = (0.28, 0.27, 0.086)

@@ -25,7 +25,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, check_bridge, limits_of
 from exo_gravity.core.trunk.inputs import FeltMotion
 from exo_gravity.lab.anfis import Anfis, AnfisLaw, text_of
-from exo_gravity.lab.moments import load_moments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ..support import ROBOT
@@ -68,9 +68,9 @@ ARMS = [
     row(by_moments, "^first_moment = ", first_moment=(0.05, 0.2, 0.2, NAN)),
     row(by_moments, "^off_axis = ", off_axis=(0.01, -0.02, 0.003)),
     row(by_moments, "^off_axis = ", off_axis=(0.01, -20.0, 0.003, 0.0)),
-    row(load_moments, "^load_mass = ", LENGTH, 1000, 0.3),
-    row(load_moments, "^load_lever = ", LENGTH, 1, 300),
-    row(load_moments, "lever", LENGTH, 1, -0.1),
+    row(MomentModel(arm(), True).load, "^load_mass = ", 1000, 0.3),
+    row(MomentModel(arm(), True).load, "^load_lever = ", 1, 300),
+    row(MomentModel(arm(), True).load, "lever", 1, -0.1),
 ]
 for known, why in ((by_moments(), "needs mass and cog"), (arm(off_axis=OFF_AXIS), "knows no moments across")):
     words = rf"robot.(first_moment|off_axis) = .*must be 0 for paper_.*which {why}"

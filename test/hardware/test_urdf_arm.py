@@ -184,7 +184,7 @@ def test_one_pose_is_where_pinocchio_has_it_and_as_it_is_among_many():
     theta = random.uniform(-3.0, 3.0, (POSES, 3))
     down = np.array([random_gravity(random) for _ in theta]) / STANDARD_GRAVITY
     moments = random.normal(size=(3, len(arm.base)))
-    by_moments = arm.by_moments(moments)
+    by_moments = arm.holding(moments)
     rows, places, (before, after) = arm.regressor(theta, down), arm.places(theta), arm.frames(theta)
     for n, (j1, j3, j4) in enumerate(theta):
         one = theta[n : n + 1]

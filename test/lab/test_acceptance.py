@@ -13,7 +13,7 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
-from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
 from exo_gravity.lab.inputs.arms import configured_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
@@ -74,7 +74,7 @@ def acceptance(
     device.motors[0].temperature = spoil.pop("temperature", 25.0)
     for name, value in spoil.items():
         setattr(person, name, value)
-    return played(device, assumed, LIMITS, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), WEIGHT, person, RATE)
+    return played(device, assumed, LIMITS, MomentModel(DEFAULT_LINKS, True), WEIGHT, person, RATE)
 
 
 def played(
@@ -163,5 +163,5 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
 
 
 def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
-    bench = Bench(None, None, MOTORS, PapersMoments(DEFAULT_LINKS, keeps_tilt=True), WEIGHT, None, None, None)
+    bench = Bench(None, None, MOTORS, MomentModel(DEFAULT_LINKS, True), WEIGHT, None, None, None)
     assert bench.moments == pytest.approx(loaded_links().moments)

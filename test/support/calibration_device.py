@@ -23,13 +23,13 @@ from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.lab.calibration.live import LiveTour
-from exo_gravity.lab.calibration.moment_model import TYPICAL_MOMENTS, PapersMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.poses import Itinerary, guess_for, next_pose
 from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
-from exo_gravity.lab.moments import load_moments, regressor
+from exo_gravity.lab.moments import regressor
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.params import device_of, simulator_table
@@ -39,7 +39,8 @@ from .active_wearer import attach
 from .simulated_device import joints_of
 
 LENGTH = (0.05, 0.13, 0.30, 0.30)
-PAPERS = PapersMoments(ArmModel.from_moments(LENGTH, (0.0,) * 4), keeps_tilt=True)
+TYPICAL_MOMENTS = (0.08, 0.15, 0.2, 0.026, 0.0, 0.0, 0.0, 0.0)  # kg m, of a robot arm with the motors of this package
+PAPERS = MomentModel(ArmModel.from_moments(LENGTH, TYPICAL_MOMENTS[:4]), True)
 LEANING = Tilt.of("right", 0.30, 0.25).direction  # the stand, so that joint 1 carries something
 UPRIGHT = (0.0, 0.0, 1.0)
 Direction = tuple[float, float, float]
@@ -81,7 +82,7 @@ class Device:
 
     def observe(self, theta: Vector, direction: Vector = LEANING, weight: Weight = NO_WEIGHT) -> Observation:
         """Pass the pose in both directions: current noise of 2 %, 12 bits."""
-        effort = self.effort(theta, direction, load_moments(LENGTH, *weight))[0]
+        effort = self.effort(theta, direction, PAPERS.load(*weight))[0]
         mean, spread = [], []
         for way in (1.0, -1.0):
             one_way = effort + way * self.friction / self.scale
@@ -103,7 +104,7 @@ class Device:
 @cache
 def best(direction: Direction, count: int, weight: Weight = NO_WEIGHT) -> tuple[tuple[float, ...], ...]:
     """Return the `count` best poses; with a weight on the arm, without any before."""
-    moments = np.array(TYPICAL_MOMENTS) + load_moments(LENGTH, *weight)
+    moments = np.array(TYPICAL_MOMENTS) + PAPERS.load(*weight)
     taken: list[tuple[float, ...]] = []
     while len(taken) < count:
         taken.append(tuple(CANDIDATES[next_pose(taken, CANDIDATES, direction, moments, PAPERS)]))
@@ -197,7 +198,7 @@ class TourRun:
         device = SimulatedDevice(SimulatedArm(self.truth), [SimulatedMotor(motor) for motor in self.motors])
         device.pitch, device.roll = self.tilt
         tilt = Tilt.of("right", *self.tilt)
-        guess = guess_for(PapersMoments(self.assumed, keeps_tilt=True), tilt, self.load)
+        guess = guess_for(MomentModel(self.assumed, True), tilt, self.load)
         tour = Tour(self.limits, guess, itinerary or Itinerary(self.limits, 12, 230.0), self.rate, self.load)
         player = Player(tour, device, MOTORS_AS_MOUNTED, self.limits, self.rate, tilt, self._disturb)
         self.device, self.log = device, player.log

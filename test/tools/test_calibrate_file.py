@@ -30,12 +30,12 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import BusError, DataError, ParameterError
 from exo_gravity.hardware.ownership import bus_lock
 from exo_gravity.lab.calibration import identification, live
-from exo_gravity.lab.calibration.moment_model import PapersMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
-from exo_gravity.lab.moments import load_moments, regressor
+from exo_gravity.lab.moments import regressor
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.sim.script import TrialScript
 
@@ -294,7 +294,7 @@ POSES = np.radians(
     ]
 )  # fmt: skip
 IN_FILE = configured_arm().robot
-PAPERS = PapersMoments(IN_FILE, keeps_tilt=True)
+PAPERS = MomentModel(IN_FILE, True)
 #: The links of the configured arm, a fifth heavier, with centres of gravity off their axes.
 TRUE = ArmModel.from_moments(IN_FILE.length, 1.2 * np.array(IN_FILE.first_moment), (0.004, -0.006, 0.003, 0.002))
 LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on link 4
@@ -302,7 +302,7 @@ LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on l
 
 def predicted(arm: ArmModel) -> np.ndarray:
     """Return the torque (n, 4) in Nm that holds `arm` in each pose."""
-    weight = regressor(POSES, DOWN) @ load_moments(arm.length, *LOAD)
+    weight = regressor(POSES, DOWN) @ PAPERS.load(*LOAD)
     return gravity_torque(arm, POSES, DOWN) + LOADED[:, None] * weight
 
 

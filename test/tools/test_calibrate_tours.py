@@ -28,7 +28,7 @@ from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
 from exo_gravity.lab.calibration.tour import CALIBRATOR, observations_in, tour_of
 from exo_gravity.lab.calibration.tours import checked, friction_from, moments_from
 from exo_gravity.lab.calibration.wearer import wearer_from
-from exo_gravity.lab.calibration.worn_arm import worn_arm
+from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
@@ -351,7 +351,7 @@ def left_by_calibration(name: str, folder: Path, run_tool) -> tuple[float, float
     described = (CONFIG / "arms" / f"{name}.urdf").read_text(encoding="utf-8"), simulator["joint_names"]
     truth = WornMujocoArm(*described, mass, cog, stiffness=STIFFNESS * last, rest=REST * last)
     without = WornMujocoArm(*described, 0.0 * mass, cog)
-    poses = np.random.default_rng(8).uniform(*worn_arm(configured_arm(files[0], "right")).comfortable, (50, len(mass)))
+    poses = np.random.default_rng(8).uniform(*WornArm(configured_arm(files[0], "right")).comfortable, (50, len(mass)))
     true, bare = (np.array([one.torque(pose) for pose in poses]) for one in (truth, without))
     given = ([settings_in(file).torque(pose, Tilt.of("left"))[0] for pose in poses.tolist()] for file in files)
     before, after = (float(np.abs(torque - true).max() / np.abs(true - bare).max()) for torque in given)

@@ -54,7 +54,7 @@ def held(
     kept[at.offset] *= unknowns[at.spring] > 0.0
     kept[at.tilt] *= model.keeps_tilt
     turns = kept[at.turn].reshape(-1, TURNS)
-    turns[:, 1:] *= model.keeps_axes
+    turns[:, 1:] *= model.kind.is_described
     free = np.flatnonzero(known)
     left = scale * (new.predicted(unknowns) - new.predicted(kept))
     by_moments = scale[:, None] * new.jacobian(kept)[..., at.moment]
@@ -62,7 +62,7 @@ def held(
         matrix = by_moments[..., free].reshape(-1, len(free))
         moments = kept[at.moment].copy()
         moments[free] += np.linalg.lstsq(matrix, left.ravel(), rcond=None)[0]
-        below = [index for index in free if index in model.positive and moments[index] < 0.0]
+        below = [index for index in free if index in model.kind.at_least_0 and moments[index] < 0.0]
         if not below:
             break
         left += by_moments[..., below] @ kept[below]  # as if they were 0
@@ -83,4 +83,4 @@ def _new_poses(model: MomentModel, start: np.ndarray) -> Rows:
     leans = random.normal(0.0, LEAN * model.keeps_tilt, (POSES, 2)).tolist()
     down = np.array([model.down(Tilt.of(SIDES[0], pitch, roll)) for pitch, roll in leans])
     rows = unmeasured(model, theta, down, start)
-    return rows._replace(turned=model.turned(theta)[..., : model.turns])
+    return rows._replace(turned=model.turned(theta))

@@ -40,11 +40,10 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.held import held
-from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel, PapersMoments
+from exo_gravity.lab.calibration.moment_model import TURNS, MomentModel
 from exo_gravity.lab.calibration.pose_fit import (
     DISTURBED,
     FIT,
-    FitLayout,
     Places,
     asked_for,
     bounded,
@@ -58,7 +57,6 @@ from exo_gravity.lab.calibration.pose_fit import (
     without_outliers,
 )
 from exo_gravity.lab.calibration.poses import missing_pose, shown_by
-from exo_gravity.lab.moments import MOMENTS
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,6 @@ class Acceptance:
     scales: tuple[float, float] = (0.3, 3.0)  #: true torque per commanded torque; users report 0.75
     misfit: float = 0.1  #: of the peak effort
     least_misfit: float = 0.1  #: Nm
-    least_zero_error: float = 0.5  #: deg worth a sentence
     slope: float = 0.005  #: 1/K; magnets lose 0.001 to 0.002
     turn: float = 6.0  #: deg of a zero or an axis; more is no error of what was measured or drawn
     least_torque: float = 0.3  #: Nm, root mean square of a joint in any pose, from which it is compared with the URDF's
@@ -100,7 +97,7 @@ class Identified:
     """The result of `identify` from m observations of n joints. Two standard errors cover 95 %, also for few poses."""
 
     moments: np.ndarray  #: (k,) kg m in the order of the model's names
-    #: (k,) kg m, their standard errors, infinite where the poses do not show a moment, which is then the model's start
+    #: (k,) kg m, their standard errors, infinite where the poses do not show a moment, which is then the file's
     error: np.ndarray
     scale: np.ndarray  #: (n,), true torque per commanded torque
     scale_error: np.ndarray  #: (n,), standard errors, infinite where not known
@@ -143,12 +140,14 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     while True:
         rows = plain.with_extras(extras)
         # With few poses, zeros and axes that are free could explain that one of them was touched.
-        keep, rejected = without_outliers(rows if model.keeps_axes else rows.holding(range(at.turn.start, at.count)))
+        keep, rejected = without_outliers(
+            rows if model.kind.is_described else rows.holding(range(at.turn.start, at.count))
+        )
         fewer = asked_for(plain.only(keep), extras, final)  # an outlier may have looked like a spring
         if fewer == extras:
             break
         extras = fewer
-    used, solution = bounded(rows.only(keep), model.positive)
+    used, solution = bounded(rows.only(keep), model.kind.at_least_0)
     typical, peak = np.median(np.abs(solution.residual), axis=0), np.abs(used.effort).max(axis=0)
     for joint in np.flatnonzero(typical > np.maximum(ACCEPTED.misfit * peak, ACCEPTED.least_misfit)):
         misfit = f"joint {joint + 1} is {typical[joint]:.2f} Nm off in half of the poses"
@@ -176,7 +175,7 @@ def identify(observations: Sequence[Observation], model: MomentModel, places: Pl
     friction = np.median([observation.friction for observation in observations], axis=0)
     return Identified(
         moments, error[at.moment], scale, scale * error[at.scale], unknowns[at.offset], friction, residual, held_out,
-        solution.singular_values, tuple(_unknown(unknowns, covariance, hidden, is_relative, model)), rejected,
+        solution.singular_values, tuple(_unknown(unknowns, hidden, is_relative, model)), rejected,
         is_relative, unknowns[at.tilt], covariance[at.tilt, at.tilt], stiffness,
         error[at.spring] * (stiffness > 0.0), np.clip(slack, -MAX_REST, MAX_REST), slope,
         error[at.slope] * (slope != 0.0),
@@ -190,8 +189,10 @@ def _check_known(hidden: np.ndarray, count: int, direction: Vector, model: Momen
     """Raise DataError that names what is missing if `count` poses do not show `hidden` (count,) that others would."""
     at = layout_of(model)
     missing = hidden & shown_by(model, model.suggested, direction)
-    missing[list(model.optional)] = False
-    if np.all(missing[at.scale][list(model.compared)]) and not is_relative:
+    shown = model.upright  # what shows while the base leans needs no pose
+    needed = np.concatenate((shown.any(axis=0), *(shown.any(axis=1),) * 2, np.ones(at.count - at.angle.start, bool)))
+    missing &= needed
+    if np.all(missing[at.scale][model.compared]) and not is_relative:
         raise DataError("the weight shows no common factor: hang a heavier one, or hold it with a horizontal forearm")
     if np.any(missing):
         names = ", ".join(name for name, is_missing in zip(_names(model), missing, strict=False) if is_missing)
@@ -235,25 +236,20 @@ def check_physical(
     for joint in np.flatnonzero((scale < low) | (scale > high)):
         expected = f"from {low:g} to {high:g}: is joint {joint + 1}'s direction or motor type wrong, or did it slip?"
         raise DataError(f"torque scale {joint + 1} = {scale[joint]:.3g}: must be {expected}")
-    if isinstance(model, PapersMoments):
-        _check_papers_arm(moments, error, direction, model)
-    else:
-        _check_like(moments, direction, model)
-
-
-def _check_papers_arm(moments: np.ndarray, error: np.ndarray, direction: Vector, model: MomentModel) -> None:
-    for index in (1, 2, 3):
-        moment, uncertain = f"{MOMENTS[index]} = {moments[index]:.3f} kg m", error[index]
+    for index in model.kind.above_0:
+        moment, uncertain = f"{model.names[index]} = {moments[index]:.3f} kg m", error[index]
         if uncertain > abs(moments[index]):
             pose = missing_pose(np.arange(layout_of(model).count) == index, direction, model)
             raise DataError(f"{moment} is not known better than {uncertain:.3f}: add the pose {pose}")
         if moments[index] <= 0.0:
             raise DataError(f"{moment}: must be positive: check direction and zero of joint {index + 1}")
-    for across, along in ((6, 2), (7, 3)):
+    for across, along in model.kind.across:
         if abs(moments[across]) > moments[along]:
+            beside = f"{model.names[across]} = {moments[across]:.3f} kg m exceeds {model.names[along]}"
             angle = math.degrees(math.atan2(moments[across], moments[along]))
-            seems = f"the zero of joint {along + 1} seems {angle:.0f} degrees off"
-            raise DataError(f"{MOMENTS[across]} = {moments[across]:.3f} kg m exceeds {MOMENTS[along]}: {seems}")
+            raise DataError(f"{beside}: the zero of joint {along + 1} seems {angle:.0f} degrees off")
+    if model.kind.is_described:
+        _check_like(moments, direction, model)
 
 
 def _check_like(moments: np.ndarray, direction: Vector, model: MomentModel) -> None:
@@ -269,33 +265,20 @@ def _check_like(moments: np.ndarray, direction: Vector, model: MomentModel) -> N
             raise DataError(f"joint {joint + 1} needs {share:.2g} times the torque of the URDF: must be {expected}")
 
 
-def _unknown(
-    unknowns: np.ndarray, covariance: np.ndarray, hidden: np.ndarray, relative: bool, model: MomentModel
-) -> Iterator[str]:
+def _unknown(unknowns: np.ndarray, hidden: np.ndarray, relative: bool, model: MomentModel) -> Iterator[str]:
     """Yield what the poses do not show, and what would, in sentences; unknowns and `hidden`: (count,)."""
-    at = layout_of(model)
     if relative:
         yield f"A common factor of all torque scales and moments: hang a known weight on link {model.count}."
     names = ", ".join(name for name, is_hidden in zip(_names(model), hidden, strict=False) if is_hidden)
-    if isinstance(model, PapersMoments):
-        if names:
-            yield f"{names}: joint 1 carries nothing while its axis is vertical: {LEAN}."
-        yield from _zeros(unknowns, covariance, at)
+    idle = ", ".join(f"joint {n + 1}" for n in np.flatnonzero(~model.upright.any(axis=1)))
+    if names and idle:
+        yield f"{names}: {idle} carries nothing while its axis is vertical: {LEAN}."
     elif names:
         yield f"{names}: no pose shows them while the base stands as it does; the file's values are kept."
-
-
-def _zeros(unknowns: np.ndarray, covariance: np.ndarray, at: FitLayout) -> Iterator[str]:
-    """Yield what an error of a zero of the paper's arm looks like."""
-    for joint, along, across in ((4, 3, 7), (3, 2, 6)):
+    for across, along in model.kind.across:
         angle = math.degrees(math.atan2(unknowns[across], unknowns[along]))
         looks = f"it looks like one of {angle:+.1f} degrees; check the zero with a level or at a stop."
-        yield f"{MOMENTS[across]} of link {joint} from an error of joint {joint}'s zero: {looks}"
-    seems = np.zeros(at.count)  # in what the weight shows, both add up
-    seems[[at.angle.start, at.turn.start + 2 * TURNS]] = 1.0
-    elbow, elbow_error = math.degrees(seems @ unknowns), math.degrees(math.sqrt(seems @ covariance @ seems))
-    if elbow and abs(elbow) > max(3.0 * elbow_error, ACCEPTED.least_zero_error):
-        yield f"The weight shows joint 3's zero {elbow:+.1f} +- {elbow_error:.1f} degrees off."
+        yield f"{model.names[across]} of link {along + 1} from an error of joint {along + 1}'s zero: {looks}"
 
 
 class FrictionCurve(NamedTuple):

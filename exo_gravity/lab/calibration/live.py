@@ -25,7 +25,7 @@ from rich.text import Text
 
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
-from exo_gravity.lab.calibration.tour import ARM, BRIDGE, OF_BRIDGE, of_urdf
+from exo_gravity.lab.calibration.tour import BRIDGE, of_arm
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import load
@@ -92,13 +92,10 @@ class LiveTour:
         return self.measured
 
 
-def tour_parameters(
-    params: Path, arm: ConfiguredArm, changes: Mapping[str, Any], moments: np.ndarray | None = None
-) -> dict[str, Any]:
+def tour_parameters(params: Path, arm: ConfiguredArm, changes: Mapping[str, Any]) -> dict[str, Any]:
     """Return the nodes of a file in which `calibrator` replaces the compensator of `arm`, each with its parameters.
 
-    changes: parameters of `calibrator` that differ from the arm's. moments: (8,) kg m of the paper's arm, as far as
-    known, by default those of the robot alone. Raises ParameterError.
+    changes: parameters of `calibrator` that differ from the arm's. Raises ParameterError.
     """
     bridge, compensator = arm.can_bridge, arm.compensator
     if list(compensator["joint_names"]) != list(bridge["joint_names"]):
@@ -111,17 +108,10 @@ def tour_parameters(
         none = [0.0] * (len(arm.joint_names) - 1)
         simulator["wearer.mass"] = [*none, mass]
         simulator["wearer.cog"] = [*none, changes["tour.load_lever"]]
-    if arm.by_urdf:
-        values = {name: value for name, value in compensator.items() if of_urdf(name)}
-        values |= {name: bridge[name] for name in OF_BRIDGE}
-        strongest = np.array(bridge["max_effort"])
-        own = np.array(compensator["max_effort"])
-        values["max_effort"] = np.where(own > 0.0, np.minimum(own, strongest), strongest).tolist()
-    else:
-        expected = (arm.papers.moments if moments is None else moments).tolist()
-        values = {name: compensator[name] for name in ARM} | {name: bridge[name] for name in BRIDGE}
-        values["max_effort"] = np.minimum(bridge["max_effort"], compensator["max_effort"]).tolist()
-        values |= {"first_moment": expected[:4], "off_axis": expected[4:]}
+    values = {name: value for name, value in compensator.items() if of_arm(name)}
+    values |= {name: bridge[name] for name in BRIDGE}
+    strongest, own = np.array(bridge["max_effort"]), np.array(compensator["max_effort"])
+    values["max_effort"] = np.where(own > 0.0, np.minimum(own, strongest), strongest).tolist()
     return {**nodes, f"{arm.namespace}/calibrator": values | dict(changes)}
 
 

@@ -2,8 +2,7 @@
 """Weighted least squares for the unknowns of an arm in held poses.
 
 The unknowns are the moments of an arm of n joints (moment_model.py) in kg m, the logarithm of its torque scales, the
-offsets in Nm, the angles by which a known weight seems to lie beside the links (a zero of the paper's joint 3 or 4 that
-is off by a degree moves a weight by more than a light forearm's own moment), the rotation of gravity's direction from
+offsets in Nm, the angles by which a known weight seems to lie beside its link, the rotation of gravity's direction from
 the measured to the true one (an IMU is mounted, and a stand placed, to no better than a degree), and small turns of the
 joints' places. The commanded effort is `torque(moments + load) / scale + offset`: nearly
 linear, so a few Gauss-Newton steps solve it. Each step leaves out the combinations of unknowns that the poses do not
@@ -74,7 +73,7 @@ class FitLayout:
 def layout_of(model: MomentModel) -> FitLayout:
     """Return where the unknowns of an arm stand."""
     joints = model.count
-    sizes = len(model.names), joints, joints, model.beside, 3, joints, joints, model.turns
+    sizes = len(model.names), joints, joints, 2, 3, joints, joints, TURNS * joints
     ends = np.cumsum((0, *sizes)).tolist()
     moment, scale, offset, angle, tilt, spring, slope, turn = map(slice, ends[:-1], ends[1:])
     natural = np.repeat(NATURAL, sizes)
@@ -224,20 +223,20 @@ def rows_of(observations: Sequence[Observation], model: MomentModel, places: Pla
     load, beside = (np.array([of(*weight) for weight in weights]) for of in (model.load, model.load_beside))
     unit = np.eye(at.count)
     # Without a weight a common factor of scales and moments does not show.
-    product = unit[at.scale][list(model.compared)].sum(axis=0, keepdims=True) * (not np.any(load))
+    product = unit[at.scale][model.compared].sum(axis=0, keepdims=True) * (not np.any(load))
     tilt = unit[at.tilt] / (FIT.tilt_error if model.shows_tilt else EXACT)
-    scales = unit[at.scale] / FIT.scale_error if model.expects_scales else unit[:0]
-    turned_by = np.resize((places.zero, places.axis, places.axis), model.turns)
+    scales = unit[at.scale] / FIT.scale_error if model.kind.is_described else unit[:0]
+    turned_by = np.resize((places.zero, places.axis, places.axis), TURNS * model.count)
     if model.shows_tilt:
         turned_by[:TURNS] = 0.0  # the whole arm turns with its first joint, which is the same as gravity turned
     turns = unit[at.turn] / np.maximum(turned_by, EXACT)[:, None]
     slopes = unit[at.slope] / FIT.slope_error
     anchor = np.vstack((unit[at.angle] / FIT.beside_error, tilt, scales, slopes, turns, product / EXACT))
     along, sigma = along_axes(model, theta), np.hypot(spread, FIT.least_spread)
-    turned = model.turned(theta)[..., : model.turns]
+    turned = model.turned(theta)
     temperature = temperatures(observations)
     warmth = np.nan_to_num(temperature - temperature.mean(axis=0))
-    start = at.start(model.start)
+    start = at.start(model.moments)
     return Rows(along, turned, theta, warmth, direction, load, beside, effort, sigma, at, start, anchor)
 
 
@@ -247,8 +246,8 @@ def unmeasured(model: MomentModel, theta: np.ndarray, direction: np.ndarray, sta
     theta: (m, n) rad. direction: (m, 3). start: (count,).
     """
     at, along, none = layout_of(model), along_axes(model, theta), np.zeros_like(theta)
-    turned, load = np.zeros((*along.shape, model.turns)), np.zeros((len(theta), at.moments))
-    beside = np.zeros((*load.shape, model.beside))
+    turned, load = np.zeros((*along.shape, TURNS * model.count)), np.zeros((len(theta), at.moments))
+    beside = np.zeros((*load.shape, 2))
     return Rows(along, turned, theta, none, direction, load, beside, none, none, at, start, np.zeros((0, at.count)))
 
 
@@ -329,7 +328,8 @@ def bounded(rows: Rows, positive: Sequence[int]) -> tuple[Rows, Solution]:
     for index in positive:
         if solution.unknowns[index] < 0.0 and solution.hidden[index] <= FIT.hidden:
             error = solution.covariance[index, index]
-            used, solution = final(rows.holding([index]))
+            at_0 = np.where(np.arange(len(rows.start)) == index, 0.0, rows.start)
+            used, solution = final(rows._replace(start=at_0).holding([index]))
             solution.unknowns[index], solution.covariance[index, index] = 0.0, error
     return used, solution
 

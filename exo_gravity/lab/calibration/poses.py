@@ -97,7 +97,7 @@ class TorqueGuess:
 
     @property
     def common_moments(self) -> np.ndarray:
-        """The moments (k,) in kg m as the joints show them; M_n of the paper's arm is that of joint n."""
+        """The moments (k,) in kg m as the joints show them that carry them with their own links."""
         return self.model.common(self._moments)
 
     def torque(self, theta: Sequence[float]) -> Torque:
@@ -167,7 +167,7 @@ class TorqueGuess:
         A torque that the joints share in another proportion than their motors give it turns light links against each
         other: with 1 kg and the arm abducted, joints 1 and 3 together carry 1 kg m^2, but 0.005 against each other.
         """
-        return self.strength[:, None] * self.model.matrix(theta, self._start, load)
+        return self.strength[:, None] * self.model.matrix(theta, load)
 
 
 def guess_for(
@@ -319,14 +319,14 @@ def next_pose(
 def missing_pose(hidden: np.ndarray, direction: Vector, model: MomentModel) -> str:
     """Return, in words, the suggested pose that shows most of the unknowns of which `hidden` (count,) are not known."""
     poses = model.suggested
-    shown = _sensitivity(poses, direction, model.start, model) * layout_of(model).natural * hidden
+    shown = _sensitivity(poses, direction, model.moments, model) * layout_of(model).natural * hidden
     best = poses[int(np.argmax((shown**2).sum(axis=(1, 2))))]
     return f"[{', '.join(f'{math.degrees(angle):.0f}' for angle in best)}] degrees"
 
 
 def shown_by(model: MomentModel, poses: np.ndarray, direction: Vector) -> np.ndarray:
     """Return which of the unknowns (count,) `poses` (m, n) rad could show."""
-    shown = _sensitivity(poses, direction, model.start, model) * layout_of(model).natural
+    shown = _sensitivity(poses, direction, model.moments, model) * layout_of(model).natural
     return np.asarray(np.sqrt((shown**2).sum(axis=(0, 1))) > CHOICE.shown * math.sqrt(len(poses)))
 
 

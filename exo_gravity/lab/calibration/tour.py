@@ -17,20 +17,17 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.interface import MAX_MASS
-from exo_gravity.core.arm.paper import MAX_LENGTH, MAX_MOMENT, ArmModel
+from exo_gravity.core.arm.paper import MAX_LENGTH
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
-from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
+from exo_gravity.core.compensation.settings import compensator_table
 from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import DataError, ExoGravityError
-from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
 from exo_gravity.core.numbers import Torque
 from exo_gravity.core.params import Param, table_for
 from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
-from exo_gravity.hardware.urdf_arm import arm_in_file
-from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
+from exo_gravity.lab.calibration.moment_model import model_of
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
 from exo_gravity.sim.controllers import SampleController
 
@@ -296,50 +293,42 @@ def observations_in(record: Path, joints: int) -> list[Observation]:
         raise DataError(f"{record}: {error}: must be the record (.jsonl) of a tour of this arm") from None
 
 
-ARM = ("side", "joint_names", "link_length", "gravity", "use_imu", "tilt_timeout")  # as the compensator's
-MOMENTS = ("first_moment", "off_axis")  # of the paper's arm
+# As the compensator's, of the paper's arm or one from a URDF, and those that describe its links.
+ARM = (
+    "side", "joint_names", "law", "gravity", "use_imu", "tilt_timeout", "link_length", "robot.mass", "robot.cog",
+    "robot.first_moment", "robot.off_axis",
+)  # fmt: skip
 LIMITS = ("position_min", "position_max", "max_effort")
-BRIDGE = ("rate", *LIMITS)  # as can_bridge's
+BRIDGE = ("rate", *LIMITS, "motor", "home")  # as can_bridge's
 DURATION = 230.0  # s of a tour, for which the poses are chosen
-CALIBRATOR = (
-    *(replace(param, fixed=True) for param in COMPENSATOR if param.name in ARM),
-    Param(
-        "first_moment", [0.0] * 4, "M1 to M4 as far as known, with the wearer", (0.0, MAX_MOMENT), "kg m", fixed=True
-    ),
-    Param("off_axis", [0.0] * 4, "W, Z, Y3, Y4 as far as known", (-MAX_MOMENT, MAX_MOMENT), "kg m", fixed=True),
-    *(param for param in CAN_BRIDGE if param.name in BRIDGE),
+OWN = (
     Param("tour.poses", 12, "number of poses that are chosen", (1, 100), fixed=True),
     Param("tour.again", 0, "number of the first poses that are visited again at the end", (0, 100), fixed=True),
     Param("tour.friction", False, "sweep the hanging arm at several speeds, then a few chosen poses", fixed=True),
     Param("tour.load_mass", 0.0, "weight that hangs on the last link", (0.0, MAX_MASS), "kg", fixed=True),
     Param("tour.load_lever", 0.0, "its distance from the last joint", (0.0, MAX_LENGTH), "m", fixed=True),
     Param("tour.earlier", "", "record (.jsonl) of an earlier tour, whose poses without a weight are known", fixed=True),
-)
-# Of an arm from a URDF: the paper's has its wearer in first_moment and off_axis.
-WORN = (
     Param("tour.wearer_mass", [0.0] * 4, "expected mass of the wearer's segment on each link", (0.0, MAX_MASS), "kg",
           fixed=True),
     Param("tour.wearer_cog", [0.0] * 4, "its centre of gravity from the link's joint", (0.0, MAX_LENGTH), "m",
           fixed=True),
 )  # fmt: skip
-OF_URDF = ("joint_names", "gravity", "use_imu", "tilt_timeout", "law")  # as the compensator's, for an arm from a URDF
-OF_BRIDGE = (*BRIDGE, "motor", "home")
 
 
-def of_urdf(name: str) -> bool:
-    """Return whether the compensator's parameter `name` says how an arm from a URDF is calibrated."""
-    return name in OF_URDF or name.startswith("urdf.")
+def of_arm(name: str) -> bool:
+    """Return whether the compensator's parameter `name` says how an arm is calibrated."""
+    return name in ARM or name.startswith("urdf.")
 
 
 def calibrator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     """Return the parameters of `calibrator` for an arm with the parameters `given`."""
-    if given.get("law") != URDF_LAW:
-        return CALIBRATOR
-    own = [replace(param, fixed=True) for param in compensator_table(given) if of_urdf(param.name)]
-    known = {param.name for param in own} | {*ARM, *MOMENTS, *BRIDGE}
-    bridge = {param.name: param for param in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if param.name in OF_BRIDGE}
-    others = (param for param in CALIBRATOR if param.name not in known)
-    return tuple(table_for((*own, *bridge.values(), *others, *WORN), given))
+    own = [replace(param, fixed=True) for param in compensator_table(given) if of_arm(param.name)]
+    known = {param.name for param in own}
+    bridge = {one.name: one for one in (*CAN_BRIDGE, *MOTOR_PARAMETERS) if one.name in BRIDGE and one.name not in known}
+    return tuple(table_for((*own, *bridge.values(), *OWN), given))
+
+
+CALIBRATOR = calibrator_table({})  # of the paper's arm
 
 
 def side_of(values: Mapping[str, Any]) -> str:
@@ -349,33 +338,12 @@ def side_of(values: Mapping[str, Any]) -> str:
 
 def tour_of(values: Mapping[str, Any]) -> Tour:
     """Return the tour that parameter values describe. Raises ParameterError."""
-    load, is_urdf = (values["tour.load_mass"], values["tour.load_lever"]), values.get("law") == URDF_LAW
-    given_limits = {name: values[name] for name in ((*LIMITS, "home") if is_urdf else LIMITS)}
-    limits = Limits(tuple(values["joint_names"]), **given_limits)
-    worn = (values["tour.wearer_mass"], values["tour.wearer_cog"]) if is_urdf else ()
-    model = urdf_moments(values, worn) if is_urdf else _papers_moments(values)
+    load = values["tour.load_mass"], values["tour.load_lever"]
+    limits = Limits(tuple(values["joint_names"]), **{name: values[name] for name in (*LIMITS, "home")})
+    model = model_of(values, (values["tour.wearer_mass"], values["tour.wearer_cog"]))
     earlier = observations_in(Path(values["tour.earlier"]), model.count) if values["tour.earlier"] else []
     guess = guess_for(model, Tilt.of(side_of(values)), load, earlier)
     given = friction_stations(limits) if values["tour.friction"] else ()
     count = len(given) + RAISED if given else values["tour.poses"]
     itinerary = Itinerary(limits, count, DURATION, given, values["tour.again"])
     return Tour(limits, guess, itinerary, values["rate"], load)
-
-
-def urdf_moments(values: Mapping[str, Any], worn: Sequence[Sequence[float]] = ()) -> UrdfMoments:
-    """Return the moments of the arm from a URDF that parameter values describe, with the rotors of its motors.
-
-    worn: mass (n,) in kg and centre of gravity (n,) in m of a wearer's segments on its links; () for none.
-
-    Raises ParameterError, also if the URDF comes from a topic.
-    """
-    arm = arm_in_file(values, ": a calibration does not wait for a topic")
-    rotors = [MOTORS[name].rotor_inertia for name in values["motor"]]
-    arm = arm.scaled([1.0] * len(values["joint_names"]), values["gravity"])
-    return UrdfMoments(arm.with_wearer(worn[0], worn[1]) if worn else arm, rotors, values["use_imu"])
-
-
-def _papers_moments(values: Mapping[str, Any]) -> MomentModel:
-    moments = values["first_moment"], values["off_axis"]
-    arm = ArmModel.from_moments(values["link_length"], *moments, gravity=values["gravity"])
-    return PapersMoments(arm, values["use_imu"])

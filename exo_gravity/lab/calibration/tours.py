@@ -21,18 +21,17 @@ from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
 from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
-from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES
-from exo_gravity.lab.calibration import live
+from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
+from exo_gravity.lab.calibration import live, moment_model
 from exo_gravity.lab.calibration.identification import Identified, fit_friction, identify
 from exo_gravity.lab.calibration.live import Say, tour_parameters
-from exo_gravity.lab.calibration.moment_model import MomentModel, PapersMoments, UrdfMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.pose_fit import Places, columns, temperatures
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
-from exo_gravity.lab.calibration.tour import observations_in, urdf_moments
+from exo_gravity.lab.calibration.tour import observations_in
 from exo_gravity.lab.inputs.arms import ConfiguredArm
-from exo_gravity.lab.moments import MOMENTS
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`
 LEAN = (
@@ -83,17 +82,16 @@ def places_of(options: argparse.Namespace) -> Places:
 
 
 def tour_observations(
-    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = "",
-    moments: np.ndarray | None = None,
-) -> list[Observation]:  # fmt: skip
+    options: argparse.Namespace, arm: ConfiguredArm, say: Say, changes: Mapping[str, Any], request: str = ""
+) -> list[Observation]:
     """Return what a tour measures, or what `options.bag` shows.
 
-    changes, moments: as for `tour_parameters`.
+    changes: as for `tour_parameters`.
     request: what a person does first; they cannot reach a simulated device.
     """
     if options.bag:
         return observations_of(options.bag, arm, with_held="tour.friction" not in changes)
-    nodes = tour_parameters(options.params, arm, changes, moments)
+    nodes = tour_parameters(options.params, arm, changes)
     if request and f"{arm.namespace}/simulator" not in nodes:
         options.wait(request)
     return live.run_tour(options, nodes, say).complete(options.record)
@@ -122,19 +120,13 @@ def calibrate_scale(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -
 
 def _request(arm: ConfiguredArm, mass: float, lever: float) -> str:
     """Return what a person is asked to hang on the arm."""
-    if arm.by_urdf:
-        return f"Hang {mass:g} kg on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
-    return f"Hang {mass:g} kg on link 4, {lever:g} m from the elbow. {LEAN}"
+    where = f"on the last link, {lever:g} m from {arm.joint_names[-1]}, on the way to the hand"
+    return f"Hang {mass:g} kg {where}" + (f". {LEAN}" if arm.compensator["use_imu"] else "")
 
 
 def model_of(arm: ConfiguredArm) -> MomentModel:
     """Return the moments of an arm as configured. Raises ParameterError."""
-    return urdf_model_of(arm) if arm.by_urdf else PapersMoments(arm.papers, arm.compensator["use_imu"])
-
-
-def urdf_model_of(arm: ConfiguredArm) -> UrdfMoments:
-    """Return the moments of an arm from a URDF as configured. Raises ParameterError."""
-    return urdf_moments({**arm.compensator, "motor": arm.can_bridge["motor"]})
+    return moment_model.model_of({**arm.compensator, "motor": arm.can_bridge["motor"]})
 
 
 def _needed(arm: ConfiguredArm, model: MomentModel, poses: Sequence[Observation]) -> np.ndarray:
@@ -188,16 +180,16 @@ def _moment_changes(arm: ConfiguredArm, model: MomentModel, found: Identified) -
     node, before, error = f"{arm.namespace}/compensator", model.moments, found.error
     unit = "as commanded; in kg m once a weight was hung" if found.relative else "kg m"
     moments = np.where(np.isfinite(error), found.in_file, before)
-    if isinstance(model, UrdfMoments):
+    if isinstance(model.arm, UrdfArm):
         known = f"{unit}, +-{np.max(error, where=np.isfinite(error), initial=0.0):.2g} at most"
-        new = model.found(moments, found.turn)
+        new = model.found(model.arm, moments, found.turn)
         for names, parts, what in ((MOMENT_NAMES, new.change, known), (TURN_NAMES, new.turn, "rad")):
             for name, values in zip(names, parts.T, strict=True):
                 note = f"{what}, was {row(np.array(arm.compensator[name]))}"
                 yield Change(node, name, (values.round(5) + 0.0).tolist(), note)
         return
     for name, part in MOMENT_PARAMETERS.items():
-        note = f"{' '.join(MOMENTS[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
+        note = f"{' '.join(model.names[part])} {unit}, +-{row(error[part])}, was {row(before[part])}"
         yield Change(node, name, moments[part].round(5).tolist(), note)
 
 

@@ -22,7 +22,7 @@ from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tours import at_links, row, torque_error, tour_observations
 from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest, visits
-from exo_gravity.lab.calibration.worn_arm import WornArm, worn_arm
+from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 MOST_CARRIED = 0.5  # share of their arm that a person can hold who means to relax
@@ -48,13 +48,13 @@ WEARER = WearerTour()
 def calibrate_wearer(options: argparse.Namespace, arm: ConfiguredArm, say: Say) -> CalibrationResult:
     """Measure the wearer's relaxed arm, or take it from `options.bag`. Raises ParameterError."""
     carried = WEARER.carried if options.carried is None else one_float("carried", options.carried, 0.0, MOST_CARRIED)
-    worn = worn_arm(arm)
+    worn = WornArm(arm)
     # Few poses, in a comfortable range, with the weight that the table expects.
     low, high = np.maximum(arm.low, worn.comfortable[0]), np.minimum(arm.high, worn.comfortable[1])
     changes = {"tour.poses": WEARER.poses, "tour.again": WEARER.again, **worn.changes}
     changes |= {"position_min": low.tolist(), "position_max": high.tolist()}
     request = "Wear the arm, sit upright and relax: it will be moved slowly. Pull to stop it"
-    return wearer_from(arm, tour_observations(options, arm, say, changes, request, worn.expected), carried)
+    return wearer_from(arm, tour_observations(options, arm, say, changes, request), carried)
 
 
 def wearer_from(
@@ -65,7 +65,7 @@ def wearer_from(
     carried: share 0..MOST_CARRIED of their arm's weight that they may hold throughout. Raises DataError if the poses do
     not show an arm.
     """
-    worn, observations = worn_arm(arm), at_links(arm, observations)
+    worn, observations = WornArm(arm), at_links(arm, observations)
     theta, direction, effort, spread = columns(observations)
     rows = worn.model.rows(theta, direction)
     torque = effort - rows @ worn.model.moments - joint_spring_of(arm.compensator).torques(theta)

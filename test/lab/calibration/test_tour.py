@@ -19,10 +19,9 @@ from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.identification import fit_friction
-from exo_gravity.lab.calibration.moment_model import PapersMoments
+from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, guess_for, measurable
 from exo_gravity.lab.calibration.tour import Tour
-from exo_gravity.lab.moments import load_moments
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -45,12 +44,13 @@ MOMENTS, UPRIGHT, STILL = DEFAULT_LINKS.moments, Tilt.of("right"), (0.0,) * 4
 
 LEANT = Tilt.of("right", 0.05, 0.2)
 
-WEIGHED = MOMENTS + load_moments(DEFAULT_LINKS.length.tolist(), *WEIGHT)
+MODEL = MomentModel(DEFAULT_LINKS, True)
+WEIGHED = MOMENTS + MODEL.load(*WEIGHT)
 
 
 def guess_of(moments=MOMENTS, tilt=UPRIGHT) -> TorqueGuess:
     """Return what is known of the default arm, or of one with other `moments` (8,) in kg m."""
-    return TorqueGuess(PapersMoments(DEFAULT_LINKS, keeps_tilt=True), moments, tilt)
+    return TorqueGuess(MomentModel(DEFAULT_LINKS, True), moments, tilt)
 
 
 @pytest.fixture
@@ -244,11 +244,11 @@ def test_what_is_expected_in_the_loop_is_what_is_added_to_the_result_also_where_
 
 
 def test_a_tour_begins_with_what_earlier_ones_have_shown_of_the_arm_without_a_weight():
-    model, tilt, cable = PapersMoments(DEFAULT_LINKS, keeps_tilt=True), Tilt.of("right", 0.1), np.full(4, 0.1)
+    model, tilt, cable = MomentModel(DEFAULT_LINKS, True), Tilt.of("right", 0.1), np.full(4, 0.1)
     poses = candidates(LIMITS, model)[:40]
 
     def needed(load=(0.0, 0.0)):
-        moments = 1.3 * MOMENTS + load_moments(DEFAULT_LINKS.length.tolist(), *load)
+        moments = 1.3 * MOMENTS + MODEL.load(*load)
         return model.rows(poses, tilt.direction) @ moments / SCALES + cable * poses
 
     seen = [
@@ -267,14 +267,14 @@ def test_a_tour_begins_with_what_earlier_ones_have_shown_of_the_arm_without_a_we
 
 def test_the_mass_matrix_of_an_arm_under_a_weight_is_in_the_torque_that_each_motor_is_commanded():
     """A joint whose inertia was taken for a tenth of the true one went 0.12 rad off its path."""
-    model, scales = PapersMoments(DEFAULT_LINKS, keeps_tilt=True), (0.7, 1.1, 1.3, 0.8)
+    model, scales = MomentModel(DEFAULT_LINKS, True), (0.7, 1.1, 1.3, 0.8)
     guess = guess_for(model, Tilt.of("right", 0.07, 0.2), WEIGHT)
     poses = candidates(LIMITS, guess.model)
     rows = guess.model.rows(poses[:6], guess.tilt.direction)
     for theta, effort in zip(poses[:6], rows @ WEIGHED / scales, strict=True):
         guess.learn(theta, effort, (0.003,) * 4)
     for theta in poses[100:120]:
-        true = PapersMoments(DEFAULT_LINKS, True).matrix(theta, WEIGHED, WEIGHT)
+        true = MODEL.matrix(theta, WEIGHT)
         np.testing.assert_allclose(guess.matrix(theta, WEIGHT), true / np.reshape(scales, (4, 1)), rtol=0.12, atol=1e-9)
 
 
@@ -298,13 +298,11 @@ def test_an_arm_hangs_on_until_it_is_carried_though_its_motors_are_stronger_than
 @pytest.mark.parametrize(("mass", "lever", "tolerance"), [(0.0, 0.0, 0.012), (*WEIGHT, 0.025)])
 def test_the_mass_matrix_is_close_to_that_of_the_device(mass, lever, tolerance):
     arm = SimulatedArm(ArmConfig(wearer_mass=(0, 0, 0, mass), wearer_cog=(0, 0, 0, lever)))
-    moments = DEFAULT_LINKS.moments + load_moments(DEFAULT_LINKS.length.tolist(), mass, lever)
-    model = PapersMoments(DEFAULT_LINKS, True)
     for theta in ((0.0,) * 4, (0.3, 0.8, 0.7, 0.5), (-0.5, 1.5, 1.2, 1.0)):
         arm.reset(theta)
         true = np.zeros((4, 4))
         mujoco.mj_fullM(arm.model, arm.data, true)
-        np.testing.assert_allclose(model.matrix(theta, moments, (mass, lever)), true, atol=tolerance)
+        np.testing.assert_allclose(MODEL.matrix(theta, (mass, lever)), true, atol=tolerance)
 
 
 @pytest.mark.parametrize(("moments", "tilt", "count", "again"), [(MOMENTS, UPRIGHT, 4, 2), (WEIGHED, LEANT, 8, 0)])

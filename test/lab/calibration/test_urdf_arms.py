@@ -21,13 +21,13 @@ from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
 from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.live import tour_parameters
-from exo_gravity.lab.calibration.moment_model import UrdfMoments, along_axes
+from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
+from exo_gravity.lab.calibration.moment_model import model_of as moments_of_values
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
-from exo_gravity.lab.calibration.tour import urdf_moments
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
-from exo_gravity.lab.calibration.worn_arm import worn_arm
+from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.ros_yaml import text_of
@@ -178,7 +178,7 @@ def test_zeros_and_axes_that_are_askew_are_found_where_the_poses_show_them(name:
 def test_the_derivatives_by_turns_of_the_joints_are_mujocos(count: int) -> None:
     text, names = random_chain(count, seed=20 + count)
     arm = UrdfArm(text, names, "hand")
-    model, random, step = UrdfMoments(arm, [0.0] * count, True), np.random.default_rng(count), 1e-4
+    model, random, step = MomentModel(arm, True), np.random.default_rng(count), 1e-4
     poses, down = random.uniform(-2.0, 2.0, (10, count)), gravity_in_trunk(0.3, -0.2)
     shown = np.einsum("mnkat,a,k->tmn", model.turned(poses), down, arm.moments)
     moments = model.rows(poses, down).reshape(-1, len(model.names))
@@ -250,9 +250,9 @@ def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refuse
     values = {**bench.arm.compensator, "motor": bench.arm.can_bridge["motor"]}
     none = dict.fromkeys((*MOMENT_NAMES, *TURN_NAMES), [0.0] * 2)
     with pytest.raises(ParameterError, match=r"urdf\.file = '': must be a file: a calibration does not wait"):
-        urdf_moments({**values, "urdf.file": ""})
+        moments_of_values({**values, "urdf.file": ""})
     with pytest.raises(ParameterError, match=r"joint_names = .*: must be all joints that move the arm's links"):
-        urdf_moments({**values, **none, "joint_names": ["abduction", "elbow"]})
+        moments_of_values({**values, **none, "joint_names": ["abduction", "elbow"]})
 
 
 def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
@@ -307,7 +307,7 @@ def relaxed_poses(name: str) -> list[np.ndarray]:
     """The poses of the tour for an arm of config, without the visits again."""
     arm = configured_arm(packaged_config(f"{name}.yaml"), "right")
     arm = replace(arm, compensator={**arm.compensator, "wearer.body_mass": BODY_MASS})
-    model, (low, high) = model_of(arm), worn_arm(arm).comfortable.tolist()
+    model, (low, high) = model_of(arm), WornArm(arm).comfortable.tolist()
     limits = replace(arm.limits, position_min=low, position_max=high)
     poses, taken = candidates(limits, model), [np.array(limits.home)]
     while len(taken) < WEARER.poses:
@@ -363,7 +363,7 @@ class Person:
         output = self.params.with_suffix(".new.yaml")
         write_changes(self.params, output, result.changes, "calibrate wearer")
         settings = read_arm(load(output), "/right").settings
-        poses = np.random.default_rng(99).uniform(*worn_arm(self.arm).comfortable, (NEW_POSES, len(self.arm.low)))
+        poses = np.random.default_rng(99).uniform(*WornArm(self.arm).comfortable, (NEW_POSES, len(self.arm.low)))
         true = np.array([self.truth.torque(pose) for pose in poses])
         given = np.array([settings.torque(pose, Tilt.of("left"))[0] for pose in poses])
         weight = np.abs(true - [self.bare.torque(pose) for pose in poses]).max()
@@ -400,4 +400,4 @@ def test_a_wearer_who_does_not_relax_and_one_who_is_not_there_are_refused(tmp_pa
         wearer_from(person.arm, person.observed())
     light = replace(person.arm, compensator={**person.arm.compensator, "wearer.body_mass": 0.0})
     with pytest.raises(ParameterError, match=r"compensator wearer\.body_mass = 0.*: must be the wearer's, in kg"):
-        worn_arm(light)
+        WornArm(light)
