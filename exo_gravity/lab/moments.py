@@ -27,19 +27,17 @@ from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.hardware.urdf_model import Skeleton
 
 MOMENTS = ("M1", "M2", "M3", "M4", "W", "Z", "Y3", "Y4")
-X, Y, Z = np.eye(3)
-BASE = ((0, X), (1, X), (2, X), (3, X), (0, Z), (1, Z), (2, Y), (3, Y))  # link, and axis of its frame, of each moment
-SAME = ((1, 1, 4), (2, 2, 5), (3, 2, 5))  # link, axis, and the moment as which it counts: both are along one axis
-NOWHERE = np.empty((0, 3))
 
 
 class PapersChain(ArmModel):
     """The paper's arm by its moments, with gains of 1."""
 
-    base = BASE
-    directions = np.tile(X, (JOINT_COUNT, 1))  # of the links, in their frames
-    turns = np.tile((Z, X, Y), (JOINT_COUNT, 1, 1))  # of each joint's place, one a row, in the frames `before`
-    moved_by = np.tri(JOINT_COUNT, dtype=bool).T  # whether a joint, the first index, moves the link of another
+    #: link, and axis of its frame, of each moment: x of M1 to M4, z of W and Z, y of Y3 and Y4
+    base = tuple(zip((0, 1, 2, 3, 0, 1, 2, 3), np.eye(3)[[0, 0, 0, 0, 2, 2, 1, 1]], strict=True))
+    directions = np.eye(3)[[0] * JOINT_COUNT]  #: of the links, in their frames
+    #: about which each joint's place turns, in its own frame of `frames`: its axis, and two directions across it
+    turns = np.tile(np.eye(3)[[2, 0, 1]], (JOINT_COUNT, 1, 1))
+    moved_by = np.tri(JOINT_COUNT, dtype=bool).T  #: whether a joint, the first index, moves the link of another
 
     @classmethod
     def of(cls, arm: ArmModel) -> PapersChain:
@@ -78,7 +76,7 @@ class PapersChain(ArmModel):
         """
         links = self._links(theta)
         axis, along = links[:, :, 1], links[:, :, 2]
-        before = np.concatenate((np.broadcast_to(X, along[:, :1].shape), along[:, :-1]), axis=1)
+        before = np.concatenate((np.broadcast_to(np.eye(3)[0], along[:, :1].shape), along[:, :-1]), axis=1)
         own = np.stack((before, np.cross(axis, before), axis), axis=-1)
         return own, np.swapaxes(links[:, :, 2:], 2, 3)
 
@@ -103,7 +101,8 @@ class PapersChain(ArmModel):
         """Return the largest moments; axes and links of the paper's arm are what `can_bridge` assumes."""
         w, z, y3, y4 = np.abs(self.off_axis).tolist()
         beside = np.array((w + z + y3 + y4, z + y3 + y4, y3 + y4, y4))
-        return Skeleton(NOWHERE, NOWHERE, np.array(self.first_moment), beside)
+        not_stated = np.empty((0, 3))
+        return Skeleton(not_stated, not_stated, np.array(self.first_moment), beside)
 
 
 Chain = PapersChain | UrdfArm
@@ -134,8 +133,7 @@ def _unit_arms(gravity: float) -> list[PapersChain]:
 def _by_links() -> np.ndarray:
     """Return what 1 kg m of each link along each axis of its frame adds to the moments, (4, 3, 8)."""
     added = np.zeros((JOINT_COUNT, 3, len(MOMENTS)))
-    for k, (link, way) in enumerate(BASE):
+    for k, (link, way) in enumerate(PapersChain.base):
         added[link, :, k] = way
-    for link, axis, k in SAME:
-        added[link, axis, k] = 1.0
+    added[1, 1, 4] = added[2, 2, 5] = added[3, 2, 5] = 1.0  # along the axis of W, and twice along that of Z
     return added

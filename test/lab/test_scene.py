@@ -24,7 +24,7 @@ from exo_gravity.lab.view.scene import (
     gravity_shapes,
     state_of,
 )
-from exo_gravity.lab.view.urdf import ArmDescription, described, urdf
+from exo_gravity.lab.view.urdf import Described, PapersPicture, described, urdf
 from exo_gravity.sim.urdf import UrdfConfig
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")
@@ -33,7 +33,7 @@ STILL = (0.0,) * 4
 
 
 def arm(side="left"):
-    return ArmDescription(side, ROBOT, (), Limits(NAMES))
+    return Described(side, PapersPicture(side, ROBOT, ()), Limits(NAMES))
 
 
 def view(theta=STILL, velocity=STILL, effort=STILL, state="active", message="", side="left"):

@@ -21,7 +21,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import configured_arms
-from exo_gravity.lab.view.urdf import ArmDescription, urdf
+from exo_gravity.lab.view.urdf import Described, PapersPicture, urdf
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG
@@ -130,7 +130,7 @@ def by_mujoco(text, joints, gravity):
 def description(side="left", **robot):
     values = {"length": (0.05, 0.13, 0.3, 0.3), "cog": (0.04, 0.1, 0.2, 0.15), "mass": (0.6, 0.5, 0.6, 0.2), **robot}
     arm = ArmModel.from_moments(**robot) if "first_moment" in robot else ArmModel(**values)
-    return ArmDescription(side, arm, (0.6, 0.5, 0.6, 0.2), Limits(NAMES))
+    return Described(side, PapersPicture(side, arm, (0.6, 0.5, 0.6, 0.2)), Limits(NAMES))
 
 
 CALIBRATED = {
@@ -148,7 +148,7 @@ DESCRIBED = {  # the text, and the arms in it: side, joints, robot
         for name in ("exo.yaml", "sim_both.yaml")
     },
     **{
-        f"{case}, {side}": (urdf([one]), [(side, NAMES, one.robot)])
+        f"{case}, {side}": (urdf([one]), [(side, NAMES, one.robot.robot)])
         for case, robot in CALIBRATED.items()
         for side in ("left", "right")
         for one in [description(side, **robot)]

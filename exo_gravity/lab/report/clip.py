@@ -176,7 +176,8 @@ class Stage:
 
 def _dummy(arms: Sequence[Described]) -> list[Shape]:
     """Return the wearer without the arms that are worn."""
-    middle, worn = np.mean([arm.base for arm in arms], axis=0) * (1.0, 0.0, 1.0), {arm.outward for arm in arms}
+    middle = np.mean([arm.base for arm in arms], axis=0) * (1.0, 0.0, 1.0)
+    worn = {1.0 if arm.side == "left" else -1.0 for arm in arms}
     parts = [(ends, size, {1.0, -1.0} if ends[0][1] else {1.0}) for *ends, size in DUMMY]
     parts += [(list(ends), LIMB_SIZE, {1.0, -1.0} - worn) for ends in pairwise(FREE_ARM)]
     return [

@@ -53,16 +53,64 @@ LEAST_MASS = 1e-3  # kg, of a link that has none in its URDF
 CHEST, HEAD_RADIUS, HEAD_HEIGHT = (0.14, 0.26, 0.48), 0.10, 0.20  # m
 
 
-class _Named:
-    """The names in a description of one arm of n joints."""
+@dataclass(frozen=True, eq=False)
+class PapersPicture:
+    """The paper's arm on a trunk, with what is drawn of an arm from a URDF."""
 
     side: str  #: 'left' or 'right'
-    limits: Limits  #: names, position, speed and torque limits of the joints
+    robot: ArmModel  #: without a wearer
+    mass: Vector  #: (4,) kg, used if `robot` is given by its moments
+    shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
 
     @property
     def outward(self) -> float:
         """1 if the arm is on the trunk's +y side (left), -1 otherwise."""
         return 1.0 if self.side == "left" else -1.0
+
+    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return where the arm is at `theta` (4,) rad, as `Described.pose`."""
+        length, base = self.robot.length, (0.0, self.outward * HALF_BREADTH, 0.0)
+        links = frames(length.tolist(), theta)
+        along = self._in_trunk([link.along for link in links])
+        axes = self._in_trunk([link.axis for link in links]) * self.outward  # a mirror reverses rotations
+        origins = self._in_trunk([link.origin for link in links]) + (self.shoulder if any(self.shoulder) else base)
+        return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mass (4,) kg and centre of gravity (4, 3) m of each link, as `UrdfArm.bodies`.
+
+        Moments across the links (core/arm/paper.py) become offsets of the centres of gravity: W of link 1, Z of link
+        2, Y3 and Y4 of links 3 and 4. An arm given by its moments has the masses `mass`, and its centres of gravity,
+        also beyond the links, follow from the moments.
+        """
+        robot = self.robot
+        mass = np.array(self.mass if robot.by_moments else robot.mass)
+        if not np.all(mass > 0.0):
+            raise ParameterError("robot.mass", mass.tolist(), "above 0 kg for each link of a robot description")
+        along = robot.cog
+        if robot.by_moments:
+            carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
+            along = (robot.first_moment - robot.length * carried) / mass
+        a1, a2, a3, a4 = along.tolist()
+        w, z, y3, y4 = (robot.off_axis / mass).tolist()
+        out = self.outward
+        return mass, np.array(((w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)))
+
+    def _in_trunk(self, points: Sequence[Sequence[float]]) -> np.ndarray:
+        """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
+        x, y, z = np.array(points).T
+        return np.stack((y, self.outward * x, -z), axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """What a description, and a picture, states about one arm of n joints."""
+
+    side: str  #: 'left' or 'right'
+    robot: PapersPicture | UrdfArm
+    limits: Limits  #: names, position, speed and torque limits of the joints
+    damping: Vector = (0.0,) * JOINT_COUNT  #: (n,) Nm s/rad, 0 for unknown
+    friction: Vector = (0.0,) * JOINT_COUNT  #: (n,) Nm, 0 for unknown
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -70,105 +118,34 @@ class _Named:
         count = len(self.limits.joint_names)
         return (*(f"{self.side}_link_{n}" for n in range(1, count + 1)), f"{self.side}_end")
 
-
-@dataclass(frozen=True, eq=False)
-class ArmDescription(_Named):
-    """The paper's arm."""
-
-    side: str  #: 'left' or 'right'
-    robot: ArmModel  #: without a wearer
-    mass: Vector  #: (4,) kg, used if `robot` is given by its moments
-    limits: Limits  #: names, position, speed and torque limits of the joints
-    damping: Vector = (0.0,) * JOINT_COUNT  #: (4,) Nm s/rad, 0 for unknown
-    friction: Vector = (0.0,) * JOINT_COUNT  #: (4,) Nm, 0 for unknown
-    shoulder: Vector = (0.0, 0.0, 0.0)  #: (3,) m, the arm's base in the trunk's axes; zeros for unknown
-
     @property
     def base(self) -> Point:
         """Origin of joint 1 in the trunk's axes, m."""
-        given = tuple(map(float, self.shoulder))
-        return given if any(given) else (0.0, self.outward * HALF_BREADTH, 0.0)
+        return tuple(self._hanging[0].tolist())
+
+    @property
+    def _hanging(self) -> np.ndarray:
+        return self.pose([0.0] * len(self.limits.joint_names))[0]
 
     def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (4,) rad, in the trunk's axes.
+        """Return where the arm is at `theta` (n,) rad, in the trunk's axes.
 
-        The origins (5, 3) in m of the joints and the far end, the axes (4, 3) about which the joints turn, and unit
-        vectors (4, 3) along the links.
+        The origins (n + 1, 3) in m of the joints and the far end, the axes (n, 3) about which the joints turn, and unit
+        vectors (n, 3) along the links, as far as these are across the axes.
         """
-        length = self.robot.length
-        links = frames(length.tolist(), theta)
-        along = _in_trunk(self, [link.along for link in links])
-        axes = _in_trunk(self, [link.axis for link in links]) * self.outward  # a mirror reverses rotations
-        origins = _in_trunk(self, [link.origin for link in links]) + self.base
-        return np.vstack((origins, origins[3] + length[3] * along[3])), axes, along
+        return self.robot.pose(theta)
 
     def link_vectors(self) -> np.ndarray:
-        """Return the vector (4, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
-        _, _, along = self.pose((0.0,) * JOINT_COUNT)
-        return np.asarray(self.robot.length[:, None] * along)
+        """Return the vector (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
+        return np.diff(self._hanging, axis=0).round(12)
 
     def bodies(self) -> list[tuple[float, Point]]:
         """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
 
-        Raises ParameterError if a link has no mass. Moments across the links (core/arm/gravity.py) become offsets of
-        the centres of gravity: W of link 1, Z of link 2, Y3 and Y4 of links 3 and 4. An arm given by its moments has
-        the masses `mass`, and its centres of gravity, also beyond the links, follow from the moments.
+        Raises ParameterError if a link of the paper's arm has no mass.
         """
-        robot = self.robot
-        mass = [float(m) for m in (self.mass if robot.by_moments else robot.mass)]
-        if not all(m > 0.0 for m in mass):
-            raise ParameterError("robot.mass", mass, "above 0 kg for each link of a robot description")
-        along = robot.cog
-        if robot.by_moments:
-            carried = [sum(mass[n + 1 :]) for n in range(JOINT_COUNT)]
-            along = (robot.first_moment - robot.length * carried) / mass
-        a1, a2, a3, a4 = along.tolist()
-        w, z, y3, y4 = (moment / m for moment, m in zip(robot.off_axis, mass, strict=True))
-        out = self.outward
-        centres = (w, out * a1, 0.0), (0.0, -out * z, -a2), (y3, 0.0, -a3), (y4, 0.0, -a4)
-        return list(zip(mass, centres, strict=True))
-
-
-@dataclass(frozen=True, eq=False)
-class UrdfDescription(_Named):
-    """An arm from a URDF, whose root link has the trunk's axes. It is on the side on which its first joint is."""
-
-    robot: UrdfArm
-    limits: Limits
-    damping: Vector  #: (n,) Nm s/rad, 0 for unknown
-    friction: Vector  #: (n,) Nm, 0 for unknown
-
-    @property
-    def side(self) -> str:  # type: ignore[override]
-        """'left' or 'right'."""
-        return "left" if self.base[1] > 0.0 else "right"
-
-    @property
-    def base(self) -> Point:
-        """Origin of the first joint in the trunk's axes, m."""
-        x, y, z = self.robot.places(np.array([self._zero]))[0, 0].tolist()
-        return x, y, z
-
-    def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where the arm is at `theta` (n,) rad."""
-        return self.robot.pose(theta)
-
-    def link_vectors(self) -> np.ndarray:
-        """Return the vectors between the joints, and from the last one to the hand."""
-        return np.diff(self.robot.places(np.array([self._zero]))[0], axis=0)
-
-    def bodies(self) -> list[tuple[float, Point]]:
-        """Return mass and centre of gravity of each link."""
         masses, centres = self.robot.bodies()
         return [(max(mass, LEAST_MASS), tuple(at)) for mass, at in zip(masses.tolist(), centres.tolist(), strict=True)]
-
-    @property
-    def _zero(self) -> list[float]:
-        return [0.0] * len(self.limits.joint_names)
-
-
-#: What a description, and a picture, states about one arm of n joints.
-Described = ArmDescription | UrdfDescription
 
 
 def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> Described:
@@ -176,15 +153,10 @@ def described(compensator: Mapping[str, Any], can_bridge: Mapping[str, Any]) -> 
     limits, friction = limits_of(can_bridge), (compensator["friction.viscous"], compensator["friction.coulomb"])
     if compensator["law"] == URDF_LAW:
         arm = arm_in_file(compensator, ", for a picture: the URDF on a topic is one already")
-        return UrdfDescription(arm, limits, *friction)
-    robot, mass = robot_of(compensator), compensator["robot.mass"]
-    return ArmDescription(compensator["side"], robot, mass, limits, *friction, compensator["shoulder_from_imu"])
-
-
-def _in_trunk(arm: Described, points: Sequence[Sequence[float]]) -> np.ndarray:
-    """Return vectors (n, 3) of the arm's base frame in the trunk's axes: x0 outward, y0 forward, z0 down."""
-    x, y, z = np.array(points).T
-    return np.stack((y, arm.outward * x, -z), axis=1)
+        at = arm.pose([0.0] * len(arm.names))[0][0]
+        return Described("left" if at[1] > 0.0 else "right", arm, limits, *friction)
+    side, mass, shoulder = (compensator[name] for name in ("side", "robot.mass", "shoulder_from_imu"))
+    return Described(side, PapersPicture(side, robot_of(compensator), mass, shoulder), limits, *friction)
 
 
 def urdf(arms: Sequence[Described], meshes: str = "") -> str:
