@@ -295,8 +295,8 @@ def observations_in(record: Path, joints: int) -> list[Observation]:
 
 # As the compensator's, of the paper's arm or one from a URDF, and those that describe its links.
 ARM = (
-    "side", "joint_names", "law", "gravity", "use_imu", "tilt_timeout", "link_length", "robot.mass", "robot.cog",
-    "robot.first_moment", "robot.off_axis",
+    "side", "joint_names", "law", "gain", "gravity", "use_imu", "tilt_timeout", "link_length",
+    "robot.mass", "robot.cog", "robot.first_moment", "robot.off_axis",
 )  # fmt: skip
 LIMITS = ("position_min", "position_max", "max_effort")
 BRIDGE = ("rate", *LIMITS, "motor", "home")  # as can_bridge's
