@@ -1,12 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The paper's arm as a chain whose moments are unknown, with what `UrdfArm` has for that.
 
-<<<<<<< HEAD
-`core.arm.paper` defines the moments, and the torque that is linear in them.
-=======
 `core.arm.paper` defines its eight moments, and the torque that is linear in them. Each is a first moment of a link
 along an axis of the link's frame of Table 1.
->>>>>>> f7541a0f (One model of moments and one worn arm for every arm: the paper's is a chain with a base of moments, as one from a URDF)
 """
 
 from __future__ import annotations
