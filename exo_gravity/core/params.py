@@ -21,9 +21,11 @@ ROS_PARAMETERS = ("use_sim_time", "start_type_description_service")
 ROS_QOS_PREFIX = "qos_overrides."
 COUNTED = ("joint_names", "can_id")  # lists that say how many joints an arm has
 KINDS = {float: "number", int: "whole number", str: "string", bool: "true or false"}
-# Parameters that were valid at a47959f4 and are gone: what to write for such a value, by the names in force.
+# Parameters that were valid once and are gone: what to write for such a value, by the names in force.
 GONE: dict[str, Callable[[list[Any]], dict[str, Any]]] = {
     "robot.moments": lambda value: {"robot.first_moment": value[:4], "robot.off_axis": value[4:]},
+    "first_moment": lambda value: {"robot.first_moment": value},  # of the calibrator, as `off_axis`
+    "off_axis": lambda value: {"robot.off_axis": value},
     "friction.identified": lambda value: {"friction.coulomb": value[:4], "friction.viscous": value[4:]},
     "limits.range": lambda value: {"limits.lower": value[0::2], "limits.upper": value[1::2]},
     "inertial.shoulder_from_imu": lambda value: {"inertial": any(value), "shoulder_from_imu": value},
