@@ -13,8 +13,6 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.arm.wearer import SEX, TABLES, Wearer
 from exo_gravity.core.compensation.guidance import DropWatch
-from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.moments import regressor
 from exo_gravity.sim import SimulatedArm
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
@@ -89,16 +87,6 @@ def test_an_arm_given_by_its_moments_weighs_at_least_what_its_links_need_for_the
 TINY = 1e-12  # Nm
 
 
-def test_the_regressor_times_the_moments_is_the_exact_law():
-    rng = np.random.default_rng(2)
-    arm = with_moments_across(random_arm(rng), rng.uniform(-0.05, 0.05, (4, 2)))
-    theta, direction = random_poses(rng, 50), random_directions(rng, 50)
-    torque = regressor(theta, direction, arm.gravity) @ arm.moments
-    np.testing.assert_allclose(torque, gravity_torque(arm, theta, direction), atol=TINY)
-    one = regressor(theta[:1], direction[0]) @ arm.moments
-    np.testing.assert_allclose(one[0], gravity_torque(arm, theta[0], direction[0]), atol=TINY)
-
-
 def test_centres_of_gravity_off_the_links_axes_agree_with_pinocchio():
     rng = np.random.default_rng(3)
     for _ in range(5):
@@ -108,12 +96,6 @@ def test_centres_of_gravity_off_the_links_axes_agree_with_pinocchio():
             model.gravity.linear = arm.gravity * down
             expected = pin.computeGeneralizedGravity(model, data, pose)
             np.testing.assert_allclose(gravity_torque(arm, pose, down), expected, atol=TINY)
-
-
-def test_a_weight_on_link_4_adds_the_moments_of_a_wearer_of_that_mass():
-    arm = ArmModel(LENGTH, (0.02, 0.1, 0.2, 0.1), (0.5, 0.4, 0.6, 0.2))
-    loaded = arm.with_wearer((0, 0, 0, 1.0), (0, 0, 0, 0.25))
-    np.testing.assert_allclose(arm.moments + MomentModel(arm, True).load(1.0, 0.25), loaded.moments, rtol=1e-12)
 
 
 LENGTHS = (0.28, 0.27, 0.086)

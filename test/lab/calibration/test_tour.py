@@ -20,7 +20,7 @@ from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import MomentModel
-from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, candidates, guess_for, measurable
+from exo_gravity.lab.calibration.poses import CHOICE, Itinerary, TorqueGuess, candidates, guess_for, measurable
 from exo_gravity.lab.calibration.tour import Tour
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.arm import DEFAULT_LINKS
@@ -241,6 +241,13 @@ def test_what_is_expected_in_the_loop_is_what_is_added_to_the_result_also_where_
     assert np.min(guess.common_moments[:4]) < -0.01
     in_loop = [guess.torque(theta) for theta in poses.tolist()]
     np.testing.assert_allclose(in_loop, guess.torques(poses)[0], atol=1e-9)
+
+
+def test_poses_in_which_link_3_or_4_points_far_upwards_are_no_candidates():
+    poses = np.radians(((0, 0, 0, 0), (0, 90, 0, 0), (0, 170, 90, 0), (0, 0, 0, 135), (30, 150, 0, 30)))
+    expected = np.sin(np.radians((-90, 0, 0, 45, 60)))
+    np.testing.assert_allclose(MODEL.upwards(poses), expected, atol=1e-12)
+    assert np.max(MODEL.upwards(candidates(LIMITS, MODEL))) <= CHOICE.most_upwards
 
 
 def test_a_tour_begins_with_what_earlier_ones_have_shown_of_the_arm_without_a_weight():

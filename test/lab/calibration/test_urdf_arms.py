@@ -295,7 +295,6 @@ OFF_MASS, OFF_PLACE = 0.25, 0.02  # share, and m, by which each segment differs 
 
 STIFFNESS = 1.0  # Nm/rad of some joints
 BREATHING = 0.05  # Nm, standard deviation of a pose by the wearer
-BREATHING, NOISE = 0.05, 0.004  # Nm, standard deviations of a pose: of the wearer, and of the motors
 
 SEEDS = range(6)
 
