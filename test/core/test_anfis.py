@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from importlib.metadata import EntryPoint
 from itertools import product
 
 import numpy as np
@@ -12,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.compensation import laws
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME, Compensator
-from exo_gravity.core.compensation.laws import LAWS
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.lab.anfis import Anfis, AnfisLaw, grades, text_of
@@ -191,8 +193,8 @@ CYCLE = 0.01  # s
 class Springs:
     """Holds the arm as springs do, up to 1 rad of abduction."""
 
-    def __init__(self, arm):
-        self._arm = arm
+    def __init__(self, given):
+        self._arm = given.arm
 
     def outside(self, theta, tilt):
         return "the springs reach to 1 rad" if theta[1] > 1.0 else ""
@@ -202,8 +204,11 @@ class Springs:
 
 
 @pytest.fixture(autouse=True)
-def springs(monkeypatch):
-    monkeypatch.setitem(LAWS, "springs", lambda settings: Springs(settings.arm))
+def other_laws(monkeypatch):
+    """Another distribution has the law `springs`, and one that is not there."""
+    entries = {"springs": f"{__name__}:Springs", "gone": "gone:law"}
+    others = {name: EntryPoint(name, value, laws.GROUP) for name, value in entries.items()} | laws.installed()
+    monkeypatch.setattr(laws, "installed", lambda: others)
 
 
 def held(compensator, start, theta, seconds):
@@ -212,6 +217,8 @@ def held(compensator, start, theta, seconds):
 
 
 def test_a_law_of_ones_own_is_a_value_of_the_parameter_and_carries_the_arm():
+    with pytest.raises(ParameterError, match=r"^law = .*gone.*: must be a law that can be loaded: gone:law"):
+        settings_of(values_of(COMPENSATOR, {"law": "gone"}))
     settings = settings_of(values_of(COMPENSATOR, {"law": "springs", "use_imu": False}))
     _, answer = held(Compensator(settings), 1.0, NEAR, 0.1)
     assert answer.effort == pytest.approx([0.5 * angle for angle in NEAR]) and not answer.fallback

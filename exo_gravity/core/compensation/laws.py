@@ -5,18 +5,19 @@ A law is an object with two methods, and its entry in `LAWS` is what makes it fo
 not apply in every pose says where it does not: the compensator then carries the arm by the exact law.
 
 A laboratory's own law needs no fork: a distribution that names what makes it under the entry point group GROUP is found
-here, as `anfis` of this one is (exo_gravity/lab/anfis.py). Entry points are looked up when such a law is chosen: an
-ordinary start does not pay for them.
+here, as `anfis` of this one is (exo_gravity/lab/anfis.py). To look entry points up takes a tenth of a second: the
+compensator does it at its start (`installed`), so that no change of law holds up its cycle.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.paper import ArmModel, mobile_torque, static_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import DataError, ParameterError
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Torque
 
 GROUP = "exo_gravity.laws"
@@ -113,29 +114,30 @@ class Laws(dict[str, Maker]):
     """What makes each law, by name. Raises ParameterError where the law does not cover such an arm."""
 
     def __missing__(self, name: str) -> Maker:
-        """Return what makes the law `name` of another distribution. Raises KeyError, DataError."""
-        self[name] = maker = _entry(name)
-        return maker
+        """Return what makes the law `name` of another distribution. Raises KeyError, ParameterError."""
+        return _loaded(name)
 
     def __contains__(self, name: object) -> bool:
-        """Return whether the law `name` is known, or another distribution has it."""
-        try:
-            return bool(self[str(name)])
-        except KeyError:
-            return False
+        """Return whether the law `name` is known, or a distribution has it."""
+        return super().__contains__(name) or name in installed()
 
 
-def _entry(name: str) -> Maker:
-    """Return what makes the law of the entry point `name`. Raises KeyError, DataError if it does not load."""
+@cache
+def installed() -> Mapping[str, Any]:
+    """Return the entry points of GROUP by name, looked up once."""
     from importlib.metadata import entry_points  # slow to import
 
-    for entry in entry_points(group=GROUP, name=name):
-        try:
-            maker: Maker = entry.load()
-        except Exception as error:  # the code of others
-            raise DataError(f"entry point {entry.name} = {entry.value} of {GROUP}: {error}") from error
-        return maker
-    raise KeyError(name)
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+def _loaded(name: str) -> Maker:
+    """Return what the entry point `name` leads to. Raises KeyError, ParameterError if it does not load."""
+    entry = installed()[name]
+    try:
+        maker: Maker = entry.load()
+    except Exception as error:  # the code of others
+        raise ParameterError("law", name, f"a law that can be loaded: {entry.value} of {GROUP} ({error})") from error
+    return maker
 
 
 LAWS = Laws(
@@ -143,7 +145,7 @@ LAWS = Laws(
         "exact": lambda given: ExactLaw(given.arm),
         "paper_static": _paper_static,
         "paper_mobile": _paper_mobile,
-        "anfis": lambda given: _entry("anfis")(given),
+        "anfis": lambda given: _loaded("anfis")(given),
         URDF_LAW: _urdf,
     }
 )
