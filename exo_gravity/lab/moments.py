@@ -14,8 +14,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from exo_gravity.core.arm.chain import frames
-from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Arm, Links
+from exo_gravity.core.arm.chain import Body, frames
+from exo_gravity.core.arm.interface import Arm, Links
 from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import JOINT_COUNT, Torque, Vector
@@ -36,21 +36,18 @@ class PapersChain(ArmModel):
     moved_by = np.tri(JOINT_COUNT, dtype=bool).T  #: whether a joint, the first index, moves the link of another
 
     @classmethod
-    def of(cls, arm: ArmModel) -> PapersChain:
-        """Return `arm` as a chain."""
-        return cls._of(arm.length, arm.moments, arm.gravity)
-
-    @classmethod
-    def _of(cls, length: Vector, moments: np.ndarray, gravity: float) -> PapersChain:
+    def of(cls, length: Vector, moments: np.ndarray, gravity: float) -> PapersChain:
+        """Return the arm with links of `length` (4,) m that has these moments, (8,) kg m."""
         along, across = moments.reshape(2, -1)
         return cast(PapersChain, cls.from_moments(length, along, across, gravity=gravity))
 
     def regressor(self, theta: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Return the torque of each joint per unit of each moment: (m, 4, 8) in Nm per kg m.
 
-        theta: (m, 4) rad. direction: (3,) or (m, 3), gravity's unit vector in the arm's base frame.
+        theta: (m, 4) rad. direction: (3,) or (m, 3), gravity's unit vector in the arm's base frame. Raises
+        ParameterError as `gravity_torque` does.
         """
-        return regressor(theta, direction, self.gravity)
+        return np.stack([gravity_torque(arm, theta, direction) for arm in _unit_arms(self.gravity)], axis=-1)
 
     def holding(self, moments: np.ndarray) -> Callable[[Sequence[float], Tilt], Torque]:
         """Return a function that computes the torque (4,) in Nm from theta (4,) rad and tilt, with moments per joint.
@@ -86,12 +83,13 @@ class PapersChain(ArmModel):
 
     def worn_links(self, mass: Vector, cog: Vector) -> Links:  # type: ignore[override]
         """Return the inertia with a point on link 4: the last of `mass` (4,) kg, at the last of `cog` (4,) m."""
-        return self.with_payload(mass[-1], (cog[-1] - self.length[3], 0.0, 0.0)).links
+        *others, last = self.links.bodies
+        return self.links._replace(bodies=(*others, last.joined_with(Body.rod(mass[-1], (cog[-1], 0.0, 0.0)))))
 
     def with_wearer_moments(self, moments: ArrayLike, support: float = 1.0) -> PapersChain:
         """Return this arm plus a share `support` of first moments (4, 3) kg m of the links, in their frames."""
         more = support * np.einsum("na,nak->k", np.asarray(moments), _by_links())
-        return self._of(self.length, self.moments + more, self.gravity)
+        return self.of(self.length, self.moments + more, self.gravity)
 
     def skeleton(self) -> Skeleton:
         """Return the largest moments; axes and links of the paper's arm are what `can_bridge` assumes."""
@@ -106,15 +104,7 @@ Chain = PapersChain | UrdfArm
 
 def chain_of(arm: Arm) -> Chain:
     """Return an arm as a chain with a base of moments."""
-    return PapersChain.of(arm) if isinstance(arm, ArmModel) else cast(UrdfArm, arm)
-
-
-def regressor(
-    theta: ArrayLike, direction: ArrayLike = (0.0, 0.0, 1.0), gravity: float = STANDARD_GRAVITY
-) -> np.ndarray:
-    """Return `PapersChain.regressor`. Raises ParameterError as `gravity_torque` does."""
-    poses = np.atleast_2d(np.asarray(theta, dtype=float))
-    return np.stack([gravity_torque(arm, poses, direction) for arm in _unit_arms(gravity)], axis=-1)
+    return PapersChain.of(arm.length, arm.moments, arm.gravity) if isinstance(arm, ArmModel) else cast(UrdfArm, arm)
 
 
 @lru_cache(4)
@@ -122,7 +112,7 @@ def _unit_arms(gravity: float) -> list[PapersChain]:
     """Return an arm for each moment, which has that moment of 1 kg m and no other."""
     rows = np.eye(len(MOMENTS))
     no_length = (0.0,) * JOINT_COUNT  # the torque depends on the lengths through the moments only
-    return [PapersChain._of(no_length, row, gravity) for row in rows]
+    return [PapersChain.of(no_length, row, gravity) for row in rows]
 
 
 @lru_cache(1)

@@ -10,7 +10,7 @@ import pytest
 
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.arm.wearer import TISSUE_REACH, Wearer
+from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH, Wearer
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
 from exo_gravity.core.errors import ParameterError
@@ -91,6 +91,8 @@ def test_springs_of_a_wearer_on_an_arm_of_five_joints_from_a_urdf():
     )
     for pose in np.random.default_rng(1).uniform(-0.6, 0.9, (10, count)).tolist():
         assert settings.torque(pose, tilt)[0] == pytest.approx(held(config, pose), abs=1e-9)
+    with pytest.raises(ParameterError, match=r"wearer.joint_stiffness"):
+        replace(settings, tissue=Springs((1.0,) * 4, (0.0,) * 4))
 
 
 def test_moments_in_place_of_masses_and_what_is_impossible_is_refused():
@@ -109,3 +111,6 @@ def test_moments_in_place_of_masses_and_what_is_impossible_is_refused():
     for row, wrong in ((0, 4.1), (0, -0.1), (1, 0.6), (1, float("nan"))):
         with pytest.raises(ParameterError, match=f"wearer.{('first_moment', 'off_axis')[row]}"):
             replace(SETTINGS, wearer_moments=np.insert(np.zeros((1, 4)), row, (0.0, 0.0, wrong, 0.1), axis=0).tolist())
+    for name, springs in (("stiffness", ((0.0, 0.0, MAX_TISSUE + 0.1, 0.0),)), ("rest", ((1.0,) * 4, (4.0,) * 4))):
+        with pytest.raises(ParameterError, match=f"wearer.joint_{name}"):
+            replace(SETTINGS, tissue=Springs(*springs))

@@ -29,7 +29,6 @@ from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_ta
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of
-from exo_gravity.lab.moments import regressor
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.params import device_of, simulator_table
@@ -78,7 +77,9 @@ class Device:
 
     def effort(self, theta: Vector, direction: Vector, added: np.ndarray | float = 0.0) -> np.ndarray:
         """Return the commands (n, 4) in Nm that hold the arm without friction."""
-        return regressor(theta, direction) @ (self.moments + added) / self.scale + self.offset
+        return (
+            PAPERS.rows(np.atleast_2d(theta), np.asarray(direction)) @ (self.moments + added) / self.scale + self.offset
+        )
 
     def observe(self, theta: Vector, direction: Vector = LEANING, weight: Weight = NO_WEIGHT) -> Observation:
         """Pass the pose in both directions: current noise of 2 %, 12 bits."""

@@ -35,7 +35,6 @@ from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
-from exo_gravity.lab.moments import regressor
 from exo_gravity.lab.trial.from_file import simulated_trials
 from exo_gravity.sim.script import TrialScript
 
@@ -302,7 +301,7 @@ LOADED = np.arange(len(POSES)) % 2 == 1  # every second pose has the weight on l
 
 def predicted(arm: ArmModel) -> np.ndarray:
     """Return the torque (n, 4) in Nm that holds `arm` in each pose."""
-    weight = regressor(POSES, DOWN) @ PAPERS.load(*LOAD)
+    weight = PAPERS.rows(POSES, DOWN) @ PAPERS.load(*LOAD)
     return gravity_torque(arm, POSES, DOWN) + LOADED[:, None] * weight
 
 
@@ -335,7 +334,7 @@ def test_the_page_compares_the_old_and_the_new_file_with_what_was_measured(found
     assert (measured - old) == pytest.approx(predicted(IN_FILE))
     down = DOWN + np.cross(result.tilt, DOWN)  # the new file's mounting of the IMU
     joints = POSES[~LOADED] + result.turn[:, 0]  # as the new zeros show them
-    unloaded = regressor(joints, down / np.linalg.norm(down)) @ result.in_file / result.scale
+    unloaded = PAPERS.rows(joints, down / np.linalg.norm(down)) @ result.in_file / result.scale
     assert (measured - new)[~LOADED] == pytest.approx(unloaded, abs=1e-3)
     assert np.abs(old).max() > 10.0 * np.abs(new).max()
 

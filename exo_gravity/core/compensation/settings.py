@@ -35,7 +35,7 @@ from exo_gravity.core.arm.wearer import (
 from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
 from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
-from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Torque, Vector, for_joints
+from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Torque, Vector, floats, for_joints
 from exo_gravity.core.params import (
     JOINT_NAMES,
     REAL_TIME_PARAMETERS,
@@ -163,6 +163,13 @@ class Settings:
         check_owned(self, len(self.robot.scale))
         for name in ("wearer_mass", "wearer_cog"):
             object.__setattr__(self, name, tuple(getattr(self, name)) or (0.0,) * len(self.robot.scale))
+        for prefix, springs, stiffest, most in (
+            ("joint_spring.", self.joint_spring, MAX_STIFFNESS, MAX_REST),
+            ("wearer.joint_", self.tissue, MAX_TISSUE, math.pi),
+        ):
+            if springs.on:  # else the default, of any length
+                floats(f"{prefix}stiffness", springs.stiffness, len(self.robot.scale), 0.0, stiffest, "Nm/rad")
+                floats(f"{prefix}rest", springs.rest, len(self.robot.scale), -most, most, "rad")
         if soft := [k for k in self.joint_stiffness if 0.0 < k < SOFTEST]:
             raise ParameterError("joint_stiffness", soft, f"0 for a rigid joint, or at least {SOFTEST:g} Nm/rad")
         self._carry(self.robot)

@@ -20,18 +20,17 @@ from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import WORN_MOMENTS, robot_of
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.numbers import Torque, one_float
+from exo_gravity.core.numbers import one_float
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_in_file
 from exo_gravity.lab.moments import MOMENTS, PapersChain, chain_of
 
-Holder = Callable[[Sequence[float], Tilt], Torque]
 # deg of each joint, within the paper's ranges: from these a missing pose is suggested.
 GRID = ((-60, 0, 60), (15, 45, 75, 105, 135), (-30, 0, 30, 60, 90, 120), (0, 30, 60, 90, 120, 150))
 TURNS = 3  # of a joint's place: about its axis, and about two directions across it
 SUGGESTED = 600  # poses at random, from which one is suggested for another arm
 FITTED = 60  # of them, in which the moments of an arm with turned axes are found
 STEP = 10.0  # deg, of their angles
-LITTLE = 1e-6  # Nm per kg m: less is none
+LITTLE = 1e-6  # Nm per kg m: a joint that carries less carries nothing
 
 
 class Kind(NamedTuple):
@@ -42,6 +41,7 @@ class Kind(NamedTuple):
     is_described: bool = True
     down: Callable[[Tilt], Sequence[float]] = attrgetter("gravity_in_trunk")  #: gravity's direction in the base frame
     worn: tuple[str, ...] = WORN_MOMENTS  #: parameters of a wearer's moments
+    worn_along: tuple[int, ...] = ()  #: numbers of those moments of a wearer that must each be plausible
     at_least_0: tuple[int, ...] = ()  #: numbers of the moments that are 0 where they seem to be less
     above_0: tuple[int, ...] = ()  #: those that must be above 0, and known
     across: tuple[tuple[int, int], ...] = ()  #: of a moment across a link, and of the larger one along it
@@ -51,9 +51,16 @@ class Kind(NamedTuple):
 
 
 PAPERS = Kind(
-    False, attrgetter("direction"), ("wearer.first_moment", "wearer.off_axis"), (0,), (1, 2, 3), ((7, 3), (6, 2)), 2,
-    ((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7)),
-)  # fmt: skip
+    is_described=False,
+    down=attrgetter("direction"),
+    worn=("wearer.first_moment", "wearer.off_axis"),
+    worn_along=(2, 3),
+    at_least_0=(0,),
+    above_0=(1, 2, 3),
+    across=((7, 3), (6, 2)),
+    rises_from=2,
+    comfortable=((-0.4, -0.17, -0.5, -0.17), (0.6, 1.2, 1.3, 1.7)),
+)
 
 
 def turned_by(
@@ -188,10 +195,6 @@ class MomentModel:
             in_links[link] += moment * way
         return in_links
 
-    def holding(self, moments: np.ndarray) -> Holder:
-        """Return what computes the torque (n,) in Nm with moments (n, k) kg m, a row for each joint."""
-        return self.arm.holding(moments)
-
     def common(self, moments: np.ndarray) -> np.ndarray:
         """Return what the joint shows that carries the moment with its own link."""
         return np.array([moments[n, k] for k, (n, _) in enumerate(self.arm.base)])
@@ -201,6 +204,8 @@ class MomentModel:
         return self._inertia(*load).matrix(theta) + self._rotors
 
     def _links_with(self, mass: float, lever: float) -> Links:
+        if not mass:  # a point on the last link would take the place of a wearer
+            return self.arm.links
         none = [0.0] * (self.count - 1)
         return self.arm.worn_links([*none, mass], [*none, lever])
 

@@ -153,7 +153,7 @@ class TorqueGuess:
 
     def _update(self) -> None:
         """Take over the mean."""
-        self._hold, self._springs = self.model.holding(self._moments), self._mean[:, -2:].tolist()
+        self._hold, self._springs = self.model.arm.holding(self._moments), self._mean[:, -2:].tolist()
         now = np.einsum("njk,jk->nj", self._rows, self._moments)
         least = len(self._rows) * PRIOR.unexplained**2  # of a joint that carries nothing
         strength = (np.sum(now * self._at_start, axis=0) + least) / (np.sum(self._at_start**2, axis=0) + least)

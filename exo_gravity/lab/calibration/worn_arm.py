@@ -26,10 +26,10 @@ class WornArmLimits:
 
     share: float = 0.6  #: of the way from `home` to a limit of a joint of which no comfortable range is known
     reach: tuple[float, float] = (0.2, 1.2)  #: rad, least and most of that way
-    largest_error: float = 0.25  #: of the torque of the joint that carries most, as a standard error
+    largest_error: float = 0.25  #: of M3 and M4, and of the torque of the joint that carries most, as a standard error
     most: float = 15.0  #: kg of a person's arm
     body_mass: float = 70.0  #: kg, where the file has none
-    table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled torque that is plausible
+    table_ratio: tuple[float, float] = (0.6, 1.6)  #: measured to tabled moments and torque that are plausible
 
 
 WORN = WornArmLimits()
@@ -94,10 +94,16 @@ class WornArm:
 
     def found(self, fit: WearerFit, theta: np.ndarray, direction: np.ndarray) -> Found:
         """Return what a fit says. Raises DataError if it is not an arm."""
-        mass = float(fit.moments[::4].sum())
+        mass, why = float(fit.moments[::4].sum()), "is the arm relaxed, the robot calibrated?"
         if mass > WORN.most:
             raise DataError(f"the wearer's arm = {mass:.1f} kg: must be at most {WORN.most:g}: is the arm relaxed?")
-        moments, rows = self.to_moments @ fit.moments, self.model.rows(theta, direction)
+        own, kind = fit.covariance[: len(fit.moments), : len(fit.moments)], self.model.kind
+        moments, errors = self.to_moments @ fit.moments, np.sqrt(np.diag(self.to_moments @ own @ self.to_moments.T))
+        for k in kind.worn_along:
+            shown = f"{self.model.names[k]} of the wearer = {moments[k]:.3f} +- {errors[k]:.3f} kg m"
+            if not moments[k] > errors[k] / WORN.largest_error:
+                raise DataError(f"{shown}: {why}")
+        rows = self.model.rows(theta, direction)
         torque, table = rows @ moments, rows @ self._expected
         n = int(np.argmax((table**2).sum(axis=0)))  # the joint that carries most of the wearer
         name, size = self._arm.joint_names[n], float(np.sqrt(np.mean(table[:, n] ** 2)))
@@ -105,14 +111,19 @@ class WornArm:
         error = float(fit.torque_error(rows @ self.to_moments, theta)[n])
         if not share * size > error / WORN.largest_error:
             shown = f"the wearer's arm needs {share * size:.2f} +- {error:.2f} Nm at {name}"
-            raise DataError(f"{shown}: is the arm relaxed, the robot calibrated?")
+            raise DataError(f"{shown}: {why}")
         low, high = WORN.table_ratio
         whose = "the file's wearer" if self._is_known else f"a wearer of {WORN.body_mass:g} kg"
         compared = f"{share:.0%} of the torque at {name} that {whose} needs"
-        plausible = low <= share <= high or not self._is_known
-        refusals = () if plausible else (f"implausible: {compared}: must be from {low:.0%} to {high:.0%}",)
-        own = fit.covariance[: len(fit.moments), : len(fit.moments)]
-        errors, kind = np.sqrt(np.diag(self.to_moments @ own @ self.to_moments.T)), self.model.kind
+        ratios = {compared: share} | {
+            f"{moments[k] / self._expected[k]:.0%} of {self.model.names[k]} of {whose}": moments[k] / self._expected[k]
+            for k in kind.worn_along
+        }
+        refusals = tuple(
+            f"implausible: {what}: must be from {low:.0%} to {high:.0%}"
+            for what, ratio in ratios.items()
+            if self._is_known and not low <= ratio <= high
+        )
         node = f"{self._arm.namespace}/compensator"
         noted = f"kg m, +-{errors.max():.2g} at most" if kind.is_described else f"kg m, +-{row(errors)}"
         parts = self.model.in_links(moments).T if kind.is_described else moments.reshape(len(kind.worn), -1)

@@ -19,7 +19,7 @@ from exo_gravity.lab.calibration.tours import moments_from
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.inputs.references import ALPHA, OFFSET, pinocchio_model
-from exo_gravity.lab.moments import MOMENTS, regressor
+from exo_gravity.lab.moments import MOMENTS
 from exo_gravity.sim.arm import DEFAULT_LINKS
 
 from ...support.calibration_device import (
@@ -53,7 +53,7 @@ def test_moments_of_random_devices_and_torques_in_new_poses_are_right_to_2_perce
     theta = np.random.default_rng(7).uniform((-1.0, 0.0, -0.5, 0.0), (1.0, 2.8, 2.0, 2.6), (500, 4))
     for device, found in devices:
         true = device.effort(theta, LEANING)
-        off = regressor(theta, LEANING) @ found.moments / found.scale + found.offset - true
+        off = PAPERS.rows(theta, LEANING) @ found.moments / found.scale + found.offset - true
         assert np.all(np.sqrt(np.mean(off**2, axis=0)) < 0.02 * np.abs(true).max(axis=0))
         wrong = np.abs(found.moments - device.moments)
         assert np.all((wrong < 2.0 * found.error) | (wrong < 0.02 * device.moments.max()))
@@ -160,7 +160,7 @@ def off_device(seed, model, leans, askew, zero):
     springs = found.stiffness * (new + off - found.rest)
     moments = np.where(np.isfinite(found.error), found.in_file, model.moments)
     joints = new + off + found.turn[:, 0]  # as the new zeros show them
-    law = (regressor(joints, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.scale
+    law = (PAPERS.rows(joints, mounted / np.linalg.norm(mounted)) @ moments + springs) / found.scale
     true = askew_torque(turn, new, UPRIGHT)
     return np.abs(law - true), found, float(np.abs(true).max())
 

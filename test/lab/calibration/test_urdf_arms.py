@@ -257,7 +257,7 @@ def test_an_arm_whose_urdf_comes_from_a_topic_or_that_has_other_joints_is_refuse
 
 def test_the_choice_of_poses_on_another_thread_does_not_change_the_torque(tmp_path: Path) -> None:
     model, tilt, theta = model_of(Bench.of("three_joints", tmp_path).arm), Tilt.of("left"), [0.3, 0.5, 0.7]
-    torque = model.holding(np.tile(model.moments, (model.count, 1)))
+    torque = model.arm.holding(np.tile(model.moments, (model.count, 1)))
     expected, done, interval = torque(theta, tilt), threading.Event(), sys.getswitchinterval()
 
     def choose() -> None:
