@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from exo_gravity.core import gravity_torque
-from exo_gravity.core.arm.paper import ArmModel, papers
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.settings import COMPENSATOR, settings_of
+from exo_gravity.core.compensation.settings import COMPENSATOR, robot_of
 from exo_gravity.core.params import values_of
 from exo_gravity.hardware.urdf_arm import UrdfArm, read_urdf
 from exo_gravity.lab.inputs.arms import read_arm
@@ -28,7 +28,7 @@ LOOP = 2_000  # of these poses, for the peers, which compute one pose per call
 
 def measure_laws(quick: bool) -> Iterator[Row]:
     """Yield the rows of the law."""
-    arm = papers(settings_of(values_of(COMPENSATOR, {})).arm)
+    arm = robot_of(values_of(COMPENSATOR, {}))
     poses = np.random.default_rng(1).uniform(-1.5, 1.5, (POSES, 4))
     pin, model = pinocchio_model(arm)
     model.gravity.linear = np.array((0.0, 0.0, arm.gravity))

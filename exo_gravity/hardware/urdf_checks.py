@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a URDF leaves out or only fills in, and what moves in it besides the joints of the arm: one table, `FINDINGS`.
+"""Checks of a URDF: missing numbers, placeholders, and joints that move besides those of the arm. See `FINDINGS`.
 
 Many published descriptions were made for pictures and for planning: they have links without mass, equal masses on all
 links, effort limits that no motor has, joints that follow another one, and joints that the arm does not drive. Each
@@ -58,7 +58,7 @@ class Link(NamedTuple):
 
     @property
     def ball(self) -> tuple[object, ...]:
-        """Mass and inertia of a ball about the origin of the link, as a placeholder is; () if it is none."""
+        """Mass and inertia of a link that is a ball about its own origin, as placeholders are; () for any other."""
         xx, yy, zz, *products = self.inertia
         is_ball = self.mass > 0.0 and not any(self.cog) and xx == yy == zz and not any(products)
         return (self.mass, self.inertia) if is_ball else ()

@@ -18,7 +18,7 @@ from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.hardware.urdf_checks import LIMITS, checked, links_of, mimics_of, robot_of
 
 TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
-LARGEST = 1e3  # rad or m, of a limit that is none
+LARGEST = 1e3  # rad or m; a larger limit means that there is none
 TINY = 1e-12  # Nm
 LEAST_LENGTH = 1e-4  # m between two joints; nearer ones have no link between them
 
@@ -94,7 +94,7 @@ class UrdfJoints:
 
     @property
     def efforts(self) -> list[float]:
-        """The effort limits (n,) in Nm of the arm's joints, 0 where there is none."""
+        """The effort limits (n,) in Nm of the arm's joints, 0 for a joint without one."""
         joints = (self.model.joints[self.model.getJointId(name)] for name in self.names)
         efforts = (float(self.model.effortLimit[joint.idx_v]) for joint in joints)
         return [effort if 0.0 < effort < math.inf else 0.0 for effort in efforts]
@@ -202,7 +202,7 @@ class Skeleton(NamedTuple):
     axes: np.ndarray  #: (n, 3), unit vectors along the joints' axes while all angles are 0
     ways: np.ndarray  #: (n, 3), unit vectors along the links, zeros for one without length
     moments: np.ndarray  #: (n,) kg m, largest first moment along each link, with all mass beyond it
-    beside: np.ndarray  #: (n,) kg m, the largest first moment about each joint of the masses beside the links
+    beside: np.ndarray  #: (n,) kg m, largest first moment about each joint of masses off the links' axes
 
 
 class UrdfShape:

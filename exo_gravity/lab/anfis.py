@@ -175,7 +175,7 @@ def scaled(theta: np.ndarray, low: Vector, high: Vector) -> np.ndarray:
 def law(given: LawData) -> ArmLaw:
     """Return the law `anfis` of the model in `anfis_file`: an entry point of exo_gravity.laws.
 
-    Raises ParameterError without a model or with another arm than the paper's, DataError if the file is none.
+    Raises ParameterError without a model, or for another arm than the paper's; DataError if the file has no such model.
     """
     if not given.trained:
         raise ParameterError("law", "anfis", "used with anfis_file, a model from train_anfis")
@@ -183,10 +183,7 @@ def law(given: LawData) -> ArmLaw:
     return ArmLaw(with_masses(given.arm, "anfis"), trained.torque, trained.outside)
 
 
-@lru_cache(2)
-def _loaded(text: str) -> AnfisLaw:
-    """Return `AnfisLaw.load`, once for all changes of other settings."""
-    return AnfisLaw.load(text)
+_loaded = lru_cache(2)(AnfisLaw.load)  # once for all changes of other settings
 
 
 def text_of(law: AnfisLaw) -> str:

@@ -249,7 +249,7 @@ def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():
 
 PUBLIC = json.loads((Path(__file__).parents[1] / "data" / "motor_frames.json").read_text())
 DRIVERS_OWN = {"AK60-6": {"velocity_range": 50.0}}  # ranges that the public driver has otherwise
-DM4310, DM8009 = MOTORS["DM-J4310"], MOTORS["DM-J8009"]
+DM4310 = MOTORS["DM-J4310"]
 REPLY_IDS = {1: 0x11, 2: 0x12, 8: 0x18}
 
 

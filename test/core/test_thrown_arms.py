@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from exo_gravity.core.arm.paper import ArmModel, papers
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.compensator import JOINTS
 from exo_gravity.core.compensation.settings import Settings
@@ -35,7 +35,7 @@ from ..support.thorough import quick
 
 MASS, COG = (tuple(map(float, load)) for load in Wearer(75.0).on_links(ROBOT.length))
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)  # Nm
-MOMENT = papers(ROBOT).first_moment  # kg m, of the robot
+MOMENT = ROBOT.first_moment  # kg m, of the robot
 WORN = {"mode": "zero_g", "support": 1.0, "wearer_mass": MASS, "wearer_cog": COG}
 
 
@@ -111,7 +111,7 @@ def test_a_fast_wearer_is_not_let_down(is_assisted):
         assist=Assist((2.0, 4.0, 2.0, 2.0)),
     )
     addition = tuple(map(sum, zip(SUM.effort, terms.assist.max_effort, strict=True))) if is_assisted else NO_TORQUE
-    moment = papers(Settings("right", ROBOT, **WORN).arm).first_moment
+    moment = ROBOT.with_wearer(MASS, COG).first_moment
     settings = {"terms": terms, "inertial": True} if is_assisted else {}
     arm = make_arm(True, 100.0, settings, largest_moment=moment, largest_addition=addition)
     arm.carry()

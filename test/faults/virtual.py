@@ -185,11 +185,6 @@ def struck(rig: StruckArm) -> int:
     return rig.struck
 
 
-def only_struck(rig: StruckArm) -> list[int]:
-    """Return it as the only one of several."""
-    return [rig.struck]
-
-
 def error_code(rig: StruckArm) -> int:
     """Return the code of an error of the struck motor."""
     family = rig.motors[rig.struck].joint.spec.family
@@ -267,7 +262,7 @@ def control_dies(rig: StruckArm) -> None:
     rig.run(1.0)
 
 
-CUT_OFF = happens("cut_off", motors=only_struck)
+CUT_OFF = happens("cut_off", motors=lambda rig: [rig.struck])
 CONNECT = happens("cut_off", motors=())
 RESTART, SHORT_RESTART = (happens("unplugged", joint=struck, duration=duration) for duration in (0.03, 0.015))
 CUT, RELEASE = power(False), power(True)

@@ -248,15 +248,14 @@ SILENT = (silence, FaultCode.MOTOR_SILENT, "no motor on {} replies: the bus is l
 BROKEN = (break_down, FaultCode.BUS_ERROR, "No buffer space available")
 
 
-def name_of(value: object) -> str:
-    """Return the name of a function for a test's ID, which has no channel: that has the process's ID."""
-    return getattr(value, "__name__", "")
-
-
 LOST = [(MIT, SECOND, *SILENT), (MIT, FIRST, *SILENT), (MIT_V3, SECOND, *SILENT), (MIT, SECOND, *BROKEN)]
 
 
-@pytest.mark.parametrize(("wire_format", "dead", "lose", "code", "said"), quick([LOST[0], LOST[-1]], LOST), ids=name_of)
+@pytest.mark.parametrize(
+    ("wire_format", "dead", "lose", "code", "said"),
+    quick([LOST[0], LOST[-1]], LOST),
+    ids=lambda value: getattr(value, "__name__", ""),
+)
 def test_a_bus_that_is_lost_lets_the_whole_arm_down_and_its_motors_once_they_are_reached(
     wire_format: WireFormat, dead: str, lose: Callable[[CarriedArm, str], None], code: FaultCode, said: str
 ) -> None:

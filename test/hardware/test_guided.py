@@ -17,7 +17,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.compensation.terms.catalogue import Spring
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.safety.drive import Efforts, State
+from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.events import ACTS
@@ -41,10 +41,6 @@ def fastest_driven(arm: CarriedArm) -> float:
     """The largest true speed of a joint along its motor's torque in rad/s."""
     records = arm.truth.records
     return float(np.abs(records["velocity"][records["velocity"] * records["torque"] > 0.0]).max(initial=0.0))
-
-
-def undamped(efforts: Efforts) -> Efforts:
-    return efforts._replace(damped=False)
 
 
 class Leading:
@@ -84,7 +80,7 @@ def test_a_wearer_who_moves_on_is_not_stopped():
     felt, speed = {}, 1.0
     for is_damped in (True, False):
         arm = guided_arm()
-        arm.controller.change = None if is_damped else undamped
+        arm.controller.change = None if is_damped else lambda efforts: efforts._replace(damped=False)
         hand = Leading(arm.device.arm.positions, speed)
         arm.lead(hand)
         arm.run(1.0)

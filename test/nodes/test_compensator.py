@@ -38,7 +38,7 @@ from exo_gravity.tools import train_anfis
 
 from ..support import CONFIG, ROBOT
 from ..support.compensator_rig import NAMES, POSE, STILL, CompensatorRig
-from ..support.waiting import wait_until
+from ..support.waiting import each_closed, wait_until
 
 GRAVITY = gravity_torque(ROBOT, POSE)
 ASSIST = [0.5, -0.5, 0.25, 0.0]
@@ -65,10 +65,7 @@ def make_rig(monkeypatch) -> Iterator[Callable[..., CompensatorRig]]:
     """A function that makes a rig, with shorter ramps and fades, which test_compensator.py times."""
     monkeypatch.setattr(guided, "GUIDANCE", replace(guided.GUIDANCE, time=0.2, rate=100.0))
     monkeypatch.setattr(guidance, "LAST_FADE", 0.4)
-    rigs: list[CompensatorRig] = []
-    yield lambda *arguments: rigs.append(CompensatorRig(*arguments)) or rigs[-1]
-    for rig in rigs:
-        rig.close()
+    yield from each_closed(CompensatorRig)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.fake_chips import FAKES, FakeI2c
 from ..support.imu_motion import bowing_and_walking
-from ..support.waiting import wait_until
+from ..support.waiting import each_closed, wait_until
 
 keep_to_this_machine()
 G = 9.80665
@@ -116,10 +116,7 @@ class ImuRig:
 
 @pytest.fixture
 def make_imu() -> Iterator[Callable[..., ImuRig]]:
-    rigs: list[ImuRig] = []
-    yield lambda *parameters: rigs.append(ImuRig(*parameters)) or rigs[-1]
-    for rig in rigs:
-        rig.close()
+    yield from each_closed(ImuRig)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from ..support import PARTS, ROBOT
 from ..support.chains import random_chain
 from ..support.compensator_rig import NAMES, POSE, CompensatorRig
 from ..support.urdf_oracle import MujocoArm
-from ..support.waiting import wait_until
+from ..support.waiting import each_closed, wait_until
 
 LOAD = Wearer(75.0).on_links(ROBOT.length)
 WORN = {"use_imu": "false", "max_effort": [9.0, 18.0, 9.0, 9.0], "wearer.body_mass": 75.0}
@@ -66,10 +66,7 @@ class WornRig(CompensatorRig):
 
 @pytest.fixture
 def worn() -> Iterator[Callable[..., WornRig]]:
-    rigs: list[WornRig] = []
-    yield lambda *arguments: rigs.append(WornRig(*arguments)) or rigs[-1]
-    for rig in rigs:
-        rig.close()
+    yield from each_closed(WornRig)
 
 
 def test_what_the_motors_do_not_carry_is_published_as_the_wearers_and_follows_the_compensators_parameters(worn):

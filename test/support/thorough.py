@@ -13,8 +13,9 @@ def quick(some: Sequence[Any], cases: Iterable[Any]) -> list[Any]:
     """Return `cases` as parameters of a test, all but `some` marked as thorough. A tuple has a value per parameter."""
     cases = list(cases)
     assert all(case in cases for case in some), "a case that is to be quick does not exist"
-    return [case if case in some else pytest.param(*_values(case), marks=pytest.mark.thorough) for case in cases]
-
-
-def _values(case: Any) -> tuple[Any, ...]:
-    return case if isinstance(case, tuple) else (case,)
+    return [
+        case
+        if case in some
+        else pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.thorough)
+        for case in cases
+    ]

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from typing import Any
 
 PATIENCE = 100.0  # s, after which a process or a condition is taken for stuck; pytest ends a test after 120 s
 PAUSE = 0.005  # s between two looks
@@ -25,3 +27,9 @@ def wait_until(
     while not condition():
         assert time.monotonic() < end, f"the condition did not hold in {timeout:.0f} s; {seen()}"
         meanwhile()
+
+
+def each_closed(make: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Yield a function that makes what `make` does; all of it is closed at the end of the test."""
+    with ExitStack() as made:
+        yield lambda *given: made.enter_context(closing(make(*given)))

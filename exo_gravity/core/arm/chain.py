@@ -111,8 +111,7 @@ class ChainInertia(NamedTuple):
             omega, origin = plus(omega, link.axis, speed), link.origin
             turned = partial(acceleration_of, angular_velocity=omega, angular_acceleration=alpha)
             loads.append(body.moved(link, moved, turned))
-        beyond = _beyond(links, loads)
-        columns = zip(links, beyond, self.rotors, acceleration, strict=True)
+        columns = zip(links, _beyond(links, loads), self.rotors, acceleration, strict=True)
         return tuple([dot(link.axis, moment) + rotor * change for link, (_, moment), rotor, change in columns])
 
     def turning_torque(self, theta: Sequence[float], turning: Floats3) -> Torque:

@@ -43,7 +43,6 @@ from exo_gravity.core.arm.interface import (
     MAX_REACH,
     NO_LOAD,
     STANDARD_GRAVITY,
-    Arm,
     Payload,
 )
 from exo_gravity.core.arm.rotation import ZERO
@@ -267,13 +266,6 @@ class ArmModel:
     def massless(self, gravity: float) -> "ArmModel":
         """Return an arm with these links, without any mass, with gains of 1, where gravity is `gravity` m/s^2."""
         return ArmModel.from_moments(self.length, NO_TORQUE, gravity=gravity)
-
-
-def papers(arm: Arm) -> ArmModel:
-    """Return `arm` as the paper's arm, for what no other arm has. Raises ParameterError if it is another one."""
-    if not isinstance(arm, ArmModel):
-        raise ParameterError("law", "urdf", "exact: this is for the paper's arm alone")
-    return arm
 
 
 @lru_cache(8)

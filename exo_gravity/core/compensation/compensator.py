@@ -199,10 +199,8 @@ class Compensator:
                 return
         speed = sum(map(operator.mul, per_mass, velocity))
         if self._drop_watch.step(now - self._last_time, speed, s.payload.mass):
-            self.dropped, self._pending = (
-                s.payload.mass,
-                replace(self._pending or s, payload=s.payload._replace(mass=0.0)),
-            )
+            self.dropped = s.payload.mass
+            self._pending = replace(self._pending or s, payload=s.payload._replace(mass=0.0))
 
     def _law(self, now: float, theta: Sequence[float]) -> Torque:
         """Return the torque of the chosen law, or of the exact law while the chosen one does not apply."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from exo_gravity.core.arm.interface import Arm
-from exo_gravity.core.arm.paper import ArmModel, papers
+from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, compensator_table, settings_of
@@ -75,8 +75,10 @@ class ConfiguredArm:
     @property
     def papers(self) -> ArmModel:
         """The robot, for what no other arm than the paper's has. Raises ParameterError."""
-        with named(f"{self.namespace}/compensator "):
-            return papers(self.robot)
+        if not isinstance(self.robot, ArmModel):
+            expected = "exact: this is for the paper's arm alone"
+            raise ParameterError(f"{self.namespace}/compensator law", URDF_LAW, expected)
+        return self.robot
 
     @cached_property
     def settings(self) -> Settings:

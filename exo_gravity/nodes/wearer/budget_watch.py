@@ -11,7 +11,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from exo_gravity.core.arm.paper import ArmModel, papers
+from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
@@ -27,7 +27,7 @@ BRIDGE_PARAMETERS = {
     "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
 }  # fmt: skip
 # robot, the same with the wearer's whole arm, springs of device and wearer, support 0..1, largest tilt in rad
-Request = tuple[ArmModel, ArmModel, tuple[Springs, Springs], float, float]
+Request = tuple[Arm, Arm, tuple[Springs, Springs], float, float]
 
 
 class BudgetWatch:
@@ -72,7 +72,7 @@ def request_of(s: Settings) -> Request:
     """Return what the motors must be able to hold with these settings."""
     support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
     tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
-    return papers(s.loaded), papers(s.worn(s.loaded)), (s.joint_spring, s.tissue), support, tilt
+    return s.loaded, s.worn(s.loaded), (s.joint_spring, s.tissue), support, tilt
 
 
 def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
