@@ -16,10 +16,6 @@ pytestmark = pytest.mark.thorough
 POSE = (0.0, 0.5, 0.1, 0.3)
 
 
-def case_of(*events: Event, begin: str = "carried") -> Case:
-    return Case("paper", 0, 250.0, False, 0.0, 0.2, POSE, begin, events)
-
-
 def test_a_seed_always_draws_the_same_case_and_every_kind_is_drawn_and_can_happen():
     cases = [draw(seed, "paper") for seed in range(500)]
     assert cases[:20] == [draw(seed, "paper") for seed in range(20)]
@@ -56,5 +52,6 @@ BOUNDS = {  # rad/s where only the speed is another one
 
 @pytest.mark.parametrize(("events", "bound"), BOUNDS.values(), ids=BOUNDS)
 def test_each_cause_has_its_bound(events, bound):
-    found = bound_of(case_of(*events), clamped=False)
+    case = Case("paper", 0, 250.0, False, 0.0, 0.2, POSE, "carried", tuple(events))
+    found = bound_of(case, clamped=False)
     assert found == bound if isinstance(bound, Bound) else found.speed == bound

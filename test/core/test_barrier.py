@@ -15,7 +15,7 @@ from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier, Shaped
+from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier
 from exo_gravity.core.safety.descent import DESCENT, JointDescent
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.motion_monitor import MOTION, MotionMonitor
@@ -35,11 +35,6 @@ def barrier() -> Barrier:
 
 def joints(**changes: float) -> list[JointSample]:
     return [reading(time=0.0, **changes)] * 4
-
-
-def shaped(effort: tuple[float, ...] = NOTHING, **changes: float) -> Shaped:
-    """Return what joints get after a second in which they read `changes`."""
-    return barrier().shape(1.0, joints(**changes), effort, WHOLE, NOTHING, NOTHING)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -150,7 +145,7 @@ def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
 def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
-        limited = shaped(position=position)
+        limited = barrier().shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, NOTHING)
         assert limited.effort[3] == pytest.approx(sign * 1.25)
         assert limited.damping[3] == 5.0
         assert "soft wall (d)" in limited.acted

@@ -98,7 +98,7 @@ def test_a_wrong_compensator_is_let_down_before_a_free_arm_is_fast(settings, lea
 
 # Reaches at up to 3.6 rad/s, as fast as is permitted (5 rad/s trips over_speed), and shakes at 2 Hz.
 REACHES = [(0.3, 1.3, 1.2, 1.5), (-0.5, 0.4, -0.1, 0.3), (0.6, 1.5, 1.2, 1.6), (0.0, 0.5, 0.1, 0.4)]
-FAST = [{"move": list(pose), "over": 1.0} for pose in REACHES]
+FAST = [{"move": list(pose), "over": 1.1} for pose in REACHES]
 FAST += [{"push": [0.0, 4.0 * sign, 2.0 * sign, 1.0 * sign], "over": 0.25} for sign in (1, -1, 1, -1)]
 
 

@@ -359,11 +359,6 @@ def unknown_tilt(rig: StruckArm) -> None:
     rig.imu_frozen = TrunkReading((math.nan,) * 3)
 
 
-def turn_back(rig: StruckArm) -> float:
-    """Return what an encoder that has lost a turn of the rotor needs, rad."""
-    return float(-rig.motors[rig.struck].joint.spec.rotor_turn)
-
-
 def set_impossible_parameters(rig: StruckArm) -> None:
     """Set values of the compensator that are impossible, alone or together."""
     for values in IMPOSSIBLE:
@@ -487,7 +482,10 @@ START = (
     FaultCase("motor 2 cut off while proving", CUT_OFF, CHECKED, stage="proving signs", clear=CONNECT, unreached=(1,),
         outcomes=("motor_silent",)),
     FaultCase("joint 2 jumps by a motor turn while proving", JUMP, CHECKED, stage="proving signs",
-        clear=happens("encoder_slip", joint=struck, error=turn_back),
+        # The encoder has lost a turn of the rotor.
+        clear=happens(
+            "encoder_slip", joint=struck, error=lambda rig: -rig.motors[rig.struck].joint.spec.rotor_turn
+        ),
         outcomes=("position_jump", "over_speed")),
     FaultCase("foreign EXIT to motor 2 while proving", exit_frame, CHECKED, stage="proving signs", steps_from=0.05),
     # A hanging arm needs hardly any torque, so that none is missed.

@@ -335,16 +335,14 @@ def random_day(seed: int, rate: float) -> Ordinary:
     return Ordinary(lambda: worn(day(seed, 50.0), 60.0, rate, seed), 2.5, 0.3)
 
 
-def fast_bow(times: np.ndarray) -> np.ndarray:
-    return 2.0 * BOW(3.0 * times - 6.0)
-
-
 def fast_sway(times: np.ndarray) -> np.ndarray:
     return 4.0 * swaying_trunk(times)
 
 
 FTDI = DRIVERS["arrival, 16 ms timer of an FTDI adapter"]
-REPORTED_LATE = [(trunk, late) for trunk in (BOW, fast_bow, bowing_trunk) for late in (0.0, 0.03)]
+REPORTED_LATE = [
+    (trunk, late) for trunk in (BOW, lambda times: 2.0 * BOW(3.0 * times - 6.0), bowing_trunk) for late in (0.0, 0.03)
+]
 MOUNTED = Rotation.from_euler("xyz", (1.0, -2.0, 0.5))
 SWAYING = {f"{name}, sways": driven(driver, swaying_trunk) for name, driver in DRIVERS.items()}
 ORDINARY = {
