@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -231,6 +231,10 @@ class UrdfArm(UrdfShape):
     def links(self) -> UrdfLinks:
         """The inertia of links, load, wearer and rotors."""
         return UrdfLinks(self._pin, self._by_mass, self.moves, self._rotors)
+
+    def with_masses(self, law: str) -> NoReturn:
+        """Raise ParameterError: no law of the paper's arm covers another one."""
+        raise ParameterError("law", law, "urdf for an arm from a URDF")
 
     def worn_links(self, mass: Vector, cog: Vector) -> UrdfLinks:
         """Return the inertia with the wearer's whole arm. mass, cog: as in `with_wearer`."""

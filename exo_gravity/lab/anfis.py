@@ -25,7 +25,7 @@ import numpy as np
 from exo_gravity.core.arm.interface import MAX_GRAVITY
 from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.laws import ArmLaw, LawData, with_masses
+from exo_gravity.core.compensation.laws import ArmLaw, LawData
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Torque, Vector, floats, one_float
 
@@ -180,7 +180,7 @@ def law(given: LawData) -> ArmLaw:
     if not given.trained:
         raise ParameterError("law", "anfis", "used with anfis_file, a model from train_anfis")
     trained = _loaded(given.trained)
-    return ArmLaw(with_masses(given.arm, "anfis"), trained.torque, trained.outside)
+    return ArmLaw(given.arm.with_masses("anfis"), trained.torque, trained.outside)
 
 
 _loaded = lru_cache(2)(AnfisLaw.load)  # once for all changes of other settings

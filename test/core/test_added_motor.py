@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""An arm carried with a motor that another distribution provides, test/support/our_lab.
+"""An arm carried with a motor, and with a term, that another distribution provides: test/support/our_lab.
 
     PYTHONPATH=test/support/our_lab python -m test.core.test_added_motor
 
@@ -14,9 +14,12 @@ import subprocess
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 
-from exo_gravity.core.compensation.settings import Settings
+from exo_gravity.core.compensation.compensator import Compensator
+from exo_gravity.core.compensation.laws import installed
+from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, compensator_table, settings_of
 from exo_gravity.core.motors.families import others
 from exo_gravity.core.motors.joint_motor import motors_of
 from exo_gravity.core.params import values_of
@@ -50,7 +53,15 @@ def carry(**given: Any) -> dict[str, Any]:
     }
 
 
-def test_a_laboratory_s_own_motor_needs_no_fork_and_all_its_bounds_follow_from_its_record() -> None:
+def push(**given: Any) -> tuple[list[str], list[float]]:
+    """Return the terms of a compensator with these parameters, and by how many Nm it differs from one without any."""
+    values = values_of(compensator_table(given), given)
+    arms = [Compensator(settings_of(each)) for each in (values, values_of(COMPENSATOR, {"use_imu": False}))]
+    torques = [arm.step(1.0, (0.1, 0.2, 0.3, 0.4), (0.0,) * 4).effort for arm in arms]
+    return arms[0].terms.active, np.subtract(*torques).tolist()
+
+
+def test_a_laboratory_s_own_motor_and_term_need_no_fork_and_all_bounds_hold() -> None:
     path = os.pathsep.join((str(ROOT / "test" / "support" / "our_lab"), os.environ.get("PYTHONPATH", "")))
     command, environment = [sys.executable, "-m", __name__], {**os.environ, "PYTHONPATH": path}
     output = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
@@ -65,12 +76,15 @@ def test_a_laboratory_s_own_motor_needs_no_fork_and_all_its_bounds_follow_from_i
         "most": [100.0, 40.0, 100.0, 40.0],
         "simulated": ["OurSimulatedMotor", "SimulatedMotor", "OurSimulatedMotor", "SimulatedMotor"],
         "is_lazy": True,  # a start with our motors alone looks up no entry point
+        # within the bound of all terms together, 2 Nm
+        "pushed": [["our_push"], [0.5, 0.0, 2.0, pytest.approx(-1.0)]],
     }
 
 
 if __name__ == "__main__":
     before = others.cache_info().misses
     carry(motor=["AK60-6"] * 4)
-    is_lazy = others.cache_info().misses == before
+    arm = {"use_imu": False, "max_effort": [9.0] * 4}
+    is_lazy = push(**arm)[0] == [] and others.cache_info().misses == before and not installed.cache_info().misses
     ours = carry(motor=["OUR-1", "AK80-9", "OUR-1", "AK60-6"], wire_format=["ours", "mit", "ours", "mit_v3"])
-    print(json.dumps({**ours, "is_lazy": is_lazy}))
+    print(json.dumps({**ours, "is_lazy": is_lazy, "pushed": push(**arm, **{"our_push.effort": [0.5, 0.0, 2.5, -1.0]})}))

@@ -207,8 +207,8 @@ class Springs:
 def other_laws(monkeypatch):
     """Another distribution has the law `springs`, and one that is not there."""
     entries = {"springs": f"{__name__}:Springs", "gone": "gone:law"}
-    others = {name: EntryPoint(name, value, laws.GROUP) for name, value in entries.items()} | laws.installed()
-    monkeypatch.setattr(laws, "installed", lambda: others)
+    others = {name: EntryPoint(name, value, laws.GROUP) for name, value in entries.items()} | laws.installed(laws.GROUP)
+    monkeypatch.setattr(laws, "installed", lambda _group: others)
 
 
 def held(compensator, start, theta, seconds):

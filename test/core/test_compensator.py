@@ -228,18 +228,6 @@ def test_late_or_withdrawn_efforts_fade_to_zeros_that_go_on_until_an_operator_cl
     assert fade.clear() and fade.take(100.1, EFFORT, NOTHING, NOTHING)
 
 
-@pytest.mark.parametrize("period", [0.01, 0.3])
-def test_no_message_of_a_fade_steps_by_more_than_the_fade_itself(period):
-    fade, now = active(), 10.06
-    last = fade.tick(now)
-    while fade.state != "zero":
-        now += period
-        effort = fade.tick(now)
-        columns = zip(effort, last, EFFORT, strict=True)
-        assert all(abs(a - b) <= abs(full) * period / 2.0 + 1e-12 for a, b, full in columns)
-        last = effort
-
-
 def test_the_first_efforts_begin_from_what_a_controller_holds_since_its_last_sender_died():
     fade, held, last = CommandFade(0.05), (3.59, -1.0), (3.59, -1.0)
     early = CommandFade(0.05)

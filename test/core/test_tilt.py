@@ -52,14 +52,6 @@ def test_the_rotation_matrix_agrees_with_scipy_also_for_a_rounded_quaternion():
         assert rotation_matrix(1.005 * turn.as_quat()) == pytest.approx(turn.as_matrix(), abs=1e-12)
 
 
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_the_tilt_of_a_gravity_vector_is_that_of_its_pitch_and_roll(side):
-    for pitch, roll in np.random.default_rng(8).uniform(-1.5, 1.5, (50, 2)):
-        by_angles, by_vector = Tilt.of(side, pitch, roll), Tilt.of_gravity(side, 3.0 * gravity_in_trunk(pitch, roll))
-        for one, other in zip(by_angles, by_vector, strict=True):
-            np.testing.assert_allclose(one, other, atol=1e-12)
-
-
 @pytest.mark.parametrize("law", [ArmModel.torque, static_torque, mobile_torque])
 def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity(law):
     tilt = Tilt.of("left", 0.2, -0.1)

@@ -120,13 +120,6 @@ def test_an_unplugged_chip_is_an_error_that_names_it_and_comes_back_when_it_is_p
     assert rig.reopening.problem == "" and rig.reopening.openings == 2
 
 
-def test_a_chip_that_is_missing_at_the_start_is_opened_when_it_appears(rig):
-    reopening, rig.bus.plugged = Reopening(rig.open), False
-    assert rig.read_for(1.0, lambda: reopening.read(rig.time())) == [] and reopening.openings == 0
-    rig.bus.plugged = True
-    assert rig.read_for(1.5, lambda: reopening.read(rig.time())) and reopening.openings == 1
-
-
 def test_the_time_that_opening_takes_is_not_silence(rig):
     reopening, rig.opening_time = Reopening(rig.open), 1.0
     reopening.read(rig.time())

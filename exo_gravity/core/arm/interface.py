@@ -8,7 +8,7 @@ that a URDF describes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -114,6 +114,10 @@ class Arm(Protocol):
     @property
     def facts(self) -> Mapping[str, Sequence[float] | None]:
         """What is known of the arm itself, by name and unit, for /diagnostics; None for what is not known."""
+        ...
+
+    def with_masses(self, law: str) -> Any:
+        """Return this arm for a law of the paper's arm that needs its masses, an `ArmModel`. Raises ParameterError."""
         ...
 
     def worn_links(self, mass: Vector, cog: Vector) -> Links:

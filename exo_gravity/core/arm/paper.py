@@ -162,6 +162,11 @@ class ArmModel:
         if any(self.off_axis):
             raise ParameterError("robot.off_axis", self.off_axis, f"0 for {what}, which knows no moments across links")
 
+    def with_masses(self, law: str) -> "ArmModel":
+        """Return this arm for a law that needs its masses. Raises ParameterError."""
+        self.check_masses(f"law {law}")
+        return self
+
     def with_payload(self, mass: float, cog: Vector = ZERO) -> "ArmModel":
         """Return this arm with a load of `mass` kg in its hand, instead of any other.
 

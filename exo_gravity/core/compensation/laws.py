@@ -6,7 +6,8 @@ not apply in every pose says where it does not: the compensator then carries the
 
 A laboratory's own law needs no fork: a distribution that names what makes it under the entry point group GROUP is found
 here, as `anfis` of this one is (exo_gravity/lab/anfis.py). To look entry points up takes a tenth of a second: the
-compensator does it at its start (`installed`), so that no change of law holds up its cycle.
+compensator does it at its start (`installed`), so that no change of law holds up its cycle. Terms of others are found
+in the same way (terms/terms.py).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,28 +86,6 @@ class LawData(Protocol):
         ...
 
 
-def with_masses(arm: Arm, law: str) -> ArmModel:
-    """Return the paper's arm, for a law that needs its masses. Raises ParameterError."""
-    if not isinstance(arm, ArmModel):
-        raise ParameterError("law", law, f"{URDF_LAW} for an arm from a URDF")
-    arm.check_masses(f"law {law}")
-    return arm
-
-
-def _paper_static(given: LawData) -> Law:
-    return ArmLaw(with_masses(given.arm, "paper_static"), static_torque)
-
-
-def _paper_mobile(given: LawData) -> Law:
-    return ArmLaw(with_masses(given.arm, "paper_mobile"), mobile_torque)
-
-
-def _urdf(given: LawData) -> Law:
-    if isinstance(given.arm, ArmModel):
-        raise ParameterError("law", URDF_LAW, "chosen at the start, with an arm from a URDF")
-    return ExactLaw(given.arm)
-
-
 Maker = Callable[[LawData], Law]
 
 
@@ -115,37 +94,38 @@ class Laws(dict[str, Maker]):
 
     def __missing__(self, name: str) -> Maker:
         """Return what makes the law `name` of another distribution. Raises KeyError, ParameterError."""
-        return _loaded(name)
+        maker: Maker = loaded(GROUP, name, "law")
+        return maker
 
     def __contains__(self, name: object) -> bool:
         """Return whether the law `name` is known, or a distribution has it."""
-        return super().__contains__(name) or name in installed()
+        return super().__contains__(name) or name in installed(GROUP)
 
 
 @cache
-def installed() -> Mapping[str, Any]:
-    """Return the entry points of GROUP by name, looked up once."""
+def installed(group: str) -> Mapping[str, Any]:
+    """Return the entry points of a group by name, looked up once."""
     from importlib.metadata import entry_points  # slow to import
 
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+    return {entry.name: entry for entry in entry_points(group=group)}
 
 
-def _loaded(name: str) -> Maker:
-    """Return what the entry point `name` leads to. Raises KeyError, ParameterError if it does not load."""
-    entry = installed()[name]
+def loaded(group: str, name: str, what: str) -> Any:
+    """Return what the entry point `name` leads to. Raises KeyError, ParameterError that says `what` does not load."""
+    entry = installed(group)[name]
     try:
-        maker: Maker = entry.load()
+        return entry.load()
     except Exception as error:  # the code of others
-        raise ParameterError("law", name, f"a law that can be loaded: {entry.value} of {GROUP} ({error})") from error
-    return maker
+        expected = f"a {what} that can be loaded: {entry.value} of {group} ({error})"
+        raise ParameterError(what, name, expected) from error
 
 
 LAWS = Laws(
     {
         "exact": lambda given: ExactLaw(given.arm),
-        "paper_static": _paper_static,
-        "paper_mobile": _paper_mobile,
-        "anfis": lambda given: _loaded("anfis")(given),
-        URDF_LAW: _urdf,
+        "paper_static": lambda given: ArmLaw(given.arm.with_masses("paper_static"), static_torque),
+        "paper_mobile": lambda given: ArmLaw(given.arm.with_masses("paper_mobile"), mobile_torque),
+        "anfis": lambda given: loaded(GROUP, "anfis", "law")(given),
+        URDF_LAW: lambda given: ExactLaw(given.arm),
     }
 )

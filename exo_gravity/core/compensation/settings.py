@@ -4,7 +4,7 @@
 import itertools
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -32,8 +32,8 @@ from exo_gravity.core.arm.wearer import (
     Wearer,
     load_by_moments,
 )
-from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
-from exo_gravity.core.compensation.terms.terms import TermSettings, term_parameters, term_settings_of
+from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law, installed, loaded
+from exo_gravity.core.compensation.terms.terms import GROUP, TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Torque, Vector, floats, for_joints
 from exo_gravity.core.params import (
@@ -340,10 +340,17 @@ PAPER = {"side", "link_length", "anfis_file", "robot.mass", "robot.cog", "robot.
 # fmt: on
 
 
+def terms_of_others(names: Iterable[str]) -> dict[str, Any]:
+    """Return the terms of other distributions that parameter `names` are of, by prefix. Raises ParameterError."""
+    ours = (param.name for param in (*COMPENSATOR, *COMMAND_PARAMETERS, *MODEL_PARAMETERS, *URDF))
+    known, given = ({name.partition(".")[0] for name in each} for each in (ours, names))
+    return {name: loaded(GROUP, name, "term") for name in sorted(given - known) if name in installed(GROUP)}
+
+
 def compensator_table(given: Mapping[str, Any]) -> tuple[Param, ...]:
     """Return the parameters of `compensator` for the paper's arm, or the one from a URDF, of `given` ones."""
     groups = [part for part in (COMMAND_PARAMETERS, MODEL_PARAMETERS) if any(param.name in given for param in part)]
-    optional = tuple(itertools.chain(*groups))
+    optional = (*itertools.chain(*groups), *term_parameters(terms_of_others(given)))
     if given.get("law") != URDF_LAW:
         return (*COMPENSATOR, *optional)
     count = joint_count(given)
@@ -370,6 +377,8 @@ def settings_of(
     urdf: the arm, for `law: urdf`. read: returns the text of the file `anfis_file`; without it the file is left out.
     """
     robot: Arm
+    if urdf is None and values["law"] == URDF_LAW:
+        raise ParameterError("law", URDF_LAW, "chosen at the start, with an arm from a URDF")
     if urdf is None:
         robot, own = _papers(values)
     else:
@@ -387,7 +396,7 @@ def settings_of(
             wearer_cog=cog,
             use_imu=values["use_imu"],
             trained=read(path) if path and read else "",
-            terms=term_settings_of(values),
+            terms=term_settings_of(values, terms_of_others(values)),
             model_error=ModelError(*sized),
             joint_spring=joint_spring_of(values),
             tissue=Springs(values["wearer.joint_stiffness"], values["wearer.joint_rest"], TISSUE_REACH),

@@ -20,14 +20,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
-from exo_gravity.core.arm.rotation import Floats3, Quaternion, cross, dot, product, rotated
+from exo_gravity.core.arm.rotation import ZERO, Floats3, Quaternion, cross, dot, plus, product, rotated
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode
 from exo_gravity.core.safety.limits import Limits
 
 GRAVITY = 9.81  # m/s^2
-NO_TURN: Quaternion = (0.0, 0.0, 0.0, 1.0)
+# Axes and links of the paper's arm in its base frame while all angles are 0 (Table 1): x outwards, y forwards, z down.
+PAPER = (
+    ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
+    ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 1.0), (0.0, 0.0, 1.0)),
+)
 
 
 @dataclass(frozen=True)
@@ -55,10 +59,12 @@ class MotionMonitor:
     """
 
     def __init__(self, limits: Limits) -> None:
-        self._limits, self._axes, self._ways = limits, limits.axes, limits.ways
-        self._load = tuple(GRAVITY * moment for moment in limits.largest_moment)  # Nm
-        self._is_on = any(self._load if self._axes else self._load[1:])
-        self.full = tuple(accumulate(self._load[::-1]))[::-1]
+        self._limits = limits
+        load = [GRAVITY * moment for moment in limits.largest_moment]  # Nm
+        self._is_on = any(load if limits.axes else load[1:])
+        self.full = tuple(accumulate(load[::-1]))[::-1]
+        self._axes, ways = (limits.axes, limits.ways) if limits.axes else PAPER
+        self._moments = [plus(ZERO, way, torque) for way, torque in zip(ways, load, strict=False)]  # Nm
         self._guided = 0.0  # s for which the torque may still be on its way from an overtaken tilt
         self._overtaken = self._down(Tilt.of(SIDES[0]))
         self.follow(Tilt.of(SIDES[0]), None)
@@ -114,53 +120,29 @@ class MotionMonitor:
                 fault = Fault.of_joint(FaultCode.UNEXPLAINED_TORQUE, self._limits.joint_names[i], reason)
         return passed, fault
 
-    def explained(self, theta: Sequence[float]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def explained(self, theta: Sequence[float]) -> tuple[Sequence[float], Sequence[float]]:
         """Return the least and the greatest torque (n,) in Nm that gravity needs at `theta` (n,) rad of any load.
 
-        Potential -g sum(M_n u_n), u_n being how far down link n points; torques are its derivatives.
+        Potential -g sum(M_n u_n), u_n being how far down link n points; torques are its derivatives. The joints before
+        it turn a joint's axis, and its own joint turns a link, too.
         """
-        lowest, highest = self._range(theta, self._gravity)
-        if self._guided:
-            low, high = self._range(theta, self._overtaken)
-            lowest, highest = tuple(map(min, lowest, low)), tuple(map(max, highest, high))
+        turn: Quaternion = (0.0, 0.0, 0.0, 1.0)
+        axes, moments = list[Floats3](), list[Floats3]()
+        for angle, axis, moment in zip(theta, self._axes, self._moments, strict=True):
+            axes.append(rotated(turn, axis))
+            half = math.sin(angle / 2.0)
+            turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
+            moments.append(rotated(turn, moment))
+        downs = (self._gravity, self._overtaken) if self._guided else (self._gravity,)
+        lowest, highest = list[float](), list[float]()
+        for n, axis in enumerate(axes):
+            # -g . (axis x link) = (axis x g) . link
+            levers = [cross(axis, down) for down in downs]
+            torques = [[dot(lever, moment) for moment in moments[n:]] for lever in levers]
+            lowest.append(MOTION.surplus * min([sum([min(0.0, torque) for torque in each]) for each in torques]))
+            highest.append(MOTION.surplus * max([sum([max(0.0, torque) for torque in each]) for each in torques]))
         return lowest, highest
 
     def _down(self, tilt: Tilt) -> Floats3:
         """Return gravity's unit vector (3,) in the arm's base frame, for an arm with axes in its root link's axes."""
-        return tilt.gravity_in_trunk if self._axes else tilt.direction
-
-    def _range(self, theta: Sequence[float], gravity: Floats3) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the same for one direction of gravity."""
-        parts = self._parts_of_axes(theta, gravity) if self._axes else self._parts(theta, gravity)
-        lowest = tuple([MOTION.surplus * sum([min(0.0, torque) for torque in torques]) for torques in parts])
-        highest = tuple([MOTION.surplus * sum([max(0.0, torque) for torque in torques]) for torques in parts])
-        return lowest, highest
-
-    def _parts(self, theta: Sequence[float], gravity: Floats3) -> Sequence[Sequence[float]]:
-        """Return the torque of each joint of the paper's arm by the moment of each link from its own on."""
-        one, two, three, four = theta
-        x, y, z = gravity
-        s1, c1, s2, c2 = math.sin(one), math.cos(one), math.sin(two), math.cos(two)
-        s3, c3, s4, c4 = math.sin(three), math.cos(three), math.sin(three + four), math.cos(three + four)
-        out, ahead = c1 * x + s1 * y, c1 * y - s1 * x  # gravity outwards along link 1, and forwards
-        down, across = s2 * out + c2 * z, s2 * z - c2 * out  # along the hanging link 2, and across it
-        m1, m2, m3, m4 = self._load
-        turn3, turn4 = m3 * (s3 * down - c3 * ahead), m4 * (s4 * down - c4 * ahead)
-        return (
-            (-m1 * ahead, -m2 * s2 * ahead, m3 * (s3 * out - c3 * s2 * ahead), m4 * (s4 * out - c4 * s2 * ahead)),
-            (m2 * across, m3 * c3 * across, m4 * c4 * across),
-            (turn3, turn4),
-            (turn4,),
-        )
-
-    def _parts_of_axes(self, theta: Sequence[float], gravity: Floats3) -> Sequence[Sequence[float]]:
-        """Return the same of any arm: the axis turned by the joints before, the link by its own joint, too."""
-        turn, levers, moments = NO_TURN, list[Floats3](), list[Floats3]()
-        for angle, axis, way, load in zip(theta, self._axes, self._ways, self._load, strict=True):
-            levers.append(cross(rotated(turn, axis), gravity))
-            half = math.sin(angle / 2.0)
-            turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
-            x, y, z = rotated(turn, way)
-            moments.append((load * x, load * y, load * z))
-        # -g . (axis x link) = (axis x g) . link
-        return [[dot(lever, moment) for moment in moments[n:]] for n, lever in enumerate(levers)]
+        return tilt.gravity_in_trunk if self._limits.axes else tilt.direction

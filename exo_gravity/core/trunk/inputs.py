@@ -27,7 +27,6 @@ from exo_gravity.core.numbers import Vector
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
 
 NOT_REPORTED = -1.0  # first entry of the covariance of what an IMU does not measure (REP-145)
-NO_ROTATION = ZERO  # rad/s
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class TiltInput:
         self.timeout = timeout
         self._side = side
         self._tilt = Tilt.of(side)
-        self._angular_velocity = NO_ROTATION
+        self._angular_velocity = ZERO
         self._time = -math.inf  # s, when it was measured
         self._in_time = -math.inf  # s, when the newest one that came in time was measured
         self._arrival = -math.inf
@@ -102,10 +101,10 @@ class TiltInput:
         last measurement, and if `age` is impossible because the clock that stamped it differs from ours.
         """
         if now - self._vector_arrival > self.timeout:
-            self._set(now, lambda: gravity_in_trunk(*Tilt.of(self._side, pitch, roll)[:2]), NO_ROTATION, age)
+            self._set(now, lambda: gravity_in_trunk(*Tilt.of(self._side, pitch, roll)[:2]), ZERO, age)
 
     def set_gravity(
-        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = NO_ROTATION, age: float = 0.0
+        self, now: float, gravity: Sequence[float], angular_velocity: Sequence[float] = ZERO, age: float = 0.0
     ) -> None:
         """Set gravity's direction (3,) and the angular velocity (3,) rad/s, in the trunk's axes; else as `set_tilt`."""
         self._vector_arrival = now

@@ -20,7 +20,7 @@ from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
-from exo_gravity.core.compensation.laws import URDF_LAW, installed
+from exo_gravity.core.compensation.laws import GROUP, URDF_LAW, installed
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.errors import ParameterError
@@ -46,7 +46,7 @@ def declared(node: Node) -> tuple[Sequence[Param], dict[str, Any], Read, UrdfArm
     Returns their table, their values, a function that returns the settings that such values describe, and the arm from
     a URDF, to which the positions of its other joints are told; None for the paper's arm.
     """
-    installed()  # not while an arm is carried
+    installed(GROUP)  # not while an arm is carried
     table = settings.compensator_table(given_to(node))
     _forget_unused(node, {param.name for param in table})
     values = declare(node, table)

@@ -20,9 +20,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.arm.rotation import unit_quaternion, up_in_body
+from exo_gravity.core.arm.rotation import ZERO, unit_quaternion, up_in_body
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.inputs import NO_ROTATION, NOT_REPORTED, TiltInput
+from exo_gravity.core.trunk.inputs import NOT_REPORTED, TiltInput
 from exo_gravity.nodes.ros.inner import Inbox
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 
@@ -212,7 +212,7 @@ class TiltSubscription:
         if message.orientation_covariance[0] == NOT_REPORTED:
             return  # another driver's raw data
         q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
-        rate = NO_ROTATION if message.angular_velocity_covariance[0] == NOT_REPORTED else (w.x, w.y, w.z)
+        rate = ZERO if message.angular_velocity_covariance[0] == NOT_REPORTED else (w.x, w.y, w.z)
 
         def set_gravity(now: float, age: float) -> None:
             x, y, z = up_in_body(unit_quaternion("orientation", (q.x, q.y, q.z, q.w)))

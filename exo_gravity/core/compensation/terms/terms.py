@@ -2,7 +2,9 @@
 """The terms at work: their parameters, and their bounded sum, plus the outer loop's input.
 
 The compensator guides a change of parameters. Whatever is wrong with the sum, gravity compensation goes on beneath it.
-A new term is a field of `TermSettings` and an item in `Terms._built`.
+A new term is a field of `TermSettings` and an item in `Terms._built`. A laboratory's own needs no fork: a distribution
+that names a `TermParameters` with a `torque` under the entry point group GROUP is found where a file gives one of its
+parameters, whose prefix is the entry point's name.
 """
 
 import math
@@ -33,6 +35,8 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Torque, for_joints
 from exo_gravity.core.params import Param, params_of
 
+GROUP = "exo_gravity.terms"
+
 
 @dataclass(frozen=True)
 class SumLimits:
@@ -57,6 +61,7 @@ class TermSettings:
     coupling: Coupling = field(default_factory=Coupling)
     limits: SoftLimits = field(default_factory=SoftLimits)
     assist: Assist = field(default_factory=Assist)
+    others: Mapping[str, Any] = field(default_factory=dict)  #: of other distributions, by the same prefix
 
     def on_arm(self, robot: Arm) -> "TermSettings":
         """Return these settings with limits as stiff as `robot` can bear.
@@ -84,22 +89,29 @@ class TermSettings:
 
 
 #: the parameters of each term by the prefix of their names
-GROUPS: dict[str, Any] = {own.name: own.default_factory for own in fields(TermSettings)}
+GROUPS: dict[str, Any] = {own.name: own.default_factory for own in fields(TermSettings) if own.name != "others"}
 
 
-def term_parameters() -> tuple[Param, ...]:
-    """Return the parameters of all terms, with their prefixes."""
+def term_parameters(groups: Mapping[str, Any] = GROUPS) -> tuple[Param, ...]:
+    """Return the parameters of terms, with their prefixes."""
     return tuple(
-        replace(param, name=f"{prefix}.{param.name}") for prefix, owner in GROUPS.items() for param in params_of(owner)
+        replace(param, name=f"{prefix}.{param.name}") for prefix, owner in groups.items() for param in params_of(owner)
     )
 
 
-def term_settings_of(values: Mapping[str, Any]) -> TermSettings:
-    """Return the settings that parameter values describe, or raise ParameterError."""
-    return TermSettings(**{
-        prefix: owner(**{param.name: values[f"{prefix}.{param.name}"] for param in params_of(owner)})
-        for prefix, owner in GROUPS.items()
-    })  # fmt: skip
+def term_settings_of(values: Mapping[str, Any], others: Mapping[str, Any] | None = None) -> TermSettings:
+    """Return the settings that parameter values describe, or raise ParameterError.
+
+    others: the terms of other distributions, as `GROUPS`.
+    """
+    ours, theirs = (
+        {
+            prefix: owner(**{param.name: values[f"{prefix}.{param.name}"] for param in params_of(owner)})
+            for prefix, owner in groups.items()
+        }
+        for groups in (GROUPS, others or {})
+    )
+    return TermSettings(**ours, others=theirs)
 
 
 class TermsInForce(NamedTuple):
@@ -133,7 +145,8 @@ class Terms:
     @property
     def active(self) -> list[str]:
         """The names of the terms that are on, and 'assist' if efforts are used."""
-        return [name for name in GROUPS if getattr(self.settings, name).on]
+        terms = {name: getattr(self.settings, name) for name in GROUPS} | dict(self.settings.others)
+        return [name for name, term in terms.items() if term.on]
 
     @property
     def problem(self) -> str:
@@ -179,7 +192,8 @@ class Terms:
 
     def _built(self, s: TermSettings, arm: Arm) -> Sequence[Callable[[TermState], Torque]]:
         """Return the terms that are on."""
-        terms = [term.torque for term in (s.friction, s.damping, s.spring, s.coupling, s.limits) if term.on]
+        own = (s.friction, s.damping, s.spring, s.coupling, s.limits, *s.others.values())
+        terms = [term.torque for term in own if term.on]
         if s.inertia.on:
             self._has_inertia = True
             left = [(MAX_FRICTION_SHARE - s.friction.share) * coulomb for coulomb in s.friction.coulomb]

@@ -1,14 +1,15 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""A laboratory's own motor, in its own distribution: what CONTRIBUTING's "Add a motor family" says, and no more.
+"""A laboratory's own motor and term, in its own distribution: what CONTRIBUTING says, and no more.
 
 Its board speaks MIT mode with the torque first, and replies with IDs of its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from exo_gravity.core.compensation.terms.catalogue import TermParameters, TermState
 from exo_gravity.core.motors.frames import (
     COMMAND,
     OTHER,
@@ -22,6 +23,8 @@ from exo_gravity.core.motors.frames import (
     state_of,
     unpack_fields,
 )
+from exo_gravity.core.numbers import JOINT_COUNT
+from exo_gravity.core.params import owned
 from exo_gravity.sim.motors.ak import SimulatedMotor
 
 ORDER = ("torque", "position", "velocity", "kp", "kd")
@@ -88,3 +91,14 @@ class OurSimulatedMotor(SimulatedMotor):
 
 
 FAMILY = Family("our_lab", {MOTOR.name: MOTOR}, {"ours": OurFormat("ours", "our_lab")})
+
+
+@dataclass(frozen=True)
+class Push(TermParameters):
+    """A constant torque."""
+
+    effort: Sequence[float] = owned((0.0,) * JOINT_COUNT, "torque; 0: off", (-3.0, 3.0), "Nm")
+
+    def torque(self, _state: TermState) -> tuple[float, ...]:
+        """Return the torque (n,) in Nm."""
+        return tuple(self.effort)
