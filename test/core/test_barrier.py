@@ -303,6 +303,14 @@ def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some
         assert fault_after <= now + PERIOD < fault_after + 0.2
 
 
+def test_a_torque_that_follows_a_bow_and_its_return_is_no_fault() -> None:
+    monitor, upright = MotionMonitor(WATCHED), Tilt.of("left")
+    for pitch in (*np.linspace(0.0, 1.4, 50), *np.linspace(1.4, 0.0, 50)):  # the torque is still in the bow
+        monitor.follow(Tilt.of("left", pitch), upright if pitch > 0.1 else None)
+    bowed = gravity_torque(ROBOT, RAISED, Tilt.of("left", 0.8).direction)
+    assert not any(monitor.step(PERIOD, samples(RAISED), bowed)[1] for _ in range(200))
+
+
 def test_unexplained_torque_is_not_passed_on() -> None:
     passed, _ = MotionMonitor(WATCHED).step(PERIOD, samples(RAISED), torque_of(RAISED, 2.5))
     needed = torque_of(RAISED)

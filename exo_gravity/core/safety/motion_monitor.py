@@ -45,6 +45,7 @@ class MotionLimits:
     slow: float = 0.1  #: s, time constant; faster than this, torque changes only with the pose
     patience: float = 0.012  #: s of the full load
     memory: float = 1.0  #: s, time constant
+    near: float = 0.97  #: cosine of 14 degrees: tilts as near as that count as one
     guided: float = 5.0  #: s for which the torque may still be on its way to a tilt that came suddenly
 
 
@@ -65,8 +66,8 @@ class MotionMonitor:
         self.full = tuple(accumulate(load[::-1]))[::-1]
         self._axes, ways = (limits.axes, limits.ways) if limits.axes else PAPER
         self._moments = [plus(ZERO, way, torque) for way, torque in zip(ways, load, strict=False)]  # Nm
-        self._guided = 0.0  # s for which the torque may still be on its way from an overtaken tilt
-        self._overtaken = self._down(Tilt.of(SIDES[0]))
+        self._guided = 0.0  # s for which the torque may still be on its way from a tilt before
+        self._passed: list[Floats3] = []  # gravity meanwhile: the torque lies between what these need
         self.follow(Tilt.of(SIDES[0]), None)
         self.reset()
 
@@ -77,8 +78,10 @@ class MotionMonitor:
         """
         self._gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
         if overtaken:
-            self._overtaken = self._overtaken if self._guided else self._down(overtaken)
+            self._passed = self._passed if self._guided else [self._down(overtaken)]
             self._guided = MOTION.guided
+        if self._guided and all(dot(self._gravity, each) < MOTION.near for each in self._passed):
+            self._passed.append(self._gravity)
 
     def reset(self) -> None:
         """Forget the past."""
@@ -133,7 +136,7 @@ class MotionMonitor:
             half = math.sin(angle / 2.0)
             turn = product(turn, (half * axis[0], half * axis[1], half * axis[2], math.cos(angle / 2.0)))
             moments.append(rotated(turn, moment))
-        downs = (self._gravity, self._overtaken) if self._guided else (self._gravity,)
+        downs = (self._gravity, *self._passed) if self._guided else (self._gravity,)
         lowest, highest = list[float](), list[float]()
         for n, axis in enumerate(axes):
             # -g . (axis x link) = (axis x g) . link
