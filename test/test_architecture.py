@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, Iterable[str]] = {
 }
 # From the bottom up: a room imports only those before it, and itself.
 ROOMS = {
-    "core": ("names", "vocabulary", "errors", "numbers", "params", "motors", "arm", "trunk", "safety", "compensation"),
+    "core": ("vocabulary", "errors", "numbers", "params", "motors", "arm", "trunk", "safety", "compensation"),
     "hardware": (
         "clock",
         "network",

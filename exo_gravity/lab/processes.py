@@ -6,8 +6,6 @@
 The bridges stop first, because they need the other nodes while they let the arms down. If this process dies, the nodes
 stop by themselves: each watches its standard input, whose other end `Launcher` holds.
 
-Nodes that no arm waits for import what they need once the others have: two cores then carry an arm sooner.
-
 If a bridge dies, its watchdog lets the arm down. If both die, the bridge's executable is started once more, to let the
 arm down and nothing else.
 """
@@ -15,7 +13,6 @@ arm down and nothing else.
 import _thread
 import contextlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 
@@ -37,19 +35,6 @@ from exo_gravity.lab.packages import check_packages
 
 NODES_PACKAGE = "exo_gravity.nodes."
 ONE_PROCESS = f"{NODES_PACKAGE}can_bridge.one_process"  # runs can_bridge and compensator
-# What the executable does. The folder in which the user stands, '' in the path, is not searched for modules.
-PROGRAM = """import sys
-sys.path = [*filter(None, sys.path)]
-sys.argv[0] = {name!r}
-from {module} import main
-sys.exit(main())
-"""
-# What the executable of a node in `LAST` does before that: it waits for a line on its standard input.
-WAIT = """import select
-select.select([0], [], [], {patience})
-"""
-LAST = ("/wearer", "/robot_model")  # what no arm waits for, and no operator
-PATIENCE = 5.0  # s for which these wait for the others; nodes with a high log level say nothing
 WATCHDOG_TIMEOUT = 30.0  # s for the watchdog of a dead bridge to let the arm down
 RECOVERY_TIMEOUT = WATCHDOG_TIMEOUT + DESCENT_TIMEOUT
 STOP_TIMEOUT = 5.0  # s for any other node to end
@@ -63,6 +48,8 @@ CONFIRMING = (
 )
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
 OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
+# What no arm waits for, and no operator: it imports what it needs when the others have, and while an arm is checked.
+LAST, DELAY = ("/wearer", "/robot_model"), {"EXO_GRAVITY_DELAY": "2.5"}
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
 LOG_FORMAT = "{severity} {message}"
 
@@ -71,8 +58,6 @@ Stopping = threading.Event
 
 def node_modules() -> dict[str, str]:
     """Return the executables that are nodes, each with its module, from the entry points of the installed package."""
-    from importlib.metadata import PackageNotFoundError, distribution  # slow to import
-
     try:
         scripts = distribution("exo_gravity").entry_points.select(group="console_scripts")
     except PackageNotFoundError:
@@ -80,17 +65,23 @@ def node_modules() -> dict[str, str]:
     return {script.name: script.module for script in sorted(scripts) if script.module.startswith(NODES_PACKAGE)}
 
 
-def command_of(node: str, module: str = "", first: str = "") -> list[str]:
-    """Return the command that runs `node` ('/right/can_bridge') from this package. Raises ParameterError if none does.
+def program(module: str, name: str) -> list[str]:
+    """Return the command that runs `main` of a module of this package as `name`.
 
-    module: in place of the node's own. It looks for no file in a folder: python-can installs an executable `can_bridge`
-    too.
-    first: what the program does before.
+    It looks for no file in a folder: python-can installs an executable `can_bridge` too.
+    """
+    return [sys.executable, "-m", "exo_gravity", module, name]
+
+
+def command_of(node: str, module: str = "") -> list[str]:
+    """Return the command that runs `node` ('/right/can_bridge'). Raises ParameterError if this package has none.
+
+    module: in place of the node's own.
     """
     name, modules = node.rpartition("/")[2], node_modules()
     if name not in modules:
         raise ParameterError("node name", node, f"/namespace/executable, with one of {', '.join(modules)}")
-    return [sys.executable, "-c", first + PROGRAM.format(name=name, module=module or modules[name])]
+    return program(module or modules[name], name)
 
 
 def chosen(nodes: Iterable[str], only: Sequence[str]) -> list[str]:
@@ -116,8 +107,7 @@ def asking_on_terminal(bridges: Sequence[str], say: Callable[[str], None]) -> It
             say(CONFIRMING.format(bridge))
         yield
         return
-    program = PROGRAM.format(name="pose_prompt", module=f"{NODES_PACKAGE}ros.pose_prompt")
-    with subprocess.Popen([sys.executable, "-c", program, *bridges]) as prompt:
+    with subprocess.Popen([*program(f"{NODES_PACKAGE}ros.pose_prompt", "pose_prompt"), *bridges]) as prompt:
         try:
             yield
         finally:
@@ -125,56 +115,22 @@ def asking_on_terminal(bridges: Sequence[str], say: Callable[[str], None]) -> It
 
 
 def wearers(nodes: Nodes) -> list[str]:
-    """Return the nodes `wearer` to start with the compensators of a file that has no key for them."""
-    found = []
-    for node, values in nodes.items():
-        namespace, _, name = node.rpartition("/")
-        if values.get("command_interface") == "multi_array":
-            continue  # an arm of ros2_control
-        if name == "compensator" and f"{namespace}/wearer" not in nodes:
-            found.append(f"{namespace}/wearer")
-    return found
+    """Return the nodes `wearer` to start with the compensators of a file that has no key for them.
 
-
-def node_arguments(node: str, params: Path, namespace: str, log_level: str) -> list[str]:
-    """Return the arguments of a node's executable; node: its full name, in `namespace` ('/lab', '' for none)."""
-    space, name = node.rsplit("/", 1)
-    topics = [f"{topic}:={namespace}{topic}" for topic in ABSOLUTE_TOPICS if namespace]
-    remaps = [word for rule in (f"__node:={name}", f"__ns:={space or '/'}", *topics) for word in ("-r", rule)]
-    return ["--ros-args", *remaps, "--enclave", node, "--params-file", str(params), "--log-level", log_level]
-
-
-def planned(
-    params: str | Path, only: Sequence[str] = (), more: Sequence[str] = ()
-) -> tuple[Nodes, list[str], list[str]]:
-    """Return what to start for a parameter file: the nodes with their parameters, those to start, and who asks.
-
-    The last are the bridges whose start asks a person whether the arm hangs as it is drawn.
-
-    only, more: as in `Launcher`. Raises ParameterError, MissingPackageError.
+    An arm of ros2_control has none.
     """
-    nodes = {**{node: {} for node in more}, **load(params)}
-    nodes |= {node: {} for node in wearers(nodes)}
-    names = chosen(nodes, only)
-    for node in names:
-        command_of(node)
-    check_packages(node.rpartition("/")[2] for node in names)
-    asking = [node for node in stages(names)[0] if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
-    return nodes, names, asking
+    own = [node for node, values in nodes.items() if values.get("command_interface") != "multi_array"]
+    beside = [f"{node.rpartition('/')[0]}/wearer" for node in own if node.endswith("/compensator")]
+    return [node for node in beside if node not in nodes]
 
 
-def _copy(content: str, name: str) -> Path:
-    """Return a new file of this content and name, in a new temporary folder. Raises ParameterError."""
-    folder = None
+def ended(process: "subprocess.Popen[str]", timeout: float) -> int:
+    """Wait at most `timeout` s for the end of a process, then kill it; return its exit code."""
     try:
-        folder = tempfile.mkdtemp(prefix="exo_gravity_")
-        Path(folder, name).write_text(content, encoding="utf-8")
-    except OSError as error:
-        if folder:
-            shutil.rmtree(folder, ignore_errors=True)
-        expected = f"a folder with room for a copy of the parameters ({error.strerror or error})"
-        raise ParameterError("TMPDIR", os.environ.get("TMPDIR", "/tmp"), expected) from None
-    return Path(folder, name)
+        return process.wait(max(0.0, timeout))
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 class Launcher:
@@ -183,8 +139,13 @@ class Launcher:
     on_line(node, line) is called with each line that a node prints. only: shell patterns of the nodes to start; ()
     starts all. more: nodes to start in addition to those of the file, with their default parameters. namespace: '/lab'
     in front of every node and of the IMU's topics. log_level: of every node. one_process: whether can_bridge and
-    compensator of an arm share one. check(nodes): may refuse the nodes that are to start, by an exception. Raises
-    ParameterError, MissingPackageError.
+    compensator of an arm share one. remaps: of topics, 'from:=to', for every node. check(nodes): may refuse the nodes
+    that are to start, by an exception. Raises ParameterError, MissingPackageError.
+
+    params: what the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
+    asking: the bridges whose start asks a person whether the arm hangs as it is drawn.
+    is_simulated: whether no bridge can reach a real arm.
+    maybe_powered: after `stop`, the bridges whose motors may still be on.
     """
 
     def __init__(
@@ -196,46 +157,55 @@ class Launcher:
         namespace: str = "",
         log_level: str = "info",
         one_process: bool = False,
+        remaps: Sequence[str] = (),
         check: Callable[[Nodes], object] = lambda nodes: None,
     ) -> None:
-        nodes, names, asking = planned(params, only, more)
+        nodes = {**{node: {} for node in more}, **load(params)}
+        nodes |= {node: {} for node in wearers(nodes)}
+        names = chosen(nodes, only)
+        commands = {node: command_of(node) for node in names}
+        check_packages(node.rpartition("/")[2] for node in names)
         check({node: nodes[node] for node in names})
-        buses = [nodes[bridge].get("can.interface") for bridge in stages(names)[0]]
-        self.is_simulated = {*buses} <= {*SIMULATED_BUSES} and buses != []  #: whether no bridge can reach a real arm
-        self._namespace, self._log_level = namespace, log_level
-        #: What the nodes read: a copy of the file as the tools have read it, so that nothing depends on two readers.
-        self.params = _copy(
-            text_of({f"{namespace}{node}": values for node, values in nodes.items()}), Path(params).name
-        )
-        pairs = {node: f"{node.rpartition('/')[0]}/compensator" for node in stages(names)[0]}
+        bridges = stages(names)[0]
+        self.asking = [f"{namespace}{node}" for node in bridges if nodes[node].get("start_pose", CONFIRM) == CONFIRM]
+        buses = {nodes[bridge].get("can.interface") for bridge in bridges}
+        self.is_simulated = buses <= {*SIMULATED_BUSES} and bool(buses)
+        self.maybe_powered: list[str] = []
+        try:
+            self._folder = tempfile.TemporaryDirectory(prefix="exo_gravity_")
+            self.params = Path(self._folder.name, Path(params).name)
+            self.params.write_text(text_of({f"{namespace}{node}": nodes[node] for node in nodes}), encoding="utf-8")
+        except OSError as error:
+            expected = f"a folder with room for a copy of the parameters ({error.strerror or error})"
+            raise ParameterError("TMPDIR", os.environ.get("TMPDIR", "/tmp"), expected) from None
+        self._namespace, self._log_level, self._remaps, self._on_line = namespace, log_level, remaps, on_line
+        pairs = {bridge: f"{bridge.rpartition('/')[0]}/compensator" for bridge in bridges if one_process}
         # The compensator that shares the process of its can_bridge
-        self._guests = {bridge: guest for bridge, guest in pairs.items() if one_process and guest in names}
-        self._commands = {node: self._command(node) for node in names if node not in self._guests.values()}
+        self._guests = {bridge: guest for bridge, guest in pairs.items() if guest in names}
+        for bridge, guest in self._guests.items():
+            commands[bridge] = [*command_of(bridge, ONE_PROCESS), *self._words(bridge), "--", *self._words(guest)]
+            del commands[guest]
+        alone = {node: [*commands[node], *self._words(node)] for node in commands if node not in self._guests}
+        self._commands = commands | alone
         self._processes: dict[str, subprocess.Popen[str]] = {}
         self._readers: dict[str, threading.Thread] = {}
-        self._starting = {node for node in self._commands if not node.endswith(LAST)}  # which have said nothing yet
-        self._on_line = on_line
         self._ended_observers: set[str] = set()
-        self.maybe_powered: list[str] = []
-        #: The bridges whose start asks a person whether the arm hangs as it is drawn.
-        self.asking = [f"{namespace}{node}" for node in asking]
+
+    def _words(self, node: str) -> list[str]:
+        """Return the arguments of a node's executable."""
+        full = f"{self._namespace}{node}"
+        space, name = full.rsplit("/", 1)
+        topics = [f"{topic}:={self._namespace}{topic}" for topic in ABSOLUTE_TOPICS if self._namespace]
+        rules = (f"__node:={name}", f"__ns:={space or '/'}", *topics, *self._remaps)
+        remaps = [word for rule in rules for word in ("-r", rule)]
+        given = ["--params-file", str(self.params), "--log-level", self._log_level]
+        return ["--ros-args", *remaps, "--enclave", full, *given]
 
     def start(self) -> None:
         """Start every node."""
         for node in self._commands:
-            self._processes[node], self._readers[node] = self._start(node, SUPERVISED)
-        self._note_start("")
-
-    def _note_start(self, node: str) -> None:
-        """Note that a node has started; let those in `LAST` start once all others have."""
-        self._starting.discard(node)
-        if self._starting:
-            return
-        for last in filter(lambda name: name.endswith(LAST), tuple(self._processes)):
-            if pipe := self._processes[last].stdin:
-                with contextlib.suppress(OSError):  # it has ended
-                    pipe.write("\n")
-                    pipe.flush()
+            late = DELAY if node.endswith(LAST) else {}
+            self._processes[node], self._readers[node] = self._start(node, {**SUPERVISED, **late})
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
@@ -249,6 +219,15 @@ class Launcher:
         reader.start()
         return process, reader
 
+    def _read(self, node: str, process: subprocess.Popen[str]) -> None:
+        names = (node, self._guests[node]) if node in self._guests else ()
+        loggers = {f"{self._namespace}{name}"[1:].replace("/", "."): name for name in names}
+        for line in process.stdout or ():
+            logger, _, rest = line.partition(" ")
+            name, text = (loggers[logger], rest) if logger in loggers else (node, line)
+            with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block
+                self._on_line(name, text.rstrip())
+
     def process(self, node: str) -> subprocess.Popen[str]:
         """Return the process of a node by its full name."""
         host = next((host for host, guest in self._guests.items() if guest == node), node)
@@ -259,44 +238,46 @@ class Launcher:
         return self._processes[node].poll() if node in self._processes else None
 
     def dead(self) -> tuple[str, int] | None:
-        """Return the name and exit code of a node that has ended, None while all run. An observer may end alone."""
-        codes = ((node, self.exit_code(node)) for node in list(self._processes) if not node.endswith(OBSERVERS))
-        return next(((node, code) for node, code in codes if code is not None), None)
+        """Return the name and exit code of a node that has ended, None while all run.
 
-    def _tell_ended_observers(self) -> None:
-        for node in self._processes:
+        An observer may end alone: that is said once.
+        """
+        for node in set(self._processes) - self._ended_observers:
             code = self.exit_code(node)
-            if node.endswith(OBSERVERS) and code is not None and node not in self._ended_observers:
+            if code is not None and not node.endswith(OBSERVERS):
+                return node, code
+            if code is not None:
                 self._ended_observers.add(node)
                 self._on_line(node, f"ended with exit code {code}; no arm depends on it, the other nodes run on")
+        return None
+
+    def run(self, stopping: Stopping) -> tuple[str, int] | None:
+        """Run the nodes until `stopping` is set or one ends; return the name and exit code of the one that ended."""
+        dead = None
+        try:
+            self.start()
+            while not (dead or stopping.wait(0.05)):
+                dead = self.dead()
+            return dead
+        finally:
+            self.stop()
 
     def stop(self) -> None:
-        """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last.
-
-        Sets `maybe_powered` to the bridges whose motors may still be on.
-        """
+        """Stop every node: first the bridges, which let the arms down, then the rest, and the recorder last."""
         bridges, others, recorders = stages(self._processes)
         self._terminate(bridges, DESCENT_TIMEOUT)
         self.maybe_powered = [node for node in bridges if not self._is_off(node)]
         self._terminate(others, STOP_TIMEOUT)
         self._terminate(recorders, STOP_TIMEOUT)
-        shutil.rmtree(self.params.parent, ignore_errors=True)
+        self._folder.cleanup()
 
     def _terminate(self, nodes: list[str], timeout: float) -> None:
         """Terminate `nodes` and wait for them; kill those that run for more than `timeout` s."""
-        processes = [self._processes[node] for node in nodes]
-        for process in processes:
-            if process.poll() is None:
-                process.terminate()  # SIGTERM: SIGINT would print a traceback in a node that is still importing
-        deadline = time.monotonic() + timeout
-        for process in processes:
-            try:
-                process.wait(max(0.0, deadline - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
         for node in nodes:
-            if self.exit_code(node) in ENDED_WELL:
+            self._processes[node].terminate()  # SIGTERM: SIGINT would print a traceback in a node that still imports
+        deadline = time.monotonic() + timeout
+        for node in nodes:
+            if ended(self._processes[node], deadline - time.monotonic()) in ENDED_WELL:
                 self._readers[node].join(STOP_TIMEOUT)
 
     def _is_off(self, node: str) -> bool:
@@ -307,46 +288,9 @@ class Launcher:
         if self.exit_code(node) in ENDED_WELL:
             return True
         recovery, reader = self._start(node, RECOVERY)
-        try:
-            return recovery.wait(RECOVERY_TIMEOUT) == 0
-        except subprocess.TimeoutExpired:
-            recovery.kill()
-            return False
-        finally:
-            reader.join(STOP_TIMEOUT)
-
-    def run(self, stopping: Stopping) -> tuple[str, int] | None:
-        """Run the nodes until `stopping` is set or one ends; return the name and exit code of the one that ended."""
-        try:
-            self.start()
-            while not stopping.wait(0.05):
-                self._tell_ended_observers()
-                dead = self.dead()
-                if dead:
-                    return dead
-            return None
-        finally:
-            self.stop()
-
-    def _command(self, node: str) -> list[str]:
-        if guest := self._guests.get(node):
-            return [*command_of(node, ONE_PROCESS), *self._words(node), "--", *self._words(guest)]
-        first = WAIT.format(patience=PATIENCE) if node.endswith(LAST) else ""
-        return [*command_of(node, first=first), *self._words(node)]
-
-    def _words(self, node: str) -> list[str]:
-        return node_arguments(f"{self._namespace}{node}", self.params, self._namespace, self._log_level)
-
-    def _read(self, node: str, process: subprocess.Popen[str]) -> None:
-        names = (node, self._guests[node]) if node in self._guests else ()
-        loggers = {f"{self._namespace}{name}"[1:].replace("/", "."): name for name in names}
-        for line in process.stdout or ():
-            if node in self._starting:
-                self._note_start(node)
-            logger, _, rest = line.partition(" ")
-            name, text = (loggers[logger], rest) if logger in loggers else (node, line)
-            with contextlib.suppress(OSError):  # of a closed terminal: a node whose log is not read would block
-                self._on_line(name, text.rstrip())
+        is_off = ended(recovery, RECOVERY_TIMEOUT) == 0
+        reader.join(STOP_TIMEOUT)
+        return is_off
 
 
 def stop_on_signals() -> Stopping:

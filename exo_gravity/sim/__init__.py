@@ -8,9 +8,8 @@ The names are imported when they are used: `sim.script` is read by trials and re
 without MuJoCo.
 """
 
-from typing import TYPE_CHECKING
-
-from exo_gravity.core.names import imported_when_used
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from exo_gravity.sim.arm import STEP, ArmConfig, SimulatedArm
@@ -40,4 +39,10 @@ MODULES = {
     "motors.firmware": ("FIRMWARES", "Firmware"),
     "virtual_wearer": ("VirtualWearer",),
 }
-__getattr__ = imported_when_used(__name__, MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    module = next((module for module, names in MODULES.items() if name in names), None)
+    if module is None:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    return getattr(import_module(f"{__name__}.{module}"), name)

@@ -14,7 +14,9 @@ use or wrong file.
 
 import argparse
 import math
+import os
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -26,7 +28,14 @@ from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.hardware.network import keep_to_this_machine, kept_to_this_machine
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.processes import ENDED_WELL, Launcher, asking_on_terminal, node_modules, stop_on_signals
+from exo_gravity.lab.processes import (
+    ENDED_WELL,
+    Launcher,
+    Stopping,
+    asking_on_terminal,
+    node_modules,
+    stop_on_signals,
+)
 from exo_gravity.tools.cli import print_any_character
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -47,13 +56,20 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--params", metavar="FILE", help="ROS 2 parameter file (default: the packaged sim.yaml)")
     only = "start only the nodes whose full names match a shell pattern: '*/can_bridge' /imu"
-    parser.add_argument("--only", metavar="PATTERN", nargs="+", default=(), help=only)
+    parser.add_argument("--only", metavar="PATTERN", nargs="+", action="extend", default=[], help=only)
     share = "run can_bridge and compensator of an arm in one process, see docs/performance.md"
     parser.add_argument("--one-process", action="store_true", help=share)
     parser.add_argument("--panel", action="store_true", help="also start the operator's panel, where the file has none")
     parser.add_argument("--namespace", metavar="NAME", default="", help="in front of every node and of /imu/...")
+    remap = "let every node use another topic, as the -r of ROS does"
+    parser.add_argument("--remap", metavar="FROM:=TO", action="append", default=[], help=remap)
     parser.add_argument("--log-level", default="info", choices=LOG_LEVELS, help="of every node (default: info)")
     return parser.parse_args(args)
+
+
+def _stop_with_parent(stopping: Stopping) -> None:
+    sys.stdin.read()
+    stopping.set()
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -62,22 +78,32 @@ def main(args: Sequence[str] | None = None) -> None:
     require_ros("launcher")
     print_any_character()  # one that raised would end the reader of a node's log, and block the node
     stopping = stop_on_signals()
+    if os.environ.get("EXO_GRAVITY_SUPERVISED"):  # by `ros2 launch`, which holds our standard input open
+        threading.Thread(target=_stop_with_parent, args=(stopping,), daemon=True).start()
+    space, restarts = options.namespace.strip("/"), deque([-math.inf] * 3, maxlen=3)  # the latter in monotonic s
+    make = partial(
+        Launcher,
+        options.params or packaged_config("sim.yaml"),
+        print_line,
+        options.only,
+        ["/panel"] if options.panel else [],
+        f"/{space}" if space else "",
+        options.log_level,
+        options.one_process,
+        options.remap,
+        check_start,
+    )
     try:
-        more = ["/panel"] if options.panel else []
-        path, space = options.params or packaged_config("sim.yaml"), options.namespace.strip("/")
-        namespace = f"/{space}" if space else ""
-        nodes = path, print_line, options.only, more, namespace, options.log_level, options.one_process
-        launcher = Launcher(*nodes, check=check_start)
+        launcher = make()
         keep_to_this_machine()
         if sentence := kept_to_this_machine():
             print_line("launcher", sentence)
         with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
             dead = launcher.run(stopping)
-        restarts = deque([-math.inf] * 3, maxlen=3)  # monotonic s
         while dead and launcher.is_simulated and dead[1] not in ENDED_WELL and time.monotonic() - restarts[0] > 600.0:
             restarts.append(time.monotonic())
             print_line("launcher", f"{dead[0].lstrip('/')} ended with exit code {dead[1]}: the simulation starts again")
-            launcher = Launcher(*nodes, check=check_start)
+            launcher = make()
             dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)

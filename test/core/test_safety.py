@@ -316,6 +316,11 @@ ROWS: dict[str, Sequence[Step]] = {
             ),
         }.items()
     },
+    "the calm second passes while the watchdog starts": [
+        lambda arm: setattr(arm.machine, "hindrance", Reason(Wait.WATCHDOG, "the watchdog to start")),
+        enable, wait(2.0), see(State.CHECKING), lambda arm: setattr(arm.machine, "hindrance", NO_REASON),
+        until(State.PROVING, 0.1),
+    ],
     **{
         f"a turn that an encoder loses while the loop stands still for {seconds} s in the proof is a fault": [
             enable, until(State.PROVING), wait(0.05), reads(1, position=TURN), stall(seconds), wait(0.1),

@@ -52,13 +52,6 @@ class Launched:
         """Send SIGINT to every process, as a terminal does."""
         os.killpg(self.process.pid, signal.SIGINT)
 
-    def pid(self, node: str) -> int:
-        """Return the ID of a node's process."""
-        for child in children(self.process.pid):
-            if f"__node:={node}".encode() in Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0"):
-                return child
-        raise LookupError(f"{node} does not run")
-
     def wait(self) -> int:
         """Wait for the end; return the exit code."""
         code = self.process.wait(STOP_TIMEOUT)
@@ -68,11 +61,6 @@ class Launched:
     def was_let_down(self) -> bool:
         """Return whether the motors went off, and the arm was never fast."""
         return self.truth.motors_are_off() and float(abs(self.truth.since(0.0)["velocity"]).max()) < LARGEST_SPEED
-
-    def ends(self) -> list[str]:
-        """Return the executables in the order in which they ended."""
-        form = re.compile(r"\[(?:INFO|ERROR)\] \[(\w+)-\d+\]: process has (?:finished|died)")
-        return [found[1] for found in map(form.match, self.log) if found]
 
 
 @pytest.fixture
@@ -91,25 +79,11 @@ def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator
         print("\n".join(launched.log))  # pytest shows it if the test failed
 
 
-def kill(*names: str) -> Callable[[Launched], None]:
-    """Kill nodes, or the watchdog of the bridge."""
-
-    def end(launched: Launched) -> None:
-        pids = [children(launched.pid("can_bridge"))[0] if name == "watchdog" else launched.pid(name) for name in names]
-        for pid in pids:
-            os.kill(pid, signal.SIGKILL)
-
-    return end
-
-
 ENDS = {  # what happens, and the exit code of `ros2 launch` if it does not die by that
     "Ctrl-C": (Launched.ctrl_c, 0),
     "launch alone is interrupted": (lambda launched: os.kill(launched.process.pid, signal.SIGINT), 0),
     "launch is killed": (lambda launched: os.kill(launched.process.pid, signal.SIGKILL), None),
     "its terminal is closed": (lambda launched: os.killpg(launched.process.pid, signal.SIGHUP), None),
-    "compensator": (kill("compensator"), 1),
-    "imu": (kill("imu"), 1),
-    "bridge and watchdog": (kill("watchdog", "can_bridge"), 1),
 }
 
 
@@ -120,11 +94,15 @@ def test_however_it_ends_the_arm_is_let_down_before_the_other_nodes_stop(launche
     code = launched.wait()
     wait_until(launched.truth.motors_are_off, timeout=STOP_TIMEOUT)
     assert launched.was_let_down() and expected in (None, code)
-    if end == "Ctrl-C":
-        first, *others = launched.ends()
-        assert first == "can_bridge" and sorted(others) == ["compensator", "imu", "simulator", "wearer"]
-    if end in ("compensator", "imu"):
-        assert any(f"{end} ended with exit code -9; all nodes were stopped" in line for line in launched.log)
+
+
+def test_a_node_that_dies_ends_it_with_an_error(launched):
+    (launcher,) = children(launched.process.pid)
+    name = b"/right/compensator"
+    nodes = [pid for pid in children(launcher) if name in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")]
+    os.kill(*nodes, signal.SIGKILL)
+    assert launched.wait() == 1 and launched.was_let_down()
+    assert any("right/compensator ended with exit code -9; all nodes were stopped" in line for line in launched.log)
 
 
 @contextmanager

@@ -4,7 +4,6 @@
 test_exit_codes.py shows what it refuses; test/nodes starts real nodes.
 """
 
-import io
 import os
 import signal
 import subprocess
@@ -18,7 +17,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.anfis import text_of
 from exo_gravity.lab.inputs.node_checks import check_nodes
 from exo_gravity.lab.inputs.parameter_file import load, stages
-from exo_gravity.lab.processes import WAIT, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
+from exo_gravity.lab.processes import DELAY, Launcher, chosen, command_of, node_modules, stop_on_signals, wearers
 from exo_gravity.tools import launcher
 
 from ..core.test_anfis import law
@@ -78,7 +77,7 @@ class Process:
     """A node's process that has printed `log`, and ends when it is terminated."""
 
     def __init__(self, log: Sequence[str]) -> None:
-        self.stdin, self.stdout, self._code = io.StringIO(), log, None
+        self.stdout, self._code = log, None
 
     def poll(self, timeout: float = 0.0) -> int | None:
         return self._code
@@ -99,8 +98,10 @@ def launched(monkeypatch, run_tool):
     def launched(*words: str, log: Sequence[str] = ()) -> tuple[dict[str, list[str]], list[str]]:
         commands: dict[str, list[str]] = {}
 
-        def start(command: list[str], **_: object) -> Process:
-            commands[node_of(command)] = command
+        def start(command: list[str], env: dict[str, str], **_: object) -> Process:
+            node = node_of(command)
+            commands[node] = command
+            assert (node.endswith("/wearer")) == (DELAY.items() <= env.items())  # no arm waits for it
             return Process(log if node_of(command).endswith("/can_bridge") else ())
 
         ended = threading.Event()
@@ -118,10 +119,11 @@ def test_only_a_part_of_the_nodes_is_started(launched):
     assert list(launched("--only", "*/compensator", "*/w*")[0]) == ["/right/compensator", "/right/wearer"]
 
 
-def test_a_namespace_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
-    commands, _ = launched("--namespace", "lab/", "--log-level", "warn")
+def test_a_namespace_remappings_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
+    remap = "assist_efforts:=mine"
+    commands, _ = launched("--namespace", "lab/", "--log-level", "warn", "--remap", remap)
     words = commands["/lab/right/compensator"]
-    assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", "warn"} <= set(words)
+    assert {"__ns:=/lab/right", "/imu/data:=/lab/imu/data", "/lab/right/compensator", remap, "warn"} <= set(words)
 
 
 def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_names(launched):
@@ -131,7 +133,7 @@ def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_
     assert list(commands) == ["/lab/imu", "/lab/right/can_bridge", "/lab/right/simulator", "/lab/right/wearer"]
     words = commands["/lab/right/can_bridge"]
     first, second = words[: words.index("--")], words[words.index("--") + 1 :]
-    assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[2]
+    assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[3]
     assert {"--ros-args", "__node:=compensator", "__ns:=/lab/right", "/lab/right/compensator"} <= set(second)
     assert [line for line in lines if not line.startswith("launcher ")] == [
         "right/compensator INFO compensating",
@@ -140,30 +142,6 @@ def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_
     ]
     alone, _ = launched(*one_process, "--only", "*/can_bridge", "/imu")
     assert list(alone) == ["/lab/imu", "/lab/right/can_bridge"] and "--" not in alone["/lab/right/can_bridge"]
-
-
-@pytest.mark.parametrize("silent", ["", "/right/simulator"], ids=["all have started", "one is silent"])
-def test_a_wearer_is_told_to_start_once_all_that_an_arm_waits_for_have_started(monkeypatch, silent):
-    processes: dict[str, Process] = {}
-
-    def start(command: list[str], **_: object) -> Process:
-        node = node_of(command)
-        processes[node] = Process(() if node in (silent, "/right/wearer") else ("INFO started\n", "INFO running\n"))
-        return processes[node]
-
-    monkeypatch.setattr(subprocess, "Popen", start)
-    started = Launcher(SIM, lambda node, line: None)
-    started.start()
-    started.stop()  # after the last line of each log
-    told = {node for node, process in processes.items() if process.stdin.getvalue()}
-    assert told == (set() if silent else {"/right/wearer"})
-
-
-def test_a_process_that_waits_for_the_others_begins_at_a_line_and_when_its_launcher_has_died():
-    program = [sys.executable, "-c", f"{WAIT.format(patience=600.0)}print('begun')"]
-    for given in ("\n", ""):
-        ended = subprocess.run(program, input=given, capture_output=True, text=True, timeout=120, check=True)
-        assert ended.stdout == "begun\n"
 
 
 @pytest.mark.parametrize(

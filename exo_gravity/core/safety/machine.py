@@ -297,7 +297,7 @@ class SafetyMachine:
                 self._trip(missing)
                 return
             missing = Reason(missing.code, missing.reason)
-        missing = self.hindrance or missing or missing_of_trunk(limits, self.motion.trunk_tilt)
+        missing = missing or missing_of_trunk(limits, self.motion.trunk_tilt)
         if not missing and (effort is None or are_late):
             missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:
@@ -308,10 +308,12 @@ class SafetyMachine:
             self.pose.withdraw()
         if asks:
             missing = self.pose.missing(self._now, readings.joints, missing)
-        self.waiting_for = missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
+        # While the bridge cannot switch motors on the calm second passes: its watchdog starts meanwhile.
+        self.waiting_for = self.hindrance or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         if missing:
             self._calm_since = self._now
-        if effort is not None and not ride.is_riding and self._now - self._calm_since >= START_GATE.calm:
+        is_calm = not self.hindrance and self._now - self._calm_since >= START_GATE.calm
+        if is_calm and effort is not None and not ride.is_riding:
             fault = None if readings.trusted else torque_while_hanging(limits, effort)
             if fault:
                 self._trip(fault)

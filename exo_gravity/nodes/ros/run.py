@@ -33,8 +33,6 @@ CLOSE_TIMEOUT = 5  # s for the middleware to close
 SWITCH_INTERVAL = 2e-4  # s that a thread may wait for the interpreter's lock; Python's default is 5 ms
 NO_CLOCK_TIMEOUT = 2.0  # s of a clock that stands still, without a publisher of /clock
 NO_CLOCK = "use_sim_time is true, but nobody publishes /clock: this node's clock and timers stand still"
-# Set by exo.launch.py for all nodes but the bridges: it ends them itself, once the arms are down.
-WAITS_FOR_BRIDGES = "EXO_GRAVITY_WAITS_FOR_BRIDGES"
 HELP = """
 Parameters: docs/parameters.md. Start it from a parameter file with `launcher --params FILE`, or alone:
   {name} --ros-args -r __ns:=/right --params-file FILE
@@ -133,13 +131,8 @@ def _clock(state: str) -> dict[str, object]:
 def handle_signals(ending: list[int]) -> None:
     """Let each signal that ends the node be appended to `ending`.
 
-    A SIGHUP that is ignored, as nohup does, stays ignored. With WAITS_FOR_BRIDGES only SIGTERM ends the node.
+    A SIGHUP that is ignored, as nohup does, stays ignored.
     """
-    if os.environ.get(WAITS_FOR_BRIDGES):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, lambda received, _: ending.append(received))
-        return
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda received, _: ending.append(received))
