@@ -3,7 +3,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.source import source_of
 from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.session import Session
-
-if TYPE_CHECKING:
-    import pandas
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 STRING = "std_msgs/msg/String"
@@ -122,8 +119,8 @@ class Bag:
         columns = {name: np.concatenate([arm[name] for arm in arms]) for name in arms[0]}
         return {"subject": np.full(len(columns["arm"]), self.session.subject, object), **columns}
 
-    def to_frame(self) -> "pandas.DataFrame":
-        """Return `columns` as a table. Raises ModuleNotFoundError, one sentence, without pandas."""
+    def to_frame(self) -> Any:
+        """Return `columns` as a pandas.DataFrame. Raises ModuleNotFoundError, one sentence, without pandas."""
         try:
             import pandas
         except ModuleNotFoundError:

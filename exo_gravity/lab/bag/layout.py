@@ -7,7 +7,7 @@ sequence its length and its items. All messages of one publisher have the same l
 one gives the offsets of the numbers, and NumPy extracts them from all messages whose lengths and texts are equal.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,11 +18,6 @@ from exo_gravity.core.errors import DataError
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 HEADER = 4  # bytes; alignment counts from their end
-MAX_LAYOUTS = 16  # of messages of one length, in one batch, that are looked for at once
-NUMBERS = {
-    "bool": "?", "octet": "u1", "byte": "u1", "uint8": "u1", "int8": "i1", "uint16": "u2", "int16": "i2",
-    "uint32": "u4", "int32": "i4", "uint64": "u8", "int64": "i8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
 
 
 class Batch(NamedTuple):
@@ -30,12 +25,13 @@ class Batch(NamedTuple):
 
     data: np.ndarray  #: (bytes,) uint8
     start: np.ndarray  #: (n,) of each message in data
-    length: np.ndarray  #: (n,) bytes
+    length: np.ndarray  #: (n,) bytes, more than those of the header
     arrival: np.ndarray  #: (n,) ns since 1970
+    ordinal: np.ndarray  #: (n,) their numbers among all messages of the recording
 
     def of(self, chosen: np.ndarray) -> "Batch":
         """Return the messages at the indices, or under the mask, `chosen`."""
-        return Batch(self.data, self.start[chosen], self.length[chosen], self.arrival[chosen])
+        return Batch(self.data, *(column[chosen] for column in self[1:]))
 
     def messages(self) -> list[bytes]:
         """Return each message."""
@@ -43,66 +39,60 @@ class Batch(NamedTuple):
         return [self.data[start:end].tobytes() for start, end in zip(self.start.tolist(), ends, strict=True)]
 
 
+def batch_of(messages: Sequence[bytes], arrival: np.ndarray, ordinal: np.ndarray) -> Batch:
+    """Return a batch of messages that arrived at `arrival` (n,) ns; ordinal: (n,) their numbers in the recording."""
+    length = np.fromiter(map(len, messages), np.int64, len(messages))
+    return Batch(np.frombuffer(b"".join(messages), np.uint8), np.cumsum(length) - length, length, arrival, ordinal)
+
+
 class Layout(NamedTuple):
     """Where the numbers lie in messages of one length."""
 
     numbers: np.dtype[np.void]  #: by their paths, such as 'header.stamp.sec'
-    constant: np.dtype[np.void]  #: bytes that messages of this layout share: header, lengths and texts, as words
     texts: dict[str, tuple[str, ...]]  #: by their paths
+    where: np.ndarray  #: (k,) the bytes that messages of this layout share: header, lengths and texts
+    shared: np.ndarray  #: (k,) these bytes
 
-
-class Decoded(NamedTuple):
-    """Messages of one layout."""
-
-    rows: np.ndarray  #: (n,) in the batch
-    layout: Layout
-    values: np.ndarray  #: (n,) of the type `layout.numbers`
+    def has(self, rows: np.ndarray) -> np.ndarray:
+        """Return which of the messages (n, bytes) have this layout, (n,)."""
+        same: np.ndarray = (rows[:, self.where] == self.shared).all(axis=1)
+        return same
 
 
 class _Walk:
-    """Goes through the fields of one message."""
+    """Goes through the fields of one message. Raises DataError beyond its end."""
 
     def __init__(self, message: bytes) -> None:
         self.message, self.at = message, HEADER
-        self.order = "<" if message[1] == 1 else ">"
+        self.is_little = message[1] == 1
         self.numbers: dict[str, tuple[Any, int]] = {}
-        self.constant = [slice(0, HEADER)]
         self.texts: dict[str, tuple[str, ...]] = {}
+        self.shared = [*range(HEADER)]
 
-    def align(self, size: int) -> None:
-        self.at += -(self.at - HEADER) % size
-
-    def take(self, count: int) -> int:
-        """Go on by `count` bytes; return where they begin. Raises DataError beyond the end."""
-        begin, self.at = self.at, self.at + count
+    def take(self, count: int, align: int = 1) -> int:
+        """Go on by `count` bytes; return where they begin."""
+        begin = self.at + -(self.at - HEADER) % align
+        self.at = begin + count
         if self.at > len(self.message):
             raise DataError("it ends too early")
         return begin
 
+    def share(self, count: int, align: int = 1) -> bytes:
+        """Return `count` bytes that messages of this layout share."""
+        begin = self.take(count, align)
+        self.shared.extend(range(begin, self.at))
+        return self.message[begin : self.at]
+
     def size(self) -> int:
         """Return the length before a text or a sequence."""
-        self.align(4)
-        at = self.take(4)
-        self.constant.append(slice(at, self.at))
-        return int.from_bytes(self.message[at : self.at], "little" if self.order == "<" else "big")
+        return int.from_bytes(self.share(4, align=4), "little" if self.is_little else "big")
 
-    def text(self) -> str:
-        length = self.size()
-        at = self.take(length)
-        self.constant.append(slice(at, self.at))
-        return self.message[at : self.at - 1].decode()
-
-    def number(self, path: str, name: str, shape: tuple[int, ...]) -> None:
-        form = np.dtype(self.order + NUMBERS[name])
-        self.align(form.itemsize)
-        self.numbers[path] = (form, shape), self.take(form.itemsize * int(np.prod(shape, dtype=int)))
-
-    def message_of(self, msgtype: str, prefix: str = "") -> None:
+    def read(self, msgtype: str, prefix: str = "") -> None:
         fields: Any = TYPES.fielddefs[msgtype][1]
         for name, (node, of) in fields:
             path = prefix + name
             if node == Nodetype.NAME:
-                self.message_of(of, f"{path}.")
+                self.read(of, f"{path}.")
                 continue
             (item, (kind, *_)), count = ((node, of), 1) if node == Nodetype.BASE else of
             if item != Nodetype.BASE:
@@ -110,46 +100,23 @@ class _Walk:
             if node == Nodetype.SEQUENCE:
                 count = self.size()
             if kind == "string":
-                if count > len(self.message):
-                    raise DataError("it ends too early")
-                self.texts[path] = tuple(self.text() for _ in range(count))
+                self.texts[path] = tuple(self.share(self.size())[:-1].decode() for _ in range(count))
             elif count:
-                self.number(path, kind, () if node == Nodetype.BASE else (count,))
+                form = np.dtype(kind).newbyteorder("<" if self.is_little else ">")
+                shape = () if node == Nodetype.BASE else (count,)
+                self.numbers[path] = (form, shape), self.take(form.itemsize * count, form.itemsize)
 
 
 def layout_of(message: bytes, msgtype: str) -> Layout:
     """Return the layout of a message. Raises DataError if it is not one of this type, or has sequences of messages."""
     try:
         walk = _Walk(message)
-        walk.message_of(msgtype)
-    except (DataError, IndexError, UnicodeDecodeError) as error:
+        walk.read(msgtype)
+    except (DataError, UnicodeDecodeError) as error:
         raise DataError(f"a message is damaged, or is not a {msgtype} in CDR ({error})") from None
     formats, offsets = zip(*walk.numbers.values(), strict=True) if walk.numbers else ((), ())
     form: Any = {"names": [*walk.numbers], "formats": formats, "offsets": offsets, "itemsize": len(message)}
-    return Layout(np.dtype(form), _words(walk.constant, len(message)), walk.texts)
-
-
-def _words(parts: list[slice], size: int) -> np.dtype[np.void]:
-    """Return the bytes `parts` of a message of `size` bytes as words, which may overlap: words are compared fast."""
-    words: dict[int, int] = {}  # where each begins: its bytes
-    for part in _joined(parts):
-        length = part.stop - part.start
-        width = next(width for width in (8, 4, 2, 1) if width <= length)
-        words |= dict.fromkeys((*range(part.start, part.stop - width, width), part.stop - width), width)
-    names, formats = [str(at) for at in words], [f"u{width}" for width in words.values()]
-    form: Any = {"names": names, "formats": formats, "offsets": [*words], "itemsize": size}
-    return np.dtype(form)
-
-
-def _joined(parts: list[slice]) -> tuple[slice, ...]:
-    """Return parts of a message without empty ones, neighbours as one."""
-    joined = parts[:1]
-    for part in parts[1:]:
-        if part.start == joined[-1].stop:
-            joined[-1] = slice(joined[-1].start, part.stop)
-        else:
-            joined.append(part)
-    return tuple(joined)
+    return Layout(np.dtype(form), walk.texts, np.array(walk.shared), np.frombuffer(message, np.uint8)[walk.shared])
 
 
 class Decoder:
@@ -157,63 +124,31 @@ class Decoder:
 
     def __init__(self, msgtype: str) -> None:
         self.msgtype, self.damaged, self.problem = msgtype, 0, ""
-        self._known: dict[int, tuple[Layout, np.ndarray]] = {}  # by length: the last layout, and a message of it
+        self._known: dict[int, Layout] = {}  # the last layout by the length of its messages
 
-    def decode(self, batch: Batch) -> Iterator[Decoded]:
-        """Yield the messages of a batch, those of one layout together."""
-        for length in dict.fromkeys(batch.length.tolist()):  # in order of appearance
-            chosen = np.flatnonzero(batch.length == length)
-            rows = _rows(batch.data, batch.start[chosen], length)
-            for _ in range(MAX_LAYOUTS):
-                if not len(rows):
-                    break
-                same = self._matching(rows, length)
-                if same is None:  # the first one is damaged
-                    chosen, rows = chosen[1:], rows[1:]
+    def decode(self, batch: Batch) -> Iterator[tuple[np.ndarray, Layout, np.ndarray]]:
+        """Yield the messages of each layout: which of the batch they are (n,), the layout, and their numbers (n,)."""
+        for length in np.unique(batch.length).tolist():
+            left = np.flatnonzero(batch.length == length)
+            rows = records_at(batch.data, batch.start[left], length)
+            layout = self._known.get(length)
+            while len(left):
+                try:
+                    layout = layout or layout_of(rows[0].tobytes(), self.msgtype)
+                except DataError as error:
+                    self.damaged, self.problem = self.damaged + 1, str(error)
+                    left, rows = left[1:], rows[1:]
                     continue
-                layout, _ = self._known[length]
-                yield Decoded(chosen[same], layout, rows[same].view(layout.numbers)[:, 0])
-                chosen, rows = chosen[~same], rows[~same]
-            for index, row in zip(chosen, rows, strict=True):  # layouts that change with every message
-                if own := self._layout(row):
-                    yield Decoded(np.array([index]), own, row.view(own.numbers))
-
-    def _matching(self, rows: np.ndarray, length: int) -> np.ndarray | None:
-        """Return which rows have the known layout or, if none has, that of the first row; None if that is damaged."""
-        if length in self._known:
-            same = _equal(rows, *self._known[length])
-            if same.any():
-                return same
-        layout = self._layout(rows[0])
-        if not layout:
-            return None
-        self._known[length] = layout, rows[0].copy()
-        return _equal(rows, *self._known[length])
-
-    def _layout(self, row: np.ndarray) -> Layout | None:
-        try:
-            return layout_of(row.tobytes(), self.msgtype)
-        except DataError as error:
-            self.damaged, self.problem = self.damaged + 1, str(error)
-            return None
+                same = layout.has(rows)
+                if same.any():
+                    self._known[length] = layout
+                    yield left[same], layout, rows[same].view(layout.numbers)[:, 0]
+                    left, rows = left[~same], rows[~same]
+                layout = None
 
 
-def records_at(data: np.ndarray, start: np.ndarray, form: np.dtype[np.void]) -> np.ndarray:
-    """Return the records (n,) of a form that begin at `start` (n,) in data, (bytes,) uint8, which holds all of them."""
-    count = max(len(data) - form.itemsize + 1, 0)
+def records_at(data: np.ndarray, start: np.ndarray, size: int) -> np.ndarray:
+    """Return the bytes (n, size) that begin at `start` (n,) in data, (bytes,) uint8, which holds all of them."""
     # Whole records are copied several times as fast as rows of bytes are.
-    raw = np.ndarray(count, np.dtype((np.void, form.itemsize)), data, strides=(1,))
-    return raw[start].view(form)
-
-
-def _rows(data: np.ndarray, start: np.ndarray, length: int) -> np.ndarray:
-    """Return the messages (n, length) of equal length at `start` in data, as bytes."""
-    if not length:
-        return np.empty((len(start), 0), np.uint8)
-    return records_at(data, start, np.dtype((np.void, length))).view(np.uint8).reshape(-1, length)
-
-
-def _equal(rows: np.ndarray, layout: Layout, one: np.ndarray) -> np.ndarray:
-    """Return whether each row shares the constant bytes of the message `one`."""
-    same: np.ndarray = rows.view(layout.constant)[:, 0] == one.view(layout.constant)[0]
-    return same
+    whole = np.ndarray(max(len(data) - size + 1, 0), np.dtype((np.void, size)), data, strides=(1,))
+    return whole[start].view(np.uint8).reshape(-1, size)

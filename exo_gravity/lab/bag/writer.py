@@ -11,7 +11,8 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -64,10 +65,9 @@ class BagWriter:
         except (WriterError, OSError) as error:
             raise DataError(f"{self.path}: cannot record there ({error})") from None
         self._storage = cast(McapWriter, self._writer.storage)
-        self._topics: dict[str, tuple[str, Qos]] = {}
         self._connections: dict[str, Connection] = {}
-        self._waiting: queue.Queue[list[Message]] = queue.Queue(MAX_WAITING)
-        self._ending = threading.Event()
+        self._waiting: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()  # what the thread has to do
+        self._is_open = True
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
 
@@ -78,17 +78,14 @@ class BagWriter:
         """
         if msgtype not in self._types.fielddefs:
             raise DataError(f"{topic} has type {msgtype}: must be one of ROS 2 Jazzy's common interfaces")
-        self._topics[topic] = msgtype, qos
+        self._waiting.put(partial(self._announce, topic, msgtype, qos))
 
     def write(self, messages: Sequence[Message]) -> None:
         """Queue messages, in the order of their times."""
-        try:
-            if messages and not self.error:
-                self._waiting.put_nowait(list(messages))
-                return
-        except queue.Full:
-            pass
-        self.lost += len(messages)
+        if self.error or self._waiting.qsize() >= MAX_WAITING:
+            self.lost += len(messages)
+        elif messages:
+            self._waiting.put(partial(self._take, list(messages)))
 
     def describe(self, key: str, value: str) -> None:
         """State something about the recording, for `custom_data` in metadata.yaml."""
@@ -96,38 +93,33 @@ class BagWriter:
 
     def close(self) -> None:
         """Write the queued messages, the index and metadata.yaml. A failure is in `error`."""
-        self._ending.set()
+        self._waiting.put(self._finish)
         self._thread.join()
 
     def _run(self) -> None:
         flush_at = time.monotonic() + FLUSH_PERIOD
         try:
-            while not (self._ending.is_set() and self._waiting.empty()):
-                with contextlib.suppress(queue.Empty):
-                    self._take(self._waiting.get(timeout=0.05))
+            while self._is_open:
                 if time.monotonic() >= flush_at:
                     flush_at = time.monotonic() + FLUSH_PERIOD
                     if self._storage.chunk.bio.tell():
                         self._storage.close_chunk()
                         self._storage.bio.flush()
-            self._announce()
-            self._writer.close()
+                with contextlib.suppress(queue.Empty):
+                    self._waiting.get(timeout=0.05)()
         except Exception as error:  # of any kind: this thread must not end without a reason
             reason = getattr(error, "strerror", None) or str(error)
             self.error = DataError(f"{self.path}: recording ended after {self.count} messages: {reason}")
             with contextlib.suppress(OSError):  # closing the file tries the failed write again
                 self._storage.bio.close()
 
-    def _announce(self) -> None:
-        """Add the topics that are new."""
-        for topic in [topic for topic in tuple(self._topics) if topic not in self._connections]:
-            msgtype, qos = self._topics[topic]
+    def _announce(self, topic: str, msgtype: str, qos: Qos) -> None:
+        if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(
                 topic, msgtype, typestore=self._types, offered_qos_profiles=[qos]
             )
 
     def _take(self, messages: list[Message]) -> None:
-        self._announce()
         for topic, stamp, data in messages:
             connection = self._connections.get(topic)
             if connection is None or stamp < 0:  # a bad message must not end the recording
@@ -135,6 +127,10 @@ class BagWriter:
                 continue
             self._writer.write(connection, stamp, data)
             self.count += 1
+
+    def _finish(self) -> None:
+        self._is_open = False
+        self._writer.close()
 
 
 def is_complete(path: str | Path) -> bool:
@@ -162,12 +158,11 @@ def repair(path: str | Path) -> tuple[Path, int]:
             if count == 1:
                 writer = _opened(folder)
             if topic not in connections:
-                definition, qos = source.announced[topic]
+                schema, channel = source.announced[topic]
                 if msgtype not in types.fielddefs:
-                    types.register(get_types_from_msg(definition, msgtype))
-                connections[topic] = writer.add_connection(
-                    topic, msgtype, typestore=types, offered_qos_profiles=parse_qos(qos)
-                )
+                    types.register(get_types_from_msg(schema.data.decode(), msgtype))
+                qos = parse_qos(channel.metadata.get("offered_qos_profiles", ""))
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=types, offered_qos_profiles=qos)
             writer.write(connections[topic], stamp, data)
         if not count:
             raise DataError(f"{folder}: not written: the recording has no message")

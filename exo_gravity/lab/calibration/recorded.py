@@ -97,8 +97,8 @@ def samples_of(path: Path, topic: str, msgtype: str) -> Iterator[np.ndarray]:
     """
     storage, decoder, found = Storage(path), Decoder(msgtype), False
     for rows in storage.rows(lambda name, kind: (name, kind) == (topic, msgtype)):
-        for decoded in decoder.decode(rows.batch):
-            yield decoded.values
+        for _, _, values in decoder.decode(rows.batch):
+            yield values
             found = True
     if not found:
         topics = decoder.problem or f"its topics: {', '.join(sorted(storage.topics)) or 'none'}"

@@ -24,7 +24,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import REQUEST
 from exo_gravity.core.numbers import COVER, Torque
 from exo_gravity.lab.observer.momentum import OBSERVER, WearerEstimate
-from exo_gravity.lab.observer.share import SHARE, Known, RunningShare, Shares
+from exo_gravity.lab.observer.share import SHARE, RunningShare, Shares
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,6 @@ class SupportAdaptation:
         if now >= self._due and abs(self.support - in_force) >= REQUEST.least_change:
             self.requested, self._due = self.support, now + REQUEST.pause
 
-    @property
-    def share(self) -> Known | None:
-        """The wearer's share of the whole arm."""
-        return self.shares.whole if self.shares else None
-
     def _sunk(self, dt: float, joints: Sequence[Sequence[float]], weight: Torque, asked: float) -> float:
         """Return how fast the arm sinks as a share of `full`, at most 1, and at least -`lift` while it is lifted.
 
@@ -122,10 +117,10 @@ class SupportAdaptation:
         is_moved = max(map(abs, velocity)) > tuning.reach
         self._speed = 0.0 if is_moved else self._speed + part * (rise / dt - self._speed)
         self.problem = ""
-        if self.share is None:  # the arm hangs
+        share, deviation = self.shares.whole if self.shares else (math.nan, math.nan)
+        if math.isnan(share):  # the arm hangs
             return 0.0
-        share, deviation = self.share
-        band = COVER * deviation
+        band = COVER * float(deviation)
         if band > tuning.widest:
             self.problem = f"the wearer's share is known to +-{100.0 * band:.0f} % only"
         sunk = max(-tuning.lift, min(1.0, -self._speed / tuning.full))

@@ -13,7 +13,6 @@ error of the weight itself is the same share of it in every joint.
 
 import itertools
 import math
-import operator
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,7 +22,7 @@ import numpy as np
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate, low_passed
+from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
 
 PERIOD = 0.01  # s between two samples
 
@@ -57,50 +56,24 @@ class Share(NamedTuple):
     deviation: np.ndarray
 
 
-Known = tuple[float, float]  # a share, 0..1, and its standard deviation
-
-
 class Shares(NamedTuple):
-    """The wearer's share of what carries their arm; None where there is nothing to carry."""
+    """The wearer's share of what carries their arm."""
 
-    whole: Known | None
-    joints: tuple[Known | None, ...]  #: (n,)
+    whole: Share
+    joints: Share  #: (m,)
 
 
 class RunningShare:
     """The share of the last `window` s, from one estimate to the next: an older one weighs exponentially less."""
 
     def __init__(self) -> None:
-        # Nm^2, (n,): the means of the joints' parts of both sums, and of the deviation's own and common part
-        self._given: tuple[float, ...] = ()
-        self._carried: tuple[float, ...] = ()
-        self._own: tuple[float, ...] = ()
-        self._common: tuple[float, ...] = ()
+        self._means: np.ndarray | float = 0.0  # (4, m) Nm^2, see `_products`
 
     def update(self, dt: float, estimate: WearerEstimate) -> Shares:
         """Take an estimate, `dt` s after the last; return the shares."""
-        part, weight = dt / (SHARE.window + dt), estimate.weight
-        nothing = (0.0,) * len(weight)
-        size = list(map(abs, weight))
-        common = map(common_part, estimate.deviation, estimate.independent)
-        self._given = low_passed(self._given or nothing, list(map(operator.mul, weight, estimate.torque)), part)
-        self._carried = low_passed(self._carried or nothing, [w * w for w in weight], part)
-        self._own = low_passed(self._own or nothing, list(map(operator.mul, size, estimate.independent)), part)
-        self._common = low_passed(self._common or nothing, list(map(operator.mul, size, common)), part)
-        joints = zip(self._given, self._carried, self._own, self._common, strict=True)
-        of_joints = tuple([
-            (given / carried, math.hypot(own, common) / carried) if carried > SHARE.least_of_joint**2 else None
-            for given, carried, own, common in joints
-        ])  # fmt: skip
-        carried = sum(self._carried)
-        if carried < SHARE.least_weight**2:
-            return Shares(None, of_joints)
-        return Shares((sum(self._given) / carried, math.hypot(*self._own, sum(self._common)) / carried), of_joints)
-
-
-def common_part(deviation: float, independent: float) -> float:
-    """Return what is left of a standard deviation without its `independent` part."""
-    return math.sqrt(max(0.0, deviation**2 - independent**2))
+        products = _products(*(np.array(column) for column in estimate))
+        self._means = self._means + dt / (SHARE.window + dt) * (products - self._means)
+        return _shares(self._means, 1.0)
 
 
 def observed(
@@ -133,31 +106,34 @@ def while_between(curve: WearerCurve, spans: Iterable[tuple[float, float]]) -> W
 
 def share_of(curve: WearerCurve, window: float = math.inf) -> Share:
     """Return the wearer's share over the last `window` s at each time, or one number over the whole curve."""
-    count, given, carried, own, common = _sums(curve, window)
-    total = carried.sum(axis=-1)
-    enough = np.where(total > SHARE.least_weight**2 * count, total, np.nan)
-    error = np.hypot(np.linalg.norm(own, axis=-1), common.sum(axis=-1))
-    return Share(given.sum(axis=-1) / enough, error / enough)
+    products = _products(*curve[1:])
+    if math.isinf(window):
+        return _shares(products.sum(axis=1), len(curve.time)).whole
+    total = np.pad(products.cumsum(axis=1), ((0, 0), (1, 0), (0, 0)))
+    first = np.searchsorted(curve.time, curve.time - window)
+    return _shares(total[:, 1:] - total[:, first], np.arange(len(first)) + 1 - first).whole
 
 
 def joint_shares(curve: WearerCurve) -> Share:
     """Return the share of each joint (m,) over the whole curve."""
-    count, given, carried, own, common = _sums(curve, math.inf)
-    enough = np.where(carried > SHARE.least_of_joint**2 * count, carried, np.nan)
-    return Share(given / enough, np.hypot(own, common) / enough)
+    return _shares(_products(*curve[1:]).sum(axis=1), len(curve.time)).joints
 
 
-def _sums(curve: WearerCurve, window: float) -> tuple[np.ndarray, ...]:
-    """Return, over the last `window` s at each time or over the whole curve, how many samples there are, and four sums.
+def _products(torque: np.ndarray, deviation: np.ndarray, weight: np.ndarray, independent: np.ndarray) -> np.ndarray:
+    """Return what is summed, (4, ..., m) in Nm^2, of an estimate or a curve, (..., m) in Nm each.
 
-    These are the two of the share, and of its deviation the joints' own and the common part, each (..., m) in Nm^2.
+    These are the two parts of the share, and of its deviation the joints' own and the common part.
     """
-    size, common = np.abs(curve.weight), np.sqrt(np.maximum(0.0, curve.deviation**2 - curve.independent**2))
-    parts = (curve.torque * curve.weight, curve.weight**2, curve.independent * size, common * size)
-    products = np.column_stack((np.ones(len(curve.time)), *parts))
-    if math.isinf(window):
-        sums = products.sum(axis=0)
-    else:
-        total = np.vstack((np.zeros(products.shape[1]), products.cumsum(axis=0)))
-        sums = total[1:] - total[np.searchsorted(curve.time, curve.time - window)]
-    return sums[..., 0], *np.split(sums[..., 1:], len(parts), axis=-1)
+    size, common = np.abs(weight), np.sqrt(np.maximum(0.0, deviation**2 - independent**2))
+    return np.array((torque * weight, weight**2, independent * size, common * size))
+
+
+def _shares(sums: np.ndarray, count: np.ndarray | float) -> Shares:
+    """Return the shares of the sums of `count` products, (4, ..., m) in Nm^2."""
+    given, carried, own, common = sums
+    total = carried.sum(axis=-1)
+    total = np.where(total > SHARE.least_weight**2 * count, total, np.nan)
+    of_joint = np.where(carried > SHARE.least_of_joint**2 * np.expand_dims(count, -1), carried, np.nan)
+    error = np.hypot(np.linalg.norm(own, axis=-1), common.sum(axis=-1))
+    whole = Share(given.sum(axis=-1) / total, error / total)
+    return Shares(whole, Share(given / of_joint, np.hypot(own, common) / of_joint))

@@ -1,21 +1,65 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""All estimates of the wearer of one arm, from one sample to the next: torque, share, contacts, support."""
+"""All estimates of the wearer of one arm, from one sample to the next: torque, share, contacts, support.
+
+A contact is a torque that comes faster than a person's does, as at a table's edge.
+"""
 
 import math
+import operator
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.numbers import COVER
+from exo_gravity.core.numbers import COVER, Torque, for_joints
 from exo_gravity.core.vocabulary import NONE, UNKNOWN
 from exo_gravity.lab.observer.adaptation import SupportAdaptation
-from exo_gravity.lab.observer.contact import ContactWatch
-from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate
-from exo_gravity.lab.observer.share import Known, Shares
+from exo_gravity.lab.observer.momentum import MomentumObserver, WearerEstimate, low_passed
+from exo_gravity.lab.observer.share import Shares
 from exo_gravity.lab.vocabulary import Adapts
 
 OLD = 1.0  # s after which an estimate is no longer shown
+
+
+@dataclass(frozen=True)
+class ContactTuning:
+    """What counts as a contact."""
+
+    followed: float = 0.1  #: s, time constant of what a person's torque follows
+    #: Nm beyond that, (n,): 1.3 times the most that `make study NAME=wearer` saw of reaching wearers
+    least: Sequence[float] = (3.0, 5.0, 3.0, 1.5)
+    pause: float = 1.0  #: s without another one, after which a contact is a new one
+
+
+CONTACT = ContactTuning()
+
+
+class ContactWatch:
+    """Counts the contacts of one arm. last: time in s, joint and Nm of the newest, None before the first."""
+
+    def __init__(self, tuning: ContactTuning = CONTACT) -> None:
+        self.count = 0
+        self.last: tuple[float, int, float] | None = None
+        self._tuning = tuning
+        self._slow: Torque = ()
+        self._time = self._touched = -math.inf  # s
+
+    def update(self, now: float, estimate: WearerEstimate) -> None:
+        """Take the estimate at `now` s."""
+        tuning = self._tuning
+        dt, self._time = now - self._time, now
+        if not 0.0 <= dt <= tuning.followed:
+            self._slow, dt = estimate.torque, 0.0
+        self._slow = low_passed(self._slow, estimate.torque, dt / tuning.followed)
+        jumps = list(map(operator.sub, estimate.torque, self._slow))
+        columns = zip(jumps, for_joints(tuning.least, len(jumps), max), estimate.distinguishable, strict=True)
+        sizes = [abs(jump) / least if shown else 0.0 for jump, least, shown in columns]
+        joint = max(range(len(sizes)), key=sizes.__getitem__)
+        if sizes[joint] > 1.0:
+            if now - self._touched > tuning.pause:
+                self.count, self.last = self.count + 1, (now, joint, jumps[joint])
+            self._touched = now
 
 
 class WearerWatch:
@@ -74,22 +118,21 @@ def values_of(names: Sequence[str], estimate: WearerEstimate | None, shares: Sha
 
     names: of the joints (n,). estimate, shares: None if there are none.
     """
-    whole, joints = shares or (None, (None,) * len(names))
-    values = dict(zip(("share of the wearer (%)", "share band (%)"), _percent(whole), strict=True))
-    for name, share in zip(names, joints, strict=True):
-        values[f"{name} share (%)"], values[f"{name} share band (%)"] = _percent(share)
-    for n, name in enumerate(names):
-        values[f"{name} wearer (Nm)"] = f"{round(estimate.torque[n], 1) + 0.0:.1f}" if estimate else UNKNOWN
-        values[f"{name} wearer band (Nm)"] = f"{COVER * estimate.deviation[n]:.1f}" if estimate else UNKNOWN
+    unknown = (math.nan,) * len(names)
+    (share, band), (of_joints, bands) = shares or ((math.nan, math.nan), (unknown, unknown))
+    torques, deviations = (estimate.torque, estimate.deviation) if estimate else (unknown, unknown)
+    values = {"share of the wearer (%)": _text(100.0 * share, 0), "share band (%)": _text(100.0 * COVER * band, 0)}
+    columns = zip(names, of_joints, bands, torques, deviations, strict=True)
+    for name, of_joint, its_band, torque, deviation in columns:
+        values[f"{name} share (%)"] = _text(100.0 * of_joint, 0)
+        values[f"{name} share band (%)"] = _text(100.0 * COVER * its_band, 0)
+        values[f"{name} wearer (Nm)"] = _text(torque, 1)
+        values[f"{name} wearer band (Nm)"] = _text(COVER * deviation, 1)
     return values
 
 
-def _percent(share: Known | None) -> tuple[str, str]:
-    """Return a share and half its 95 % band."""
-    if share is None:
-        return UNKNOWN, UNKNOWN
-    value, deviation = share
-    return f"{round(100.0 * value)}", f"{round(100.0 * COVER * deviation)}"
+def _text(value: float, digits: int) -> str:
+    return UNKNOWN if math.isnan(value) else f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
 def _known_of(s: Settings) -> object:

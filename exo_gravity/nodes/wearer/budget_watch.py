@@ -1,12 +1,11 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque budget of what an arm carries at present: whether its motors can hold it in every pose.
 
-It takes about 0.2 s of arithmetic, on a thread of its own, so that the estimate of the wearer's torque goes on.
+It takes about 0.2 s of arithmetic on the executor's thread; the estimate of the wearer's torque has its own.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from rclpy.node import Node
@@ -31,7 +30,7 @@ Request = tuple[Arm, Arm, tuple[Springs, Springs], float, float]
 
 
 class BudgetWatch:
-    """Checks the newest settings, one budget at a time. Call `update` regularly.
+    """Checks the newest settings. Call `update` regularly.
 
     Motors and joint limits are parameters of `can_bridge`, which are read once.
     """
@@ -44,28 +43,19 @@ class BudgetWatch:
         self._logger = node.get_logger()
         self._bridge = NodeParameters(node, "can_bridge", once=True, fitting=fitting)
         self._request: Request | None = None
-        self._job: Future[tuple[Reason, str]] | None = None
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="budget")
 
     def update(self, names: Sequence[str], settings: Settings) -> None:
-        """Collect a finished budget, or start one for `settings` if they are new. Never blocks.
-
-        names: of the joints (n,).
-        """
+        """Check `settings` if they are new; names: of the joints (n,)."""
         if settings.law == URDF_LAW:
             self.result = Reason(Budget.UNKNOWN, "unknown: it is watched for the paper's arm alone")
             return
         self._bridge.update()
-        if self._job is not None:
-            if self._job.done():
-                (self.result, self.largest_support), self._job = self._job.result(), None
-                if self.result.word != Budget.WITHIN_RATED:
-                    self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
-        elif self._bridge.values.keys() >= BRIDGE_PARAMETERS:
-            request = request_of(settings)
-            if request != self._request:
-                self._request = request
-                self._job = self._pool.submit(compute, names, request, self._bridge.values)
+        request = request_of(settings)
+        if self._bridge.values.keys() >= BRIDGE_PARAMETERS and request != self._request:
+            self._request = request
+            self.result, self.largest_support = compute(names, request, self._bridge.values)
+            if self.result.word != Budget.WITHIN_RATED:
+                self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
 
 
 def request_of(s: Settings) -> Request:

@@ -108,7 +108,7 @@ class WearerNode(Node):
         # Of the compensator: its parameters, what never changes of them, and why they cannot be used.
         self._settings: Settings | None = None
         self._fixed: tuple[object, ...] = ()
-        self._refusal = NO_REASON
+        self._refusal = Reason(NoEstimate.NO_PARAMETERS, f"waiting for the parameters of {self._status_name}")
         # Of an arm from a URDF: its text where it comes from a topic, and the arm, None for the paper's.
         self._description = ""
         self._descriptions: Any = None  # the topic's subscription
@@ -155,17 +155,17 @@ class WearerNode(Node):
 
     def _on_parameters(self, _name: str, values: dict[str, Any]) -> None:
         """Use the compensator's parameters, or note why they cannot be used."""
+        self._settings = None
         try:
             settings = self._read(values)
         except (ParameterError, KeyError) as error:
             # A KeyError: of another version, or another program's node.
             what = f"no parameter {error}" if isinstance(error, KeyError) else error
-            self._settings = None
             self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, f"the compensator has {what}")
             return
         if settings is None:
             waiting = f"waiting for the arm's URDF on {values['urdf.topic']}"
-            self._settings, self._refusal = None, Reason(NoEstimate.NO_DESCRIPTION, waiting)
+            self._refusal = Reason(NoEstimate.NO_DESCRIPTION, waiting)
             return
         topic = "joint_states"
         if values.get("command_interface") == "multi_array":
@@ -178,7 +178,7 @@ class WearerNode(Node):
             self._watch = WearerWatch(self._names, settings)
         if fixed != self._fixed:
             refusal = "the compensator has other joints or another trunk than before: restart this node"
-            self._settings, self._refusal = None, Reason(NoEstimate.REFUSED_PARAMETERS, refusal)
+            self._refusal = Reason(NoEstimate.REFUSED_PARAMETERS, refusal)
             return
         with self._lock:
             self._watch.apply(settings)
@@ -195,21 +195,17 @@ class WearerNode(Node):
             return settings_of({**values, "law": "exact"})  # by which the wearer's torque is estimated in any case
         if self._urdf is None:
             text = read_urdf(values["urdf.file"]) if values["urdf.file"] else self._description
+            if not text and self._descriptions is None:
+                topic = values["urdf.topic"]
+                self._descriptions = self.create_subscription(String, topic, self._on_description, LATCHED)
             if not text:
-                self._listen(values["urdf.topic"])
                 return None
             self._urdf = arm_from(values, text)
         return settings_of(values, self._urdf)
 
-    def _listen(self, topic: str) -> None:
-        """Read the parameters again when the URDF arrives."""
-
-        def on_description(message: String) -> None:
-            self._description = message.data
-            self._compensator.refresh()
-
-        if self._descriptions is None:
-            self._descriptions = self.create_subscription(String, topic, on_description, LATCHED)
+    def _on_description(self, message: String) -> None:
+        self._description = message.data
+        self._compensator.refresh()
 
     def _on_joint_state(self, message: JointState, info: dict[str, Any]) -> None:
         age = (self.get_clock().now().nanoseconds - info["received_timestamp"]) * 1e-9
@@ -231,7 +227,8 @@ class WearerNode(Node):
         if message is None or taken <= self._last:
             return
         self._last = taken
-        joints, trunk = self._joints(message), self._trunk_at(taken, settings)
+        upright = Tilt.of(settings.side)
+        joints, trunk = self._joints(message), self._trunk.at(taken) if self._trunk else (upright, ZERO, upright)
         with self._lock:
             estimate = watch.update(taken, joints, trunk)
         self._problem = NO_REASON
@@ -256,10 +253,6 @@ class WearerNode(Node):
         except ParameterError:
             return None
 
-    def _trunk_at(self, now: float, settings: Settings) -> tuple[Tilt, Floats3, Tilt] | None:
-        upright = Tilt.of(settings.side)
-        return self._trunk.at(now) if self._trunk else (upright, ZERO, upright)
-
     def _ask_for_support(self) -> None:
         """Renew the request, or change it at once."""
         requested, now = self._watch.adaptation.requested if self._watch else None, time.monotonic()
@@ -277,23 +270,20 @@ class WearerNode(Node):
 
     def _why_not(self, now: float) -> tuple[bytes, WearerState, Reason]:
         """Return level, state, and why nothing is estimated."""
-        if problem := self._silence() or self._refusal:
-            return WARN, WearerState.WAITING, problem
-        if not self._settings:
-            waiting = f"waiting for the parameters of {self._status_name}"
-            return WARN, WearerState.WAITING, Reason(NoEstimate.NO_PARAMETERS, waiting)
-        if now - self._last > SILENCE:
-            no_states = Reason(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
-            has_stopped = math.isfinite(self._last)
-            return (STALE, WearerState.STOPPED, no_states) if has_stopped else (WARN, WearerState.WAITING, no_states)
-        return (WARN, WearerState.WAITING, self._problem) if self._problem else (OK, WearerState.ESTIMATING, NO_REASON)
+        problem = self._silence() or self._refusal
+        if not problem and now - self._last > SILENCE:
+            problem = Reason(NoEstimate.NO_JOINT_STATES, "waiting for joint_states")
+            if math.isfinite(self._last):
+                return STALE, WearerState.STOPPED, problem
+        problem = problem or self._problem
+        return (WARN, WearerState.WAITING, problem) if problem else (OK, WearerState.ESTIMATING, NO_REASON)
 
     def _report(self) -> None:
         now, budget = time.monotonic(), self._budget
         level, state, why_not = self._why_not(now)
         values: dict[str, object] = {"state": state, "reason": why_not.word, "budget": budget.result.word}
         values |= {"budget text": budget.result, "largest support": budget.largest_support}
-        if self._watch and self._settings and not self._silence():
+        if self._watch and not (self._silence() or self._refusal):
             with self._lock:
                 values |= self._watch.values(now)
         else:

@@ -105,8 +105,8 @@ def test_messages_that_a_slow_disk_cannot_take_are_counted_and_the_recording_goe
         writer.add_topic(STATES, JOINT_STATE, RELIABLE)
         for k in range(20):
             writer.write([state(k)])
-        assert writer.lost in (9, 10)  # the writer holds ten or eleven
         ready.set()
+    assert 9 <= writer.lost <= 11  # the queue holds ten, one of them the topic, and the thread one
     assert writer.error is None and writer.count == 20 - writer.lost == len(made.only(writer.path).time)
 
 
@@ -144,7 +144,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
 @pytest.fixture
 def cut(tmp_path):
     """The folder of a recording whose file ends within a chunk, without metadata.yaml."""
-    content = list(made.messages(made.trial(made.POSES, hold=3.0, rate=200.0)))
+    content = list(made.messages(made.trial(made.POSES, hold=6.0, rate=500.0)))
     with closing(BagWriter(tmp_path / "bag")) as writer:
         for topic, msgtype in {item[0]: item[1] for item in content}.items():
             writer.add_topic(topic, msgtype, offered_qos("step" not in topic, "step" in topic, 1))
