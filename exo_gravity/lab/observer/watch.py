@@ -9,6 +9,8 @@ import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
@@ -131,7 +133,7 @@ def values_of(names: Sequence[str], estimate: WearerEstimate | None, shares: Sha
     return values
 
 
-def _text(value: float, digits: int) -> str:
+def _text(value: float | np.ndarray, digits: int) -> str:
     return UNKNOWN if math.isnan(value) else f"{round(float(value), digits) + 0.0:.{digits}f}"
 
 
