@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Runs `main` of a module as an executable: `python -m exo_gravity MODULE NAME [ARGUMENTS]`.
+"""Runs `main` of a module as an executable: `python exo_gravity/__main__.py MODULE NAME [ARGUMENTS]`.
 
-The folder in which the user stands is not searched for modules. EXO_GRAVITY_DELAY: s to wait before.
+EXO_GRAVITY_DELAY: s to wait before.
 """
 
 import os
@@ -12,6 +12,6 @@ from importlib import import_module
 if __name__ == "__main__":
     time.sleep(float(os.environ.get("EXO_GRAVITY_DELAY", "0")))
     if not getattr(sys.flags, "safe_path", False):  # new in Python 3.11
-        del sys.path[0]
+        del sys.path[0]  # this folder
     module, *sys.argv = sys.argv[1:]
     sys.exit(import_module(module).main())

@@ -25,6 +25,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from subprocess import PIPE, STDOUT
 
+import exo_gravity
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import SIMULATED_BUSES
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
@@ -70,7 +71,7 @@ def program(module: str, name: str) -> list[str]:
 
     It looks for no file in a folder: python-can installs an executable `can_bridge` too.
     """
-    return [sys.executable, "-m", "exo_gravity", module, name]
+    return [sys.executable, str(Path(exo_gravity.__file__).with_name("__main__.py")), module, name]
 
 
 def command_of(node: str, module: str = "") -> list[str]:
@@ -151,7 +152,7 @@ class Launcher:
     def __init__(
         self,
         params: str | Path,
-        on_line: Callable[[str, str], None],
+        on_line: Callable[[str, str], object],
         only: Sequence[str] = (),
         more: Sequence[str] = (),
         namespace: str = "",

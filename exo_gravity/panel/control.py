@@ -3,7 +3,7 @@
 
 A page is one browser tab. It keeps its secret while it is reloaded, and confirms each few states that it receives. A
 page that confirms nothing for 2 s is gone: the laptop is closed, or the network lost. One page at a time holds control,
-the others watch. Every page may let the arms down, at any time and without a rate limit. Each confirmation of the page
+the others watch. Every page may let the arms down at any time. Each confirmation of the page
 that holds control renews its lease at the arms (core/safety/lease.py), if the panel has one: no page, no panel, no
 lease. A request is an object such as {"do": "set", "arm": "right", "values": {"support": 0.3}}.
 """
@@ -50,8 +50,6 @@ class PageLimits:
     #: finds the arm let down
     gone: float = 2.0
     pages: int = 32  #: at once
-    burst: float = 20.0  #: requests that a page may send at once
-    refill: float = 10.0  #: requests per second, after those
 
 
 LIMITS = PageLimits()
@@ -105,8 +103,6 @@ class Page:
     number: int  #: shown to people
     address: str
     seen: float  #: monotonic s of its last confirmation
-    credited: float  #: monotonic s of its last request
-    credit: float = LIMITS.burst  #: requests that it may send
     connection: Any = None  #: its open live connection
 
     def __str__(self) -> str:
@@ -139,14 +135,13 @@ class Control:
         is gone.
         """
         page = self._pages.get(secret)
-        now = self.clock()
         if page is None:
             if len(self._pages) >= LIMITS.pages:  # those that are closed lose their numbers
                 self._pages = {known.secret: known for known in self._pages.values() if known.connection}
             if len(self._pages) >= LIMITS.pages:
                 return None
             self._numbers += 1
-            page = Page(secrets.token_urlsafe(24), self._numbers, address, now, now)
+            page = Page(secrets.token_urlsafe(24), self._numbers, address, self.clock())
             self._pages[page.secret] = page
         if self.holder is None or self.is_gone():
             self.holder = page
@@ -178,17 +173,15 @@ class Control:
         try:
             request = parse(body, self.arms.names, self.files.trials)
         except ParameterError as error:
-            return self._refused(page, 400, without_value(error))
+            return self._answer(page or f"{address} unknown page", "refused", without_value(error), 400)
         kind, arm, text = request["do"], request.get("arm", ""), sentence(request)
         if kind != "let_down":
             if page is None:
                 return (403, "unknown page: reload it")
-            if not self._spend(page):
-                return (429, "too many requests: wait a moment")
             if kind not in FOR_ALL and page is not self.holder:
-                return self._refused(page, 403, f"{text}: another page holds control")
+                return self._answer(page, text, "another page holds control", 403)
             if arm and (other := self.arms.other_holder(arm, str(page))):
-                return self._refused(page, 403, f"{text}: {other} holds control of this arm")
+                return self._answer(page, text, f"{other} holds control of this arm", 403)
         if kind in ("enable", "activate", "resume"):  # by a page that confirms nothing, the arm is not carried for long
             self.arms.lease(str(page), "hold")
         try:
@@ -197,13 +190,15 @@ class Control:
             problem = without_value(error)
         except OSError as error:
             problem = f"{error.filename}: {error.strerror}"
-        self._log(f"{page or f'{address} unknown page'}: {text}: {problem or 'done'}")
-        return (409 if problem else 200, problem)
+        return self._answer(page or f"{address} unknown page", text, problem, 409 if problem else 200)
 
-    def _refused(self, page: Page | None, status: int, text: str) -> tuple[int, str]:
-        if page and self._spend(page):  # a flood of wrong requests must not fill the log
-            self._log(f"{page}: refused: {text}")
-        return (status, text)
+    def _answer(self, page: Page | str, text: str, problem: str, status: int) -> tuple[int, str]:
+        """Note what a page asked for, and return its answer."""
+        try:
+            self._note(f"{page}: {text}: {problem or 'done'}")
+        except Exception:  # what was to be noted has been done, and the next arm or page must not suffer from this
+            logging.getLogger(__name__).exception("%s: %s: %s", page, text, problem or "done")
+        return (status, problem)
 
     async def _carry_out(self, request: Mapping[str, Any], kind: str, arm: str, page: Page | None) -> str:
         if kind == "let_down":
@@ -223,19 +218,3 @@ class Control:
         problems = [f"{type(r).__name__}: {r}" if isinstance(r, BaseException) else r for r in results]
         failed = [f"{arm}: {problem}" for arm, problem in zip(arms, problems, strict=True) if problem]
         return "; ".join(failed) if arms else "no arm is present"
-
-    def _log(self, text: str) -> None:
-        try:
-            self._note(text)
-        except Exception:  # what was to be noted has been done, and the next arm or page must not suffer from this
-            logging.getLogger(__name__).exception("%s", text)
-
-    def _spend(self, page: Page) -> bool:
-        """Return whether the page may send one more request now."""
-        now = self.clock()
-        page.credit = min(LIMITS.burst, page.credit + LIMITS.refill * (now - page.credited))
-        page.credited = now
-        if page.credit < 1.0:
-            return False
-        page.credit -= 1.0
-        return True

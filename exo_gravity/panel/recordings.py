@@ -11,11 +11,9 @@ import asyncio
 import contextlib
 import itertools
 import json
-import os
 import re
-import sys
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -23,14 +21,15 @@ from typing import Any
 import yaml
 
 from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.params import ROS_PARAMETERS
 from exo_gravity.core.safety.drive import State
-from exo_gravity.lab.inputs.ros_yaml import dumped
+from exo_gravity.lab.inputs.ros_yaml import dumped, text_of
+from exo_gravity.lab.processes import Launcher, program
 from exo_gravity.lab.trial.session import Session, check_text
 from exo_gravity.panel.view import OF_SUBJECT
 from exo_gravity.sim.script import TrialScript
 
-STOP_TIMEOUT = 10.0  # s for a recorder to end
-WEARER, REPORT = "wearer.yaml", "report.html"
+RECORDER, WEARER, REPORT = "/recorder", "wearer.yaml", "report.html"
 FOLDER_NAME = re.compile(r"(.+)_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)(_\d+)?")  # of a recording or trial
 MOST_LISTED = 200  # recordings that the page lists
 
@@ -52,7 +51,7 @@ class Recordings:
         self._device, self._note, self._clock = device, note, clock
         self._present = {"subject": "", "protocol": "", "note": ""}  # `Session` of what is recorded from now on
         self._wearer: dict[str, Any] = {}  # parameters in the subject's file
-        self._recorder: asyncio.subprocess.Process | None = None
+        self._recorder: Launcher | None = None
         self._folder: Path | None = None
         self._began = 0.0
         self._trial: asyncio.subprocess.Process | None = None
@@ -65,7 +64,7 @@ class Recordings:
         is_on = self._is_recording() or self._progress["phase"] == "running"
         recording = {
             "on": is_on,
-            "foreign": not is_on and "/recorder" in self._device.parameters(),
+            "foreign": not is_on and RECORDER in self._device.parameters(),
             "folder": str(self._folder or "") if is_on else "",
             "seconds": round(self._clock() - self._began) if is_on else 0,
         }
@@ -74,26 +73,19 @@ class Recordings:
         return {"recording": recording, "trial": self._progress, "saved": self._saved, "session": session}
 
     def close(self) -> None:
-        """End the recording and the trial."""
-        for process in (self._recorder, self._trial):
-            if process is not None and process.returncode is None:
-                process.terminate()
+        """End the trial. The recorder ends with this process, by its standard input."""
+        if self._trial is not None and self._trial.returncode is None:
+            self._trial.terminate()
 
     async def record(self) -> str:
         """Start a recording."""
         if problem := self._occupied():
             return problem
         folder = self._new_folder("recording")
-        values = {"output": str(folder / "bag"), **self._present}
-        write(folder / "params.yaml", {"/recorder": {"ros__parameters": values}})
-        remaps = ("-r", "__node:=recorder", "-r", "__ns:=/", "--enclave", "/recorder")
-        words = command("nodes.recorder.node", "--ros-args", *remaps, "--params-file", str(folder / "params.yaml"))
-        # It watches its standard input, and ends the recording well if the panel dies.
-        environment = {**os.environ, "EXO_GRAVITY_SUPERVISED": "1"}
-        with (folder / "recorder.log").open("wb") as log:
-            self._recorder = await asyncio.create_subprocess_exec(
-                *words, stdin=PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
+        params, log = folder / "params.yaml", (folder / "recorder.log").open("w", 1, encoding="utf-8")
+        params.write_text(text_of({RECORDER: {"output": str(folder / "bag"), **self._present}}), encoding="utf-8")
+        self._recorder = Launcher(params, lambda _node, line: log.write(f"{line}\n"))
+        self._recorder.start()
         self._folder, self._began = folder, self._clock()
         return ""
 
@@ -101,27 +93,25 @@ class Recordings:
         """End the recording; it stays if a trial needs it."""
         if self._is_in_trial():
             return "a trial is running: stop the trial"
-        process, self._recorder = self._recorder, None
-        if process is None:
+        launcher, self._recorder = self._recorder, None
+        if launcher is None:
             return "nothing is being recorded"
-        if process.returncode is None:
-            process.terminate()
-        try:
-            code = await asyncio.wait_for(process.wait(), STOP_TIMEOUT)
-        except asyncio.TimeoutError:
-            process.kill()
-            return "the recorder did not end and was killed"
-        return "" if code == 0 else f"the recorder ended with exit code {code}: see {self._folder}/recorder.log"
+        await asyncio.to_thread(launcher.stop)
+        code = launcher.exit_code(RECORDER)
+        return f"the recorder ended with exit code {code}: see {self._folder}/recorder.log" if code else ""
 
     async def save(self) -> str:
         """Write the parameters in force as YAML, from which `launcher` starts."""
         nodes = self._device.parameters().items()
-        given = {node: values for node, values in nodes if values and not node.endswith(("/recorder", "/panel"))}
-        content = {node: {"ros__parameters": nested(values)} for node, values in given.items()}
+        content = {
+            node: {name: value for name, value in sorted(values.items()) if value != [] and name not in ROS_PARAMETERS}
+            for node, values in nodes
+            if values and not node.endswith((RECORDER, "/panel"))
+        }
         if not content:
             return "no node has been found yet"
         path = self._new_folder("parameters") / "params.yaml"
-        write(path, content)
+        path.write_text(text_of(content), encoding="utf-8")  # without empty lists, which ROS cannot read
         self._saved = str(path)
         return ""
 
@@ -141,9 +131,10 @@ class Recordings:
             return problem
         guided = not any(node.endswith("/simulator") for node in self._device.parameters())
         attach = ("--attach", "guided" if guided else "simulated", "--output", str(self._output))
-        words = command("tools.trial", str(path), *attach, *(f"--{key}={text}" for key, text in self._present.items()))
+        words = [str(path), *attach, *(f"--{key}={text}" for key, text in self._present.items())]
+        trial = program("exo_gravity.tools.trial", "trial")
         self._trial = await asyncio.create_subprocess_exec(
-            *words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, start_new_session=True
+            *trial, *words, stdin=DEVNULL, stdout=PIPE, stderr=PIPE, start_new_session=True
         )
         steps = [{"action": s.action, "value": list(s.value), "duration": s.duration} for s in script.steps]
         self._progress = {"phase": "running", "name": script.name, "guided": guided, "steps": steps, "step": -1}
@@ -205,7 +196,7 @@ class Recordings:
         wearer = {name: in_force[name] for name in OF_SUBJECT if name in in_force}
         folder = self._output / self._present["subject"]
         folder.mkdir(parents=True, exist_ok=True)
-        write(folder / WEARER, wearer)
+        (folder / WEARER).write_text(dumped(wearer), encoding="utf-8")
         self._wearer = wearer
         return ""
 
@@ -239,7 +230,7 @@ class Recordings:
         return folder.relative_to(self._output).as_posix() if (folder / REPORT).is_file() else ""
 
     def _is_recording(self) -> bool:
-        return self._recorder is not None and self._recorder.returncode is None
+        return self._recorder is not None and self._recorder.exit_code(RECORDER) is None
 
     def _is_in_trial(self) -> bool:
         return self._following is not None and not self._following.done()
@@ -248,7 +239,7 @@ class Recordings:
         """Return why no recording can start, or ''."""
         if self._is_recording() or self._is_in_trial():
             return "a recording is running already"
-        return "another recorder is running already" if "/recorder" in self._device.parameters() else ""
+        return "another recorder is running already" if RECORDER in self._device.parameters() else ""
 
     def _new_folder(self, name: str) -> Path:
         """Create and return a folder with a new name, of the present session. Raises OSError."""
@@ -260,27 +251,3 @@ class Recordings:
                 folder.mkdir(parents=True)
                 break
         return folder
-
-
-def write(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a parameter file. Raises OSError."""
-    path.write_text(dumped(content), "utf-8")
-
-
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return dotted names as the nested mappings of a parameter file, without empty lists, which ROS cannot read."""
-    content: dict[str, Any] = {}
-    for name, value in sorted(values.items()):
-        if value == [] or name in ("use_sim_time", "start_type_description_service"):
-            continue
-        *branches, leaf = name.split(".")
-        place = content
-        for branch in branches:
-            place = place.setdefault(branch, {})
-        place[leaf] = value
-    return content
-
-
-def command(module: str, *args: str) -> list[str]:
-    """Return the command line of an executable of the package, which need not be on the PATH."""
-    return [sys.executable, "-c", f"from exo_gravity.{module} import main; raise SystemExit(main())", *args]

@@ -126,9 +126,9 @@ class PanelServer:
     async def _on_live(self, connection: WebSocket) -> None:
         """Send to a page and receive its confirmations until it closes."""
         await connection.accept()
-        with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, KeyError, RecursionError):
+        with suppress(WebSocketDisconnect, asyncio.TimeoutError, ValueError, LookupError, TypeError, RecursionError):
             hello = await asyncio.wait_for(connection.receive_json(), SERVING.hello_timeout)
-            page = self._control.open(_given(hello, "page", str), address_of(connection))
+            page = self._control.open(str(hello["page"]), address_of(connection))
             if page is None:
                 await connection.close(FULL)
                 return
@@ -137,8 +137,7 @@ class PanelServer:
                 await replaced.close(REPLACED)
             sender = asyncio.create_task(self._send(connection, page))
             try:
-                while True:
-                    _given(await connection.receive_json(), "seen", int)
+                while (await connection.receive_json())["seen"]:
                     self._control.confirm(page)
             finally:
                 sender.cancel()
@@ -291,10 +290,3 @@ def address_of(connection: HTTPConnection) -> str:
 
 def _equal(one: str, other: str) -> bool:
     return hmac.compare_digest(one.encode(), other.encode())
-
-
-def _given(message: Any, key: str, kind: type) -> Any:
-    """Return the value of `key` in a page's message. Raises ValueError if the page sends something else."""
-    if not isinstance(message, dict) or type(message.get(key)) is not kind:
-        raise ValueError(f"{key} must be given")
-    return message[key]

@@ -93,18 +93,18 @@ def main(args: Sequence[str] | None = None) -> None:
         options.remap,
         check_start,
     )
+    keep_to_this_machine()
     try:
-        launcher = make()
-        keep_to_this_machine()
-        if sentence := kept_to_this_machine():
-            print_line("launcher", sentence)
-        with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
-            dead = launcher.run(stopping)
-        while dead and launcher.is_simulated and dead[1] not in ENDED_WELL and time.monotonic() - restarts[0] > 600.0:
+        while True:
+            launcher = make()
+            if sentence := kept_to_this_machine():
+                print_line("launcher", sentence)
+            with asking_on_terminal(launcher.asking, partial(print_line, "launcher")):
+                dead = launcher.run(stopping)
+            if not dead or dead[1] in ENDED_WELL or not launcher.is_simulated or time.monotonic() - restarts[0] < 600.0:
+                break
             restarts.append(time.monotonic())
             print_line("launcher", f"{dead[0].lstrip('/')} ended with exit code {dead[1]}: the simulation starts again")
-            launcher = make()
-            dead = launcher.run(stopping)
     except ExoGravityError as error:
         print(f"launcher: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -186,7 +186,7 @@ BODIES = [
 
 
 def test_only_a_request_that_is_json_and_short_is_carried_out_and_a_live_connection_with_nonsense_ends(stage):
-    for hello in ("", "[]", "{", "{}", '{"page": 3}', "x" * 5000):
+    for hello in ("", "[]", "{", "{}", "x" * 5000):
         with live(stage, hello) as connection, pytest.raises(ConnectionClosed):
             connection.recv(timeout=PATIENCE)
     for content, status in BODIES:

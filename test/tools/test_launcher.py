@@ -133,7 +133,7 @@ def test_in_one_process_the_bridge_has_the_command_of_both_and_its_log_has_both_
     assert list(commands) == ["/lab/imu", "/lab/right/can_bridge", "/lab/right/simulator", "/lab/right/wearer"]
     words = commands["/lab/right/can_bridge"]
     first, second = words[: words.index("--")], words[words.index("--") + 1 :]
-    assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[3]
+    assert {"__node:=can_bridge", "/lab/right/can_bridge"} <= set(first) and "can_bridge.one_process" in first[2]
     assert {"--ros-args", "__node:=compensator", "__ns:=/lab/right", "/lab/right/compensator"} <= set(second)
     assert [line for line in lines if not line.startswith("launcher ")] == [
         "right/compensator INFO compensating",

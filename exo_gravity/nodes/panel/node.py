@@ -33,7 +33,7 @@ from exo_gravity import packaged
 from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.lab.bag.content import MARKERS
 from exo_gravity.lab.inputs.arms import fitting
-from exo_gravity.lab.packages import missing
+from exo_gravity.lab.packages import extras
 from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import HELD_BY, NOBODY, OK, Diagnostics, Statuses
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare, plain
@@ -42,6 +42,9 @@ from exo_gravity.nodes.ros.subscriptions import MANY_REQUESTS, PITCH_YAW, Latest
 from exo_gravity.panel.control import Control
 from exo_gravity.panel.recordings import Recordings
 from exo_gravity.panel.view import PANEL, SETTABLE, LoadChanges, Values, joint_rows, setup_of
+
+with extras("panel", "report"):
+    from exo_gravity.panel.server import PanelServer
 
 
 @dataclass(frozen=True)
@@ -280,10 +283,6 @@ class Panel(Node):
         self._shown: Any = None  # the nodes' parameters that the pages have
         self._changes = LoadChanges()
         control = Control(self._arms, self._recordings, self._note, time.monotonic)
-        try:
-            from exo_gravity.panel.server import PanelServer
-        except ModuleNotFoundError as error:
-            raise ExoGravityError(missing(error.name or "", "report")) from None
         self._server = PanelServer(values["host"], values["port"], values["token"], control)
         self.create_timer(TIMING.state_period, self._send_state)
         self.create_timer(TIMING.discovery_period, self._arms.discover)
