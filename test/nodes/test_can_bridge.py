@@ -287,7 +287,7 @@ def test_simulated_time_is_refused_with_a_real_bus_at_the_start_and_live(node):
 def served():
     """A bridge's node and a client; `spin` handles what has arrived for either."""
     with own_node("asking") as own:
-        served = Served(*own, NodeExecutor)
+        served = Served(*own)
         yield served
         served.close()
 

@@ -38,7 +38,7 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
@@ -55,7 +55,7 @@ from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.nodes.ros import inner, subscriptions
 from exo_gravity.nodes.ros import run as running
-from exo_gravity.nodes.ros.inner import NodeExecutor, Until, prepare_transitions
+from exo_gravity.nodes.ros.inner import Until, prepare_transitions
 from exo_gravity.nodes.ros.messages import milliseconds, row
 from exo_gravity.nodes.ros.parameters import NodeParameters, accept_changes, declare
 from exo_gravity.nodes.ros.run import handle_signals
@@ -233,10 +233,10 @@ WRONG_REQUESTS = (
 
 
 @pytest.fixture
-def served(request):
-    """A node that nothing spins; `indirect` for an executor of another kind."""
+def served():
+    """A node that nothing spins."""
     with own_node("asking") as own:
-        served = Served(*own, getattr(request, "param", NodeExecutor))
+        served = Served(*own)
         yield served
         served.close()
 
@@ -302,8 +302,7 @@ def test_a_node_that_its_parameter_file_does_not_name_is_refused_with_those_that
         assert declare(node, COMPENSATOR)["side"] == "right"
 
 
-@pytest.mark.parametrize("served", [NodeExecutor, SingleThreadedExecutor], indirect=True)
-def test_a_service_that_awaits_answers_under_any_executor_and_keeps_ours_free(served):
+def test_a_service_that_awaits_keeps_its_node_free(served):
     done, looked = [], []
 
     async def wait(_request, response):
@@ -311,14 +310,13 @@ def test_a_service_that_awaits_answers_under_any_executor_and_keeps_ours_free(se
         response.success = bool(done)
         return response
 
-    served.node.create_service(Trigger, "~/wait", wait)
+    served.node.create_service(Trigger, "~/wait", wait, callback_group=ReentrantCallbackGroup())
     served.node.create_service(Trigger, "~/look", lambda _, response: looked.append(1) or response)
     waiting = served.send(Trigger, "wait", Trigger.Request())
-    if type(served.executor) is NodeExecutor:
-        for _ in range(10):
-            served.spin()
-        served.answer(served.send(Trigger, "look", Trigger.Request()))
-        assert looked and not waiting.done()
+    for _ in range(10):
+        served.spin()
+    served.answer(served.send(Trigger, "look", Trigger.Request()))
+    assert looked and not waiting.done()
     done.append(1)
     assert served.answer(waiting).success
 

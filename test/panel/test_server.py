@@ -197,15 +197,3 @@ def test_only_a_request_that_is_json_and_short_is_carried_out_and_a_live_connect
         assert stage.arms.calls == []
         assert act(stage, iter((content[:9], content[9:]))) == status
     assert stage.arms.calls
-
-
-def test_a_page_that_stops_confirming_no_longer_renews_its_lease(stage):
-    with live(stage) as connection:
-        first(connection, "page")
-        for _ in range(3):
-            connection.send(json.dumps({"seen": first(connection, "state")["number"]}))
-        while len(stage.arms.leases) < 4:  # as it opened, and three confirmations
-            first(connection, "state")
-        for _ in range(3):
-            first(connection, "state")  # the connection stays open, but the page is frozen
-        assert stage.arms.leases == [("127.0.0.1 page 1", "hold")] * 4

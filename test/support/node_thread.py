@@ -14,6 +14,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 
+from exo_gravity.nodes.ros.inner import NodeExecutor
+
 from .waiting import wait_until
 
 InvalidHandle = rclpy_implementation.InvalidHandle
@@ -68,10 +70,10 @@ def own_node(name: str, namespace: str = "/right", **options: Any) -> Iterator[t
 class Served:
     """A lifecycle node `served` with an executor, and a client node with another; nothing spins by itself."""
 
-    def __init__(self, client: Node, own: SingleThreadedExecutor, executor: type[SingleThreadedExecutor]) -> None:
+    def __init__(self, client: Node, own: SingleThreadedExecutor) -> None:
         self.client, self._own = client, own
         self.node = LifecycleNode("served", namespace="/right", context=client.context, enable_logger_service=True)
-        self.executor = executor(context=client.context)
+        self.executor = NodeExecutor(client.context)
         self.executor.add_node(self.node)
 
     def send(self, kind: Any, name: str, request: Any) -> Any:

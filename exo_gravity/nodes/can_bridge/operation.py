@@ -16,6 +16,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
 from rcl_interfaces.msg import ParameterDescriptor, ParameterType
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_srvs.srv import SetBool, Trigger
@@ -119,7 +120,8 @@ class BridgeServices:
         self._hindrance = hindrance
         self._arming: set[futures.Future[str]] = set()  # requests that are not yet carried out
         self._motors = tuple(motors)
-        serve = partial(node.create_service, qos_profile=MANY_REQUESTS)
+        # A callback that waits keeps no other waiting
+        serve = partial(node.create_service, qos_profile=MANY_REQUESTS, callback_group=ReentrantCallbackGroup())
         serve(SetBool, "~/enable", partial(self.answer, self.enable))
         for function in (self.clear_fault, self.resume, self.confirm_pose, self.set_zero):
             serve(Trigger, f"~/{function.__name__}", partial(self.answer, function))

@@ -1,11 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The inner parts of rclpy that the nodes use, in one file: they may change between distributions.
-
-`WaitSet` and `take_message` are needed. The others have a fallback in rclpy's public interface, which says less:
+"""The inner parts of rclpy that the nodes use, in one file but for `PolledSubscription`: distributions differ in them.
 
     part                                    without it
-    `_take_service`                         a request is as old as the executor stood still; an executor that awaits
-                                            an answer does nothing else meanwhile
+    `_take_service`                         a request is as old as the executor stood still
     `set_parameters_atomically`, replaced   a read-only parameter that is set to its own value is refused, by name;
                                             one that is not declared is refused without the names of the others
 
@@ -13,65 +10,33 @@ rclpy's handlers of the standard services raise on some wrong requests, and an e
 So `guard` lets them answer a failure. An exception of this package still ends the node, which lets the arm down.
 """
 
-import inspect
 import time
 from collections.abc import Callable, Coroutine, Generator
+from contextlib import suppress
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import SetLoggerLevelsResult, SetParametersResult
-from rcl_interfaces.srv import SetLoggerLevels, SetParameters, SetParametersAtomically
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor, await_or_execute
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile
 from rclpy.service import Service
 
 STOOD_STILL = 1.0  # s between two looks at what is due, after which an executor has stood still
 QUEUED_TIME = 0.5  # s after that in which requests may have been queued meanwhile
-LONGEST_LOOK = 0.1  # s for which an executor waits
 PACKAGE = __name__.partition(".")[0]
 
 
-class OutsideExecutor(ReentrantCallbackGroup):
-    """Keeps its subscriptions out of the executor's wait set."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False: the executor handles none of them."""
-        return False
-
-
-class Inbox:
-    """Messages that wait in the middleware, with a wait set for this topic alone. raw: whether bytes suffice."""
-
-    def __init__(self, node: Node, msgtype: type, topic: str, qos: QoSProfile, raw: bool) -> None:
-        self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
-        self._subscription = node.create_subscription(
-            msgtype, topic, lambda message: None, qos, callback_group=OutsideExecutor(), raw=raw
-        )
-        self._take = self._subscription.handle.take_message
-
-    def wait(self, timeout: float) -> None:
-        """Wait up to `timeout` s for a message."""
-        handle = self._subscription.handle
-        with handle:
-            self._wait_set.clear_entities()
-            self._wait_set.add_subscription(handle)
-            self._wait_set.wait(int(timeout * 1e9))
-
-    def take(self) -> tuple[Any, dict[str, Any]] | None:
-        """Return the oldest message and rclpy's information on it, None if there is none."""
-        taken: tuple[Any, dict[str, Any]] | None = self._take(self._subscription.msg_type, self._subscription.raw)
-        return taken
-
-
 class Until:
-    """Awaits `is_done()`, for at most `timeout` s. An executor of another kind than `NodeExecutor` waits busily."""
+    """Awaits `is_done()`, for at most `timeout` s. An executor looks when it does other work, and ten times a second.
+
+    The callback that awaits needs a ReentrantCallbackGroup, or its node does nothing else meanwhile.
+    """
 
     def __init__(self, is_done: Callable[[], object], timeout: float) -> None:
         self._is_done, self._end = is_done, time.monotonic() + timeout
@@ -82,16 +47,8 @@ class Until:
             yield
 
 
-class _Waiting(NamedTuple):
-    """A service's callback that waits, and whom it answers."""
-
-    callback: Coroutine[None, None, Any]
-    service: Service
-    header: Any
-
-
 class NodeExecutor(SingleThreadedExecutor):
-    """rclpy's executor, which knows how old a request is, and does other work while a service's callback awaits.
+    """rclpy's executor, which knows how old a request is.
 
     request_age: s, of the request that is being answered. Read it before the first `await` of a callback.
     """
@@ -101,7 +58,6 @@ class NodeExecutor(SingleThreadedExecutor):
         self.request_age = 0.0
         self._looked = self._resumed = time.monotonic()
         self._gap = 0.0  # s for which it last stood still
-        self._waiting: list[_Waiting] = []
 
     def add_node(self, node: Node) -> bool:
         """Guard the node's standard services, and handle its callbacks from now on."""
@@ -109,11 +65,9 @@ class NodeExecutor(SingleThreadedExecutor):
         return bool(super().add_node(node))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Handle one callback, and let those that wait go on; wait at most LONGEST_LOOK s, or less."""
+        """Handle one callback."""
         self._look()
-        super().spin_once(LONGEST_LOOK if timeout_sec is None else min(timeout_sec, LONGEST_LOOK))
-        for waiting in tuple(self._waiting):
-            self._go_on(waiting)
+        super().spin_once(timeout_sec)
 
     def _look(self) -> float:
         """Return the present time in s, and note whether this executor has stood still since the last look."""
@@ -134,7 +88,7 @@ class NodeExecutor(SingleThreadedExecutor):
         return max(queued, *(1e-9 * (wall - stamp) for stamp in stamps if stamp), 0.0)
 
     def _take_service(self, service: Service) -> Callable[[], Coroutine[None, None, None]] | None:
-        """Take a request, as rclpy does, and return what answers it."""
+        """Take a request, as rclpy does, and return what answers it. A sender that is gone does not end the node."""
         try:
             with service.handle:
                 request, header = service.handle.service_take_request(service.srv_type.Request)
@@ -142,27 +96,13 @@ class NodeExecutor(SingleThreadedExecutor):
             return None
 
         async def answer() -> None:
-            if header is None:
-                return
-            self.request_age = self._age(header)
-            response = service.callback(request, service.srv_type.Response())
-            if not inspect.iscoroutine(response):
-                _send(service, response, header)
-                return
-            self._waiting.append(_Waiting(response, service, header))
-            self._go_on(self._waiting[-1])
+            if header is not None:
+                self.request_age = self._age(header)
+                response = await await_or_execute(service.callback, request, service.srv_type.Response())
+                with suppress(rclpy_implementation.RCLError):
+                    service.send_response(response, header)
 
         return answer
-
-    def _go_on(self, waiting: _Waiting) -> None:
-        try:
-            waiting.callback.send(None)
-        except StopIteration as end:
-            self._waiting.remove(waiting)
-            _send(waiting.service, end.value, waiting.header)
-        except BaseException:
-            self._waiting.remove(waiting)
-            raise
 
 
 def age_of_request(node: Node) -> float:
@@ -200,6 +140,7 @@ def prepare_transitions(node: Node, prepare: Callable[[ChangeState.Request], Cor
     for service in node.services:
         if service.srv_type is ChangeState:
             service.callback = partial(change_state, service.callback)
+            service.callback_group = ReentrantCallbackGroup()
 
 
 def _guarded(
@@ -230,22 +171,11 @@ def _failure(request: Any, response: Any, reason: str) -> Any:
     if isinstance(response, SetParameters.Response):  # those before the wrong one were set
         left = len(request.parameters) - len(response.results)
         response.results = [*response.results, *[SetParametersResult(successful=False, reason=reason)] * left]
-    elif isinstance(response, SetLoggerLevels.Response):
-        left = len(request.levels) - len(response.results)
-        response.results = [*response.results, *[SetLoggerLevelsResult(successful=False, reason=reason)] * left]
     else:
         response = type(response)()  # by its defaults it is empty, or not successful
         if isinstance(response, SetParametersAtomically.Response):
             response.result.reason = reason
     return response
-
-
-def _send(service: Service, response: Any, header: Any) -> None:
-    """Answer a request. A sender that is gone is no reason to end the node."""
-    try:
-        service.send_response(response, header)
-    except rclpy_implementation.RCLError as error:
-        get_logger(service.logger_name).warning(f"{service.srv_name}: not answered: {error}", once=True)
 
 
 def intercept_changes(node: Node, refusal: Callable[[Parameter], str], is_same: Callable[[Parameter], bool]) -> None:
