@@ -11,7 +11,7 @@ from pathlib import Path
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.drive import Send
-from exo_gravity.core.safety.power import SwitchingOn
+from exo_gravity.core.safety.start import SwitchingOn
 from exo_gravity.hardware.can.can_port import ArmOnBus
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from exo_gravity.core.safety.gate import START_GATE
 from exo_gravity.core.safety.guidance import GUIDANCE
+from exo_gravity.core.safety.start import START_GATE
 
 from .loop import BOTH_ARMS, ONE_ARM, SEVEN_JOINTS, LoopRun, run_loop
 from .table import Row

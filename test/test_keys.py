@@ -14,7 +14,7 @@ import pytest
 
 from exo_gravity.core import vocabulary
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.core.safety.gate import WAITED_OUT
+from exo_gravity.core.safety.start import TRANSIENT_FAULTS
 from exo_gravity.core.vocabulary import NONE, TEXT, Reason, Word
 from exo_gravity.lab import vocabulary as beside
 
@@ -22,7 +22,7 @@ from .support.keys import documented, row_of
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "exo_gravity"
-PASSING = WAITED_OUT - {FaultCode.OUTSIDE_LIMITS}  # faults that a start waits out; that one has a word of its own
+PASSING = TRANSIENT_FAULTS - {FaultCode.OUTSIDE_LIMITS}  # faults that a start waits out; that one has a word of its own
 # The words of each node's key.
 VOCABULARY: dict[tuple[str, str], Iterable[str]] = {
     ("", "clock"): vocabulary.ClockState,

@@ -24,7 +24,7 @@ from exo_gravity.core.motors.joint_motor import REPLY_SHARE, JointSample
 from exo_gravity.core.safety.drive import CARRYING, NO_EFFORTS, Drive, Efforts, FaultCode, Send, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.monitors import RestTracker
+from exo_gravity.core.safety.watch import RestTracker
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 from exo_gravity.hardware.can.motor_bus import MotorBus
 

@@ -16,7 +16,7 @@ from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.wearer import PAPER_LINKS, LinkLoad, Wearer
 from exo_gravity.core.compensation.settings import joint_spring_of
 from exo_gravity.core.errors import named
-from exo_gravity.core.safety.motion_monitor import GRAVITY
+from exo_gravity.core.safety.explain import GRAVITY
 from exo_gravity.lab.budget import (
     JointBudget,
     budget,

@@ -15,10 +15,10 @@ from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import NO_TORQUE
-from exo_gravity.core.safety.barrier import BARRIER, VIBRATION, Barrier
 from exo_gravity.core.safety.descent import DESCENT, JointDescent
+from exo_gravity.core.safety.explain import MOTION, MotionMonitor
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits
-from exo_gravity.core.safety.motion_monitor import MOTION, MotionMonitor
+from exo_gravity.core.safety.shape import BARRIER, VIBRATION, Shaper
 
 from ..support import ROBOT
 from ..support.safety_run import LIMITS, PERIOD, reading
@@ -30,7 +30,7 @@ FULL = LIMITS.driven_speed + BARRIER.span  # rad/s
 
 
 def barrier() -> Barrier:
-    return Barrier(LIMITS, (DAMPING,) * 4)
+    return Shaper(LIMITS, (DAMPING,) * 4)
 
 
 def joints(**changes: float) -> list[JointSample]:

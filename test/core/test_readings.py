@@ -15,10 +15,8 @@ import pytest
 
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
-from exo_gravity.core.safety.delivery import THERMAL_TIME, DeliveryMonitor, MotorLoad
-from exo_gravity.core.safety.gate import SwitchOnCheck
-from exo_gravity.core.safety.power import MotorPower, Power, PowerChange
-from exo_gravity.core.safety.trust import Readings
+from exo_gravity.core.safety.start import SwitchOnCheck
+from exo_gravity.core.safety.watch import ArmWatch, JointWatch, Power, PowerChange
 
 from ..support.safety_run import LIMITS, PERIOD, reading
 from ..support.thorough import quick
@@ -56,12 +54,12 @@ class Replies:
         rate: float = 100.0,
         is_busy: bool = False,
     ) -> None:
-        self.readings = Readings(LIMITS)
+        self.watch = ArmWatch(LIMITS)
         self.slip = self.now = self._velocity = 0.0
         self._angle, self._motor, self._period, self._is_busy = angle, motor, 1.0 / rate, is_busy
         self._random, self._seen, self._joints = random.Random(7), angle(0.0), [UNKNOWN] * 4
         self.faults: list[str] = []
-        self.run(2).readings.prove()
+        self.run(2).watch.trusted = True
         self.faults.clear()  # silent before the first replies
         self.run(5)
 
@@ -83,8 +81,8 @@ class Replies:
             read = reading(**{"time": self.now, "position": position, "velocity": velocity, **changes})
             second = self._joints[1] if lost or held_back else read
             self._joints = [second if n == 1 else reading(time=self.now) for n in range(4)]
-            self.readings.step(self.now, self._joints, (False, held_back, False, False))
-            self.faults += [str(self.readings.fault.code)] if self.readings.fault else []
+            self.watch.read(self.now, self._joints, (False, held_back, False, False))
+            self.faults += [str(self.watch.fault.code)] if self.watch.fault else []
         return self
 
     def _pass(self, seconds: float) -> None:
@@ -110,8 +108,8 @@ WRONG = {
 @pytest.mark.parametrize("code", WRONG)
 def test_one_wrong_reading_is_no_fault_and_is_not_passed_on_and_two_are_a_fault(code):
     run = Replies()
-    before = run.readings.joints[1]
-    assert run.run(**WRONG[code]).readings.joints[1]._replace(time=0.0) == before._replace(time=0.0)
+    before = run.watch.samples[1]
+    assert run.run(**WRONG[code]).watch.samples[1]._replace(time=0.0) == before._replace(time=0.0)
     assert not run.run(5).faults
     assert run.run(4, **WRONG[code]).faults[0] == ("position_jump" if "position" in WRONG[code] else code)
 
@@ -125,14 +123,14 @@ def test_a_joint_outside_its_limits_is_a_fault():
 def test_a_loop_that_stood_still_has_not_asked_and_a_motor_that_is_held_back_owes_no_reply():
     assert not Replies().run(late=1.0, lost=True).run(3).faults
     run = Replies().run(6, held_back=True).run(3, lost=True)
-    assert not run.faults and not run.readings.is_late
-    assert run.run(5, lost=True).faults[0] == "motor_silent" and run.readings.is_late
+    assert not run.faults and not run.watch.is_late
+    assert run.run(5, lost=True).faults[0] == "motor_silent" and run.watch.is_late
 
 
 @pytest.mark.parametrize(("misses", "is_silent"), [(6, False), (8, True)])
 def test_a_motor_is_silent_after_seven_commands_without_a_reply(misses, is_silent):
     run = Replies().run(misses, lost=True)
-    assert run.readings.silent == [False, is_silent, False, False]
+    assert run.watch.silent == [False, is_silent, False, False]
     assert run.faults[:1] == ["motor_silent"] * is_silent
 
 
@@ -153,7 +151,7 @@ QUICK = [(0.9, knocked, 100.0), (1.0, reaching, 250.0), (50.0 / 45.0, knocked, 5
 @pytest.mark.parametrize(("scale", "angle", "rate"), quick(QUICK, itertools.product(SCALES, ANGLES, RATES)))
 def test_ordinary_equipment_keeps_trust_while_a_wearer_reaches_and_the_arm_is_knocked(rate, angle, scale):
     run = Replies(angle, Motor(0.02, scale), rate, is_busy=True).run(round(20.0 * rate))
-    assert run.readings.trusted and not run.faults
+    assert run.watch.trusted and not run.faults
 
 
 UNTRUE = {  # a motor, what its joint does, for how many s at which rate, and the fault
@@ -170,7 +168,7 @@ def test_an_angle_and_a_velocity_that_contradict_each_other_are_found_within_one
     is_reach = motion == "one reach"
     angle = (lambda now: 1.0 - math.cos(min(math.pi, 2.0 * now))) if is_reach else resting
     run = Replies(angle, motor, 100.0, is_busy=is_reach).run(150 if is_reach else 300)
-    assert not run.readings.trusted
+    assert not run.watch.trusted
     assert not is_reach or set(run.faults) == {"readings_contradict"}
 
 
@@ -180,11 +178,10 @@ def test_a_lost_turn_ends_trust_whatever_the_velocity_shows(lag, rate):
     run = Replies(resting, Motor(lag), rate).run(round(0.5 * rate))
     run.slip = math.radians(40.0)  # a turn of its rotor, at the joint
     run.run(round(0.2 * rate))
-    assert not run.readings.trusted
+    assert not run.watch.trusted
     assert set(run.faults) <= {"position_jump", "over_speed"}
 
 
-PEAK = (9.0, 18.0, 9.0, 9.0)
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
 
 
@@ -195,7 +192,7 @@ def test_ordinary_motors_raise_no_false_alarm(rate):
     The commands wander between -1 and 1 Nm as fast as the bridge lets them, and rest in between, mostly at zero torque:
     there the tolerance is least.
     """
-    monitor, period, random = DeliveryMonitor(LIMITS, PEAK), 1.0 / rate, np.random.default_rng(4)
+    watch, period, random = ArmWatch(LIMITS), 1.0 / rate, np.random.default_rng(4)
     aim, sent, received, applied = np.zeros((4, 4))
     joints = [JointSample(0.5, 0.0, 0.0, 30, 0, 0.0)] * 4
     for cycle in range(round(8.0 * rate)):
@@ -208,15 +205,22 @@ def test_ordinary_motors_raise_no_false_alarm(rate):
             joints[i] = JointSample(0.5, 0.0, float(replied[i]), 30, 0, (cycle + 1) * period)
         received = np.where(arrive, sent, received)
         applied = applied + (1.0 - math.exp(-period / 0.008)) * (received - applied)
-        assert monitor.step(period, joints, sent.tolist(), (0.0,) * 4) is None
+        assert judged(watch, joints, period, sent.tolist()) is None
 
 
-def faults(torques, count=50, silence=0.0, rate=250.0, monitor=None, start=10.0):
-    """Return the monitor and the faults that it finds in `count` replies to EFFORT, `silence` s late."""
-    monitor = monitor or DeliveryMonitor(LIMITS, PEAK)
+def judged(watch, samples, period, effort):
+    """Return the fault that these replies to `effort` are."""
+    for joint, sample in zip(watch.joints, samples, strict=True):
+        joint.sample = sample
+    return watch.judge_torques(period, effort, (0.0,) * 4)
+
+
+def faults(torques, count=50, silence=0.0, rate=250.0, watch=None, start=10.0):
+    """Return the watch and the faults that it finds in `count` replies to EFFORT, `silence` s late."""
+    watch = watch or ArmWatch(LIMITS)
     times = [start + silence + n / rate for n in range(count)]
     replies = [[JointSample(0.5, 0.0, torque, 30, 0, time) for torque in torques] for time in times]
-    return monitor, [monitor.step(1.0 / rate, joints, EFFORT, (0.0,) * 4) for joints in replies]
+    return watch, [judged(watch, joints, 1.0 / rate, EFFORT) for joints in replies]
 
 
 @pytest.mark.parametrize(("rate", "silence"), [(250.0, 0.0), (250.0, 0.02), (250.0, 0.04), (100.0, 0.0), (500.0, 0.0)])
@@ -224,19 +228,19 @@ def faults(torques, count=50, silence=0.0, rate=250.0, monitor=None, start=10.0)
 def test_missing_torque_is_noticed_the_sooner_the_more_it_is_and_after_a_restart_by_its_second_reply(
     rate, silence, joint, latest
 ):
-    monitor, before = faults(EFFORT, rate=rate)
+    watch, before = faults(EFFORT, rate=rate)
     assert not any(before)
     torques = [0.0 if i == joint else asked for i, asked in enumerate(EFFORT)]
-    _, found = faults(torques, 100, silence, rate, monitor, 10.0 + 50 / rate)
+    _, found = faults(torques, 100, silence, rate, watch, 10.0 + 50 / rate)
     first = 1 + [fault is not None for fault in found].index(True)
     assert first / rate <= latest
-    assert monitor.missing == tuple(i == joint for i in range(4))
+    assert [own.is_missing for own in watch.joints] == [i == joint for i in range(4)]
     assert not silence or joint != 1 or first <= 2
 
 
 def test_a_motor_that_comes_back_with_its_torque_is_no_fault():
-    monitor = DeliveryMonitor(LIMITS, PEAK)
-    assert not any(fault for n in range(50) for fault in faults(EFFORT, 1, 0.034 * n, monitor=monitor)[1])
+    watch = ArmWatch(LIMITS)
+    assert not any(fault for n in range(50) for fault in faults(EFFORT, 1, 0.034 * n, watch=watch)[1])
 
 
 @pytest.mark.parametrize("rate", [100.0, 250.0, 500.0])
@@ -270,41 +274,18 @@ def test_a_light_joint_that_moves_when_pushed_has_shown_that_its_motor_is_on():
         velocity = [speed + net / 0.005 * PERIOD for speed, net in zip(velocity, torque, strict=True)]  # 0.005 kg m^2
 
 
-def load_after(seconds: float, step: float, torque: float) -> list[tuple[float, float, float]]:
-    """Return power, RMS torque and share of two motors; the second never replies."""
-    load = MotorLoad((3.0, 9.0))
-    return [
-        load.update(number * step, (JointSample(0.0, 0.0, torque, 30, 0, 0.0), UNKNOWN))
-        for number in range(round(seconds / step) + 1)
-    ][-1]
-
-
-@pytest.mark.parametrize("step", [0.1, 0.5])
-def test_a_constant_torque_warms_a_cold_motor_exponentially_whatever_the_period(step):
-    (_, rms, share), (_, other, _) = load_after(THERMAL_TIME, step, 6.0)
-    assert rms == pytest.approx(6.0 * math.sqrt(1.0 - math.exp(-1.0)), rel=1e-9)
-    assert share == pytest.approx(rms / 3.0) and other == 0.0
-
-
-def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
-    loads = MotorLoad((3.0, 9.0, 3.0)).update(
-        1.0, [JointSample(0.0, 3.0, effort, 30, 0, 0.0) for effort in (2.0, -2.0)] + [UNKNOWN]
-    )
-    assert [power for power, *_ in loads] == [6.0, -6.0, 0.0]
-
-
 IS_ON = (PowerChange.SWITCH_ON, PowerChange.SHOWN_ON)
 TOLD = {  # changes; then whether each reply says that the motor is on, None for silence, and what must hold then
     **{
-        f"left on, {change}": ([change], [(True, lambda power: power.state is Power.ON)])
+        f"left on, {change}": ([change], [(True, lambda motor: motor.power is Power.ON)])
         for change in (PowerChange.PROBED, PowerChange.TAKEN_OVER)
     },
     **{
         f"left off, {change}": (
             [change],
             [
-                (False, lambda power: not power.is_quiet),
-                (False, lambda power: power.is_quiet and power.state is not Power.ON),
+                (False, lambda motor: not motor.is_quiet),
+                (False, lambda motor: motor.is_quiet and motor.power is not Power.ON),
             ],
         )
         for change in (PowerChange.PROBED, PowerChange.TAKEN_OVER)
@@ -312,35 +293,36 @@ TOLD = {  # changes; then whether each reply says that the motor is on, None for
     "one wrong reply does not make a motor count as off": (
         IS_ON,
         [
-            *((on, lambda power: not power.is_told_off) for on in (True, False, True, False, True, False)),
-            (False, lambda power: power.is_told_off),
+            *((on, lambda motor: not motor.reports_off) for on in (True, False, True, False, True, False)),
+            (False, lambda motor: motor.reports_off),
         ],
     ),
     "a motor has left once it says so, and not before": (  # it did not hear EXIT at first
         (*IS_ON, PowerChange.SWITCH_OFF),
         [
-            *[(True, lambda power: power.state is Power.LEAVING)] * 20,
-            (False, lambda power: power.state is Power.OFF),
+            *[(True, lambda motor: motor.power is Power.LEAVING)] * 20,
+            (False, lambda motor: motor.power is Power.OFF),
         ],
     ),
     "silence takes back what was told": (
-        IS_ON, [(on, lambda power: not power.is_told_off) for on in (False, None, False)],
+        IS_ON, [(on, lambda motor: not motor.reports_off) for on in (False, None, False)],
     ),
 }  # fmt: skip
 
 
-def tell(power: MotorPower, time: float, on: bool | None) -> None:
+def tell(motor: JointWatch, time: float, on: bool | None) -> None:
     sample = JointSample(0.0, 0.0, 0.0 if on else 0.5, 30, 0, time, bool(on))  # what a motor that is off may report
-    power.step(PERIOD, sample, on is None)
+    motor.is_silent = on is None
+    motor.note_power(PERIOD, sample, is_new=True)
 
 
 @pytest.mark.parametrize("name", TOLD)
 def test_replies_that_say_whether_a_motor_is_on_are_believed_as_the_row_says(name):
-    power = MotorPower(replies=True)
+    motor = JointWatch(LIMITS, 0)
     changes, replies = TOLD[name]
     for change in changes:
-        power.change(change)
+        motor.change(change)
     for n, (on, holds) in enumerate(replies, 1):
-        power.send((n - 1) * PERIOD)
-        tell(power, n * PERIOD, on)
-        assert holds(power), (n, power.state)
+        motor.send((n - 1) * PERIOD)
+        tell(motor, n * PERIOD, on)
+        assert holds(motor), (n, motor.power)

@@ -16,11 +16,11 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import NO_TORQUE, Rate
 from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.gate import SWITCH_ON, SignCheck
+from exo_gravity.core.safety.explain import RIDE
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
-from exo_gravity.core.safety.monitors import RIDE
+from exo_gravity.core.safety.start import SWITCH_ON, SignCheck
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
 from ..support.safety_run import EFFORT, LIMITS, PERIOD, SafetyRun, reading

@@ -22,8 +22,8 @@ from exo_gravity.core.compensation.terms.terms import SUM, TermSettings
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.safety.explain import MOTION
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.safety.motion_monitor import MOTION
 from exo_gravity.sim import ArmConfig, VirtualWearer
 from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.rig import Rig

@@ -16,17 +16,17 @@ from typing import Any
 from unittest.mock import patch
 
 from exo_gravity.core.safety.drive import Send
-from exo_gravity.core.safety.power import Power
+from exo_gravity.core.safety.watch import Power
 
 STEP, MACHINE = (f"core.safety.machine:SafetyMachine.{name}" for name in ("step", "__init__"))
-TRUSTED = "core.safety.trust:Readings.trusted"  # zeros and signs
+TRUSTED = "core.safety.watch:ArmWatch.trusted"  # zeros and signs
 ARM_DESCENT, JOINT_DESCENT = (f"core.safety.descent:{name}" for name in ("ArmDescent", "JointDescent.__init__"))
 DESCENT = "core.safety.descent:DESCENT"  # its tuning
-DELIVERY = "core.safety.delivery:DeliveryMonitor.step"
-SENT = "core.safety.power:SENT"  # what a motor is sent in each state
-RIDE, RIDING = (f"core.safety.monitors:RideThrough.{name}" for name in ("step", "is_riding"))
-MONITOR, MOTION = "core.safety.motion_monitor:MotionMonitor.step", "core.safety.motion_monitor:MOTION"
-WALL = "core.safety.barrier:Barrier._wall"
+DELIVERY = "core.safety.watch:JointWatch.judge_torque"
+SENT = "core.safety.watch:SENT"  # what a motor is sent in each state
+RIDE, RIDING = (f"core.safety.explain:RideThrough.{name}" for name in ("step", "is_riding"))
+MONITOR, MOTION = "core.safety.explain:MotionMonitor.step", "core.safety.explain:MOTION"
+WALL = "core.safety.shape:Shaper._wall"
 LEASE = "core.safety.lease:Lease.lost"
 COMPENSATOR = "core.compensation.compensator:Compensator.step"
 GUIDANCE = "core.compensation.guidance:GuidedChange.step"
@@ -128,9 +128,17 @@ def without_enter(drive: Any, machine: Any, *_: Any) -> Any:
     return drive._replace(send=tuple(Send.COMMAND if send is Send.ENTER else send for send in drive.send))
 
 
-def replies_with_torque(dt: float, joints: Any, *others: Any) -> Any:
+def replies_with_torque(judge: Callable[..., str]) -> Callable[..., str]:
     """Take a reply without torque for none."""
-    return dt, [joint if abs(joint.effort) > 0.1 else joint._replace(time=-math.inf) for joint in joints], *others
+
+    def judge_torque(self: Any, *args: Any) -> str:
+        sample = self.sample
+        self.sample = sample if abs(sample.effort) > 0.1 else sample._replace(time=-math.inf)
+        reason = judge(self, *args)
+        self.sample = sample
+        return reason
+
+    return judge_torque
 
 
 def without_timeout(limits: Any, *others: Any) -> Any:
@@ -188,11 +196,11 @@ DEFECTS = (
         ("elbow pushed into the soft wall",),
         {WALL: after(lambda wall, *_: (wall[0], 0.0))},
     ),
-    Defect("torque delivery is not checked", ("motor 2 restarts in 30 ms",), {DELIVERY: after(lambda *_: None)}),
+    Defect("torque delivery is not checked", ("motor 2 restarts in 30 ms",), {DELIVERY: returns("")}),
     Defect(
         "a motor that replies no torque is taken for sound",
         ("motor 2 restarts in 30 ms",),
-        {DELIVERY: with_arguments(replies_with_torque)},
+        {DELIVERY: replies_with_torque},
     ),
     Defect("stale efforts are accepted", (FROZEN,), {RIDE: returns(None)}),
     Defect("a ride that never ends", (FROZEN,), {RIDE: after(rides_on)}),

@@ -20,7 +20,7 @@ from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.core.safety.power import Power
+from exo_gravity.core.safety.watch import Power
 from exo_gravity.hardware import control_loop
 from exo_gravity.hardware.can.can_port import CanPort, message_of
 from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
@@ -276,7 +276,7 @@ def test_a_bus_that_is_lost_lets_the_whole_arm_down_and_its_motors_once_they_are
 def test_motors_on_a_bus_that_fails_while_they_are_switched_off_are_not_taken_for_off() -> None:
     arm = raised(channel=ON_TWO)
     arm.safety.disable(arm.now)
-    assert arm.run_until(lambda: arm.safety.power[2].state is Power.LEAVING)
+    assert arm.run_until(lambda: arm.safety.watch.joints[2].power is Power.LEAVING)
     break_down(arm, SECOND)
     arm.run(0.5)
     assert not arm.loop.is_off

@@ -30,7 +30,7 @@ from exo_gravity.core.compensation.compensator import Compensation
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.boards import Boards
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.joint_motor import JointMotor, JointSample, Traffic
+from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample, Traffic
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety import descent, guidance, machine
 from exo_gravity.core.safety.drive import NO_EFFORTS, Efforts, FaultCode, State
@@ -45,7 +45,14 @@ from exo_gravity.nodes.can_bridge import node as can_bridge
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange
 from exo_gravity.nodes.can_bridge.node import CanBridge
-from exo_gravity.nodes.can_bridge.operation import WATCH_PERIOD, BridgeReport, BridgeServices, Operator
+from exo_gravity.nodes.can_bridge.operation import (
+    THERMAL_TIME,
+    WATCH_PERIOD,
+    BridgeReport,
+    BridgeServices,
+    MotorLoad,
+    Operator,
+)
 from exo_gravity.nodes.compensator.arm import JointStateInterface
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics
@@ -696,3 +703,26 @@ def test_a_failed_activation_leaves_nothing_running_and_a_dead_control_thread_is
     bridge.loop.safety.step = Mock(side_effect=RuntimeError("broken"))
     wait_until(lambda: bridge.failure)
     assert str(bridge.failure) == "broken"
+
+
+def load_after(seconds: float, step: float, torque: float) -> list[tuple[float, float, float]]:
+    """Return power, RMS torque and share of two motors; the second never replies."""
+    load = MotorLoad((3.0, 9.0))
+    return [
+        load.update(number * step, (JointSample(0.0, 0.0, torque, 30, 0, 0.0), UNKNOWN))
+        for number in range(round(seconds / step) + 1)
+    ][-1]
+
+
+@pytest.mark.parametrize("step", [0.1, 0.5])
+def test_a_constant_torque_warms_a_cold_motor_exponentially_whatever_the_period(step):
+    (_, rms, share), (_, other, _) = load_after(THERMAL_TIME, step, 6.0)
+    assert rms == pytest.approx(6.0 * math.sqrt(1.0 - math.exp(-1.0)), rel=1e-9)
+    assert share == pytest.approx(rms / 3.0) and other == 0.0
+
+
+def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
+    loads = MotorLoad((3.0, 9.0, 3.0)).update(
+        1.0, [JointSample(0.0, 3.0, effort, 30, 0, 0.0) for effort in (2.0, -2.0)] + [UNKNOWN]
+    )
+    assert [power for power, *_ in loads] == [6.0, -6.0, 0.0]

@@ -33,8 +33,8 @@ from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.delivery import DELIVERY
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
+from exo_gravity.core.safety.watch import excess_torque, expected_torque
 
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
 
@@ -192,8 +192,8 @@ class ArmDescent:
         """
         columns = zip(self._joints, samples, silent, self._silent, unsent, strict=True)
         for joint, sample, is_silent, was_silent, is_unsent in columns:
-            expected = joint.effort - joint.damping * sample.velocity
-            is_obeying = DELIVERY.excess(sample.effort, expected) <= 0.0
+            expected = expected_torque(joint.effort, joint.damping, sample.velocity)
+            is_obeying = excess_torque(sample.effort, expected) <= 0.0
             if was_silent and not is_silent and not is_obeying:
                 joint.resume(sample.effort, sample.velocity)
             elif is_silent:

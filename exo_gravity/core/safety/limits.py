@@ -1,7 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The limits of a worn arm, and which motor readings are a fault.
+"""The limits of a worn arm, and which motor readings are plausible.
 
-`find_faults` checks a motor's reading; trust.py confirms what it finds. barrier.py keeps every drive within the limits.
+watch.py finds readings that are a fault. shape.py keeps every drive within the limits.
 docs/safety_case.md compares the defaults with those of other systems.
 """
 
@@ -26,7 +26,6 @@ from exo_gravity.core.motors.joint_motor import (
 )
 from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, for_joints
 from exo_gravity.core.params import JOINT_NAMES, REAL_TIME_PARAMETERS, Param, check_owned, owned, params_of
-from exo_gravity.core.safety.drive import Fault, FaultCode
 
 # An effort command beyond these is wrong: no joint with small motors needs half of the first, in Nm; and a large motor
 # gives its peak torque at most.
@@ -217,20 +216,6 @@ class Limits:
     def is_silent(self, now: float, joint: JointSample) -> bool:
         """Return whether the reading `joint` of a motor is older than `reply_timeout` at `now` (s)."""
         return not now - joint.time <= self.reply_timeout
-
-    def find_faults(self, i: int, joint: JointSample) -> list[Fault]:
-        """Return the faults that the reading `joint` of joint `i` shows by itself."""
-        low, high, fastest = self.position_min[i], self.position_max[i], self.max_velocity[i]
-        found: dict[FaultCode, str] = {}
-        if joint.error:
-            found[FaultCode.MOTOR_ERROR] = f"the motor reports error {joint.error} ({joint.trouble})"
-        if joint.temperature is not None and joint.temperature >= HEAT.most:
-            found[FaultCode.OVER_TEMPERATURE] = f"{joint.temperature} degC, the limit is {HEAT.most:g}"
-        if not abs(joint.velocity) <= fastest:
-            found[FaultCode.OVER_SPEED] = f"{joint.velocity:.2f} rad/s, the limit is {fastest:g}"
-        if not low - READING.overshoot <= joint.position <= high + READING.overshoot:
-            found[FaultCode.OUTSIDE_LIMITS] = f"{joint.position:.3f} rad, the limits are {low:g} to {high:g}"
-        return [Fault.of_joint(code, self.joint_names[i], reason) for code, reason in found.items()]
 
 
 LIMIT_PARAMETERS = params_of(Limits, fixed=True)

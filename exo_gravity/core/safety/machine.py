@@ -1,13 +1,13 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The state machine between the requested efforts and the motors. Pure: time is an argument.
 
-`transitions.TRANSITIONS` has every transition, `power.NEXT` those of a single motor.
+`drive.TRANSITIONS` has every transition, `watch.NEXT` those of a single motor.
 
-- CHECKING waits for the start gate (gate.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
+- CHECKING waits for the start gate (start.py), at most `enable_timeout`. If zeros are not trusted, the arm must hang, a
   person must confirm it unless `start_pose` says that they have, and little torque may be asked for.
-- PROVING switches the motors on one by one (power.py). Each must show in its replies that it is on. If signs are not
-  trusted, each joint is pushed gently, and must move the right way (gate.py). Any fault, and `disable`, takes the
-  push back without a step and without damping, and switches the motors off.
+- PROVING switches the motors on one by one (`SwitchingOn`). Each must show in its replies that it is on. If signs are
+  not trusted, each joint is pushed gently, and must move the right way (`SignCheck`). Any fault, and `disable`, takes
+  the push back without a step and without damping, and switches the motors off.
 - RAMPING_IN: the torque begins as a guided motion (guidance.py), which ends at the full torque.
 - LETTING_DOWN lowers each joint at a bounded speed (descent.py). The motors are switched off once nothing holds
   the arm and nothing moves it. A motor that does not reply is taken to obey, and is still watched for: if it replies
@@ -16,7 +16,7 @@
 
 A compensator that is late for a moment is waited for (`RideThrough`): the last torque stays, and damping rises.
 
-Zeros and signs are trusted once they were checked, for as long as the angles are continuous (trust.py). So long
+Zeros and signs are trusted once they were checked, for as long as the angles are continuous (watch.py). So long
 `resume` carries an arm on from any pose after a fault that leaves nothing to repair.
 """
 
@@ -27,29 +27,35 @@ from collections.abc import Iterable, Sequence
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.barrier import Barrier
-from exo_gravity.core.safety.delivery import DeliveryMonitor
 from exo_gravity.core.safety.descent import DESCENT, ArmDescent
-from exo_gravity.core.safety.drive import CARRYING, Drive, Efforts, Fault, FaultCode, Send, State
-from exo_gravity.core.safety.gate import (
+from exo_gravity.core.safety.drive import (
+    CARRYING,
+    TRANSITIONS,
+    Drive,
+    Efforts,
+    Fault,
+    FaultCode,
+    Send,
+    State,
+    StateEvent,
+)
+from exo_gravity.core.safety.explain import MotionMonitor, RideThrough
+from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
+from exo_gravity.core.safety.limits import CONFIRM, DAMPING, MAX_EFFORT_RATE, Limits
+from exo_gravity.core.safety.shape import Shaper
+from exo_gravity.core.safety.start import (
     HANGING_ARM,
     START_GATE,
     SWITCH_ON,
     PoseQuestion,
     SignCheck,
+    SwitchingOn,
     SwitchOnCheck,
     missing_for_a_start,
     missing_of_trunk,
     torque_while_hanging,
 )
-from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
-from exo_gravity.core.safety.limits import CONFIRM, DAMPING, MAX_EFFORT_RATE, Limits
-from exo_gravity.core.safety.monitors import REST, RestTracker, RideThrough
-from exo_gravity.core.safety.motion_monitor import MotionMonitor
-from exo_gravity.core.safety.power import POWER, MotorPower, Power, PowerChange, SwitchingOn
-from exo_gravity.core.safety.stall import StallWatch
-from exo_gravity.core.safety.transitions import TRANSITIONS, StateEvent
-from exo_gravity.core.safety.trust import Readings
+from exo_gravity.core.safety.watch import POWER, REST, ArmWatch, Power, PowerChange
 from exo_gravity.core.vocabulary import NO_REASON, Motors, Reason, Resume, Wait
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
@@ -62,9 +68,9 @@ class SafetyMachine:
     motors: of the arm, which bound its torque and damping; by default `max_effort` does, and nothing.
 
     state: the State. fault: the latched Fault or None. waiting_for: what CHECKING or PROVING waits for. refusal: why
-    the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. power: of
-    each motor. ride: through late efforts. motion: judges the efforts by gravity alone. pose: the question to the
-    operator whether the arm hangs as it is drawn.
+    the last enable was refused without a fault. acted: for each limit that has acted, by name, the last time. watch:
+    what is known of each motor. ride: through late efforts. motion: judges the efforts by gravity alone. pose: the
+    question to the operator whether the arm hangs as it is drawn.
     """
 
     def __init__(self, limits: Limits, period: float, motors: Sequence[JointMotor] = ()) -> None:
@@ -79,20 +85,16 @@ class SafetyMachine:
         count = len(limits.joint_names)
         self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
         #: the last hand on every drive
-        self.barrier = Barrier(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
+        self.shaper = Shaper(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
         self._replies = [motor.wire_format.replies for motor in motors] or [True] * count
-        self.power = tuple(map(MotorPower, self._replies))
+        self.watch = ArmWatch(limits, period, motors)
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
         self._sent = self._off = Drive.off(count)  # last sent to the motors
         self._descent = ArmDescent(0.0, self._none, self._none, self._none)
         self._rise = GuidedMotion(count)  # of the torque, where it begins
-        self._stall = StallWatch(limits.joint_names, period)
         self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
-        self._rest = RestTracker(count)
-        self._readings = Readings(limits)
         self.pose = PoseQuestion(limits.joint_names)
-        self._delivery = DeliveryMonitor(limits, [motor.peak_effort for motor in motors] or limits.max_effort)
         self.motion = MotionMonitor(limits)
         self._switching = SwitchingOn(self._replies)
         self._switch_on = SwitchOnCheck(limits)
@@ -100,17 +102,16 @@ class SafetyMachine:
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
         self._attempts = 0  # to switch a motor on again that shows no torque while it is pushed
         #: Whether the last drive did not leave for each motor (n,), set from outside: that motor holds what it had.
-        self.unsent: Sequence[bool] = (False,) * len(self.power)
+        self.unsent: Sequence[bool] = (False,) * count
         #: Whether each motor (n,) was sent nothing in the last cycle on purpose, set from outside: it owes no reply.
-        self.held_back: Sequence[bool] = (False,) * len(self.power)
+        self.held_back: Sequence[bool] = (False,) * count
         #: What else CHECKING waits for, set from outside.
         self.hindrance = NO_REASON
 
     @property
     def is_unreached(self) -> bool:
         """Whether the arm counts as down, but a motor that may be on does not reply."""
-        motors = zip(self.power, self._readings.silent, strict=True)
-        return self._is_standing and any(power.may_be_on and is_silent for power, is_silent in motors)
+        return self._is_standing and any(motor.may_be_on and motor.is_silent for motor in self.watch.joints)
 
     @property
     def is_off(self) -> bool:
@@ -142,8 +143,8 @@ class SafetyMachine:
         if self.state is not State.FAULT:
             return False
         self.fault = None
-        for power in self.power:
-            power.clear_error()
+        for motor in self.watch.joints:
+            motor.clear_error()
         self._on(StateEvent.CLEAR, now)
         return True
 
@@ -155,7 +156,7 @@ class SafetyMachine:
         if not self.fault.code.is_resumable:
             cause = f"{self.fault.code} has a cause to look for: then clear the fault and enable the arm"
             return Reason(Resume.HAS_CAUSE, cause)
-        if not self._readings.trusted:
+        if not self.watch.trusted:
             unsure = "zeros are no longer sure: let the arm hang, clear the fault, enable the arm"
             return Reason(Resume.ZEROS_UNSURE, unsure)
         return Reason(Resume.POSSIBLE, "")
@@ -181,18 +182,18 @@ class SafetyMachine:
     def take_over(self, effort: Sequence[float], damping: Sequence[float], now: float) -> None:
         """Let down an arm whose controller has died while its motors applied `effort` (n,) Nm and `damping` (n,)."""
         self._sent, self._left = Drive(tuple(effort), tuple(damping), self._commands, True), effort
-        self._change_power(PowerChange.TAKEN_OVER)
+        self.watch.change_power(PowerChange.TAKEN_OVER)
         self.state = State.ACTIVE
         self._on(StateEvent.DISABLE, now)
 
     def probe(self, now: float) -> None:
         """Find out, under damping, whether motors are on that a dead controller may have left; let them down if so."""
-        self._descent = ArmDescent(now, self._none, (DAMPING,) * len(self.power), self.limits.max_effort)
-        self._change_power(PowerChange.PROBED)
+        self._descent = ArmDescent(now, self._none, (DAMPING,) * len(self._none), self.limits.max_effort)
+        self.watch.change_power(PowerChange.PROBED)
 
     def is_at_rest(self, now: float) -> bool:
         """Return whether no replying joint has moved for a while."""
-        return now - self._rest.since >= REST.time
+        return now - self.watch.rest.since >= REST.time
 
     def step(self, now: float, joints: Sequence[JointSample], efforts: Efforts) -> Drive:
         """Return what the motors receive in the cycle at `now` s.
@@ -202,7 +203,9 @@ class SafetyMachine:
         """
         now = max(now, self._now)  # a call may carry a slightly later time than the cycle that follows it
         self._now, self._dt = now, min(now - self._now, self._period)
-        self._read(joints)
+        watch = self.watch
+        watch.read(now, joints, self.held_back, self._sent.powered, self._dt)
+        self._share_supply()
         if self.state is State.CHECKING:
             self._check(efforts)
         elif self.state in CARRYING:
@@ -210,47 +213,43 @@ class SafetyMachine:
         self._watch_stalls()
         effort = efforts.effort
         if effort is not None and self.state in CARRIED:
-            effort, fault = self.motion.step(self._dt, self._readings.joints, effort, now - efforts.answered)
+            effort, fault = self.motion.step(self._dt, watch.samples, effort, now - efforts.answered)
             self._trip(fault)
         if self.state is State.PROVING:
             self._prove(efforts.effort or self._none)
         self._sent = self._drive(effort or self._none, efforts.damped)
         return self._sent
 
-    def _read(self, joints: Sequence[JointSample]) -> None:
-        """Take the newest samples: readings, rest, and what they show of the motors' power."""
-        readings = self._readings
-        readings.step(self._now, joints, self.held_back, self._sent.powered)
-        self._rest.step(self._now, readings.joints, readings.silent)
-        for power, joint, is_silent in zip(self.power, joints, readings.silent, strict=True):
-            power.step(self._dt, joint, is_silent)
-        if self._left and any(power.state is Power.ON for power in self.power):
-            # The motors of an arm share a supply: one that has too little to hold for its replies to tell is on, too.
-            for power, held in zip(self.power, self._left, strict=True):
-                if power.state is Power.UNSURE and power.is_heard and abs(held) <= 2.0 * POWER.torque:
-                    power.change(PowerChange.SHOWN_ON)
+    def _share_supply(self) -> None:
+        """Take motors that another process left for on that hold too little for their replies to tell.
+
+        The motors of an arm share a supply: one that shows torque tells of the others.
+        """
+        if self._left and any(motor.power is Power.ON for motor in self.watch.joints):
+            for motor, held in zip(self.watch.joints, self._left, strict=True):
+                if motor.power is Power.UNSURE and motor.is_heard and abs(held) <= 2.0 * POWER.torque:
+                    motor.change(PowerChange.SHOWN_ON)
 
     def _watch_stalls(self) -> None:
         """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
         self._guard = max(0.0, self._guard - DESCENT.damping_rate * self._dt)
         if self.state not in CARRIED:
-            self._stall.reset()
+            self.watch.reset_stall()
             return
-        has_stood_still, fault = self._stall.step(self._now, self._readings.joints, self._sent.effort)
+        has_stood_still, fault = self.watch.step_stall(self._now, self._sent.effort)
         if has_stood_still:
             self._guard = DAMPING
         self._trip(fault)
 
     def _carried_fault(self, efforts: Efforts) -> Fault | None:
         """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
-        sent = self._sent
-        undelivered = self._delivery.step(self._dt, self._readings.joints, sent.effort, sent.damping)
+        undelivered = self.watch.judge_torques(self._dt, self._sent.effort, self._sent.damping)
         if undelivered:
             if self.state in CARRIED or self._attempts == SWITCH_ON.attempts:
                 return undelivered
             self._attempts += 1
-        if self._readings.fault:
-            return self._readings.fault
+        if self.watch.fault:
+            return self.watch.fault
         if self.state in CARRIED and (found_off := self._found_off()):
             return found_off
         if efforts.effort is None:
@@ -259,11 +258,10 @@ class SafetyMachine:
 
     def _found_off(self) -> Fault | None:
         """Return the fault of a motor that was switched on, and whose replies say that it is off."""
-        motors = zip(self.limits.joint_names, self.power, self._readings.joints, strict=True)
-        for name, power, joint in motors:
-            if power.state is Power.ON and power.is_told_off:
-                why = f": {joint.trouble}" if joint.trouble else ""
-                return Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, name, f"its motor says that it is off{why}")
+        for motor in self.watch.joints:
+            if motor.power is Power.ON and motor.reports_off:
+                why = f": {motor.sample.trouble}" if motor.sample.trouble else ""
+                return Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, motor.name, f"its motor says that it is off{why}")
         return None
 
     def _drive(self, effort: Sequence[float], damped: bool) -> Drive:
@@ -278,10 +276,8 @@ class SafetyMachine:
 
     def _powered(self, effort: Iterable[float], damping: Iterable[float], send: Iterable[Send]) -> Drive:
         """Return a drive of motors that may be on, within the barrier."""
-        readings, torque = self._readings, tuple(effort)
-        bounded = self.barrier.damping(
-            self._dt, readings.joints, readings.silent, torque, tuple(damping), readings.is_late
-        )
+        watch, torque = self.watch, tuple(effort)
+        bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
         return Drive(torque, bounded, tuple(send), self._may_be_powered)
 
     def _check(self, efforts: Efforts) -> None:
@@ -289,11 +285,11 @@ class SafetyMachine:
 
         Efforts may be late as they may while the arm is carried, but not in the cycle in which the checks end.
         """
-        readings, limits, effort, ride = self._readings, self.limits, efforts.effort, self._ride_while_checking
+        watch, limits, effort, ride = self.watch, self.limits, efforts.effort, self._ride_while_checking
         are_late = ride.step(self._now, self._dt, self._now - efforts.answered, efforts.held)
-        missing = missing_for_a_start(limits, readings.joints, readings.fault, readings.trusted)
+        missing = missing_for_a_start(limits, watch.samples, watch.fault, watch.trusted)
         if isinstance(missing, Fault):
-            if not any(power.is_clearing for power in self.power):
+            if not any(motor.is_clearing for motor in watch.joints):
                 self._trip(missing)
                 return
             missing = Reason(missing.code, missing.reason)
@@ -302,28 +298,28 @@ class SafetyMachine:
             missing = Reason(Wait.EFFORTS, "effort commands")
         if not missing and not self._all_off:
             missing = Reason(Wait.MOTORS_OFF, "the motors to confirm that they are off")
-        asks = not readings.trusted and limits.start_pose == CONFIRM
+        asks = not watch.trusted and limits.start_pose == CONFIRM
         patience = limits.enable_timeout + (HANGING_ARM.patience if asks else 0.0)
-        if readings.fault:
+        if watch.fault:
             self.pose.withdraw()
         if asks:
-            missing = self.pose.missing(self._now, readings.joints, missing)
+            missing = self.pose.missing(self._now, watch.samples, missing)
         # While the bridge cannot switch motors on the calm second passes: its watchdog starts meanwhile.
         self.waiting_for = self.hindrance or missing or Reason(Wait.CALM, f"{START_GATE.calm:g} s without a fault")
         if missing:
             self._calm_since = self._now
         is_calm = not self.hindrance and self._now - self._calm_since >= START_GATE.calm
         if is_calm and effort is not None and not ride.is_riding:
-            fault = None if readings.trusted else torque_while_hanging(limits, effort)
+            fault = None if watch.trusted else torque_while_hanging(limits, effort)
             if fault:
                 self._trip(fault)
                 return
             self.waiting_for = NO_REASON
-            largest = 0.0 if readings.trusted else limits.sign_check_torque
+            largest = 0.0 if watch.trusted else limits.sign_check_torque
             self._switching, self._attempts = SwitchingOn(self._replies), 0
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
-            self._delivery.reset()
+            watch.reset_delivery()
             self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
             waited = f"not enabled within {patience:g} s: waited for {self.waiting_for}"
@@ -332,20 +328,20 @@ class SafetyMachine:
     def _prove(self, asked: Sequence[float]) -> None:
         """Advance the checks of motors that were just switched on; asked: (n,) Nm."""
         if not self._switching.done:
-            self._delivery.reset()
+            self.watch.reset_delivery()
             return
-        joints = self._readings.joints
+        joints = self.watch.samples
         if self._signs.done:  # before, or there is nothing to check: they are trusted
             fault = self._switch_on.step(self._dt, joints, self._sent.damping)
-            self._delivery.reset()
+            self.watch.reset_delivery()
         else:
             fault = self._signs.step(self._dt, joints, asked)
         self.waiting_for = self._signs.hint
         self._trip(fault)
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
-            self._readings.prove()
+            self.watch.trusted = True
             self.motion.reset()
-            self._rise.begin((1.0,) * len(self.power))
+            self._rise.begin((1.0,) * len(self._none))
             self._on(StateEvent.PROVEN)
 
     def _push(self) -> Drive:
@@ -353,15 +349,15 @@ class SafetyMachine:
 
         A joint is damped only if its signs are trusted, or have just been proven.
         """
-        count = len(self.power)
         if not self._switching.done:
             return self._powered(self._none, self._none, self._switching.step())
         if self._signs.pushes:
-            pushed, again, damped = self._signs.effort, list(self._delivery.missing), self._signs.damped
+            again = [motor.is_missing for motor in self.watch.joints]
+            pushed, damped = self._signs.effort, self._signs.damped
         else:
-            pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * count
+            pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * len(self._none)
         if any(again):
-            self._delivery.reset()
+            self.watch.reset_delivery()
         boards = zip(again, self._replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
         rise = DESCENT.damping_rate * self._dt
@@ -369,7 +365,7 @@ class SafetyMachine:
         return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
 
     def _carry(self, effort: Sequence[float], damped: bool) -> Drive:
-        joints = self._readings.joints
+        joints = self.watch.samples
         if self.state is State.RAMPING_IN:
             self._rise.step(self._dt, [joint.velocity for joint in joints], self._none, effort)
             if self._rise.is_over:
@@ -378,67 +374,62 @@ class SafetyMachine:
         share = [1.0 - left for left in self._rise.shares]
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        shaped = self.barrier.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
+        shaped = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
         self.acted.update(dict.fromkeys(shaped.acted, self._now))
         damping = [max(self._guard, own) for own in shaped.damping]
         return self._powered(shaped.effort, damping, self._commands)
 
     def _descend(self) -> Drive:
         """Return a drive that lowers the arm, or stands once it is down."""
-        readings = self._readings
-        descent, silent, joints = self._descent, readings.silent, readings.joints
-        descent.step(self._now, self._dt, joints, silent, self.unsent)
+        watch, descent, sent = self.watch, self._descent, self._sent
+        descent.step(self._now, self._dt, watch.samples, watch.silent, self.unsent)
         self._switch_quiet_off()
-        if self._is_switched_off or descent.is_down(self._now, self._rest.since):
-            for power, is_silent in zip(self.power, silent, strict=True):
-                if not is_silent:
-                    power.change(PowerChange.SWITCH_OFF)
+        is_switched_off = all(motor.power in (Power.OFF, Power.LEAVING) for motor in watch.joints)
+        if is_switched_off or descent.is_down(self._now, watch.rest.since):
+            for motor in watch.joints:
+                if not motor.is_silent:
+                    motor.change(PowerChange.SWITCH_OFF)
             self._on(StateEvent.DOWN_AFTER_FAULT if self.fault else StateEvent.DOWN)
             return self._stand()
-        delivered = self._delivery.step(self._dt, joints, self._sent.effort, self._sent.damping) is None
+        undelivered = watch.judge_torques(self._dt, sent.effort, sent.damping)
         send = self._sends()
-        for i, (power, joint, is_missing) in enumerate(zip(self.power, joints, self._delivery.missing, strict=True)):
-            asked = self._sent.effort[i] - self._sent.damping[i] * joint.velocity
-            is_off = power.is_told_off or (is_missing and abs(joint.effort) < POWER.off_share * abs(asked))
-            if is_off and power.state is Power.ON and power.may_return and not joint.error:
-                power.may_return = False
-                self._readings.doubt()
+        for i, motor in enumerate(watch.joints):
+            may_reenable = motor.power is Power.ON and motor.can_reenable and not motor.sample.error
+            if may_reenable and motor.is_found_off(sent.effort[i], sent.damping[i]):
+                motor.can_reenable = False
+                watch.require_sign_check()
                 descent.rejoin(i)
                 send[i] = Send.ENTER if self._replies[i] else Send.COMMAND
-        if not delivered:
-            self._delivery.reset()
+        if undelivered:
+            watch.reset_delivery()
         return self._powered(*descent.applied, send)
 
     def _stand(self) -> Drive:
         """Return what the motors receive while the arm is off: nothing, unless one of them may be on."""
         self._switch_quiet_off()
-        if any(power.state is Power.ON for power in self.power):
+        if any(motor.power is Power.ON for motor in self.watch.joints):
             if self.state is State.CHECKING:
                 self.refusal = Reason(Wait.MOTOR_ON, "a motor was still on: it is let down")
             self._on(StateEvent.FOUND_ON)
             return self._descend()
-        if any(power.state is Power.ENTERING for power in self.power):  # the proof has ended
+        if any(motor.power is Power.ENTERING for motor in self.watch.joints):  # the proof has ended
             pushed = [limited(0.0, push, MAX_EFFORT_RATE * self._dt) for push in self._sent.effort]
             if any(pushed):
                 return self._powered(pushed, self._none, self._commands)
-            self._change_power(PowerChange.SWITCH_OFF)
+            self.watch.change_power(PowerChange.SWITCH_OFF)
         if self._all_off:
             return self._off._replace(send=tuple(self._sends()))
-        self._descent.step(self._now, self._dt, self._readings.joints, self._readings.silent, self.unsent)
+        self._descent.step(self._now, self._dt, self.watch.samples, self.watch.silent, self.unsent)
         return self._powered(*self._descent.applied, self._sends())
 
     def _switch_quiet_off(self) -> None:
         """Switch motors off that may be on, but reply without torque."""
-        for power in self.power:
-            if power.state in (Power.UNSURE, Power.UNKNOWN) and power.is_quiet:
-                power.change(PowerChange.SWITCH_OFF)
-
-    @property
-    def _is_switched_off(self) -> bool:
-        return all(power.state in (Power.OFF, Power.LEAVING) for power in self.power)
+        for motor in self.watch.joints:
+            if motor.power in (Power.UNSURE, Power.UNKNOWN) and motor.is_quiet:
+                motor.change(PowerChange.SWITCH_OFF)
 
     def _sends(self) -> list[Send]:
-        return [power.send(self._now) for power in self.power]
+        return [motor.send(self._now) for motor in self.watch.joints]
 
     @property
     def _is_standing(self) -> bool:
@@ -446,11 +437,11 @@ class SafetyMachine:
 
     @property
     def _all_off(self) -> bool:
-        return all(power.state is Power.OFF for power in self.power)
+        return all(motor.power is Power.OFF for motor in self.watch.joints)
 
     @property
     def _may_be_powered(self) -> bool:
-        return any(power.may_be_on for power in self.power)
+        return any(motor.may_be_on for motor in self.watch.joints)
 
     def _refuse(self, reason: Reason) -> None:
         self.refusal = reason
@@ -462,15 +453,11 @@ class SafetyMachine:
 
     def _latch(self, fault: Fault, now: float) -> None:
         if fault.code.needs_recheck:
-            self._readings.doubt()
+            self.watch.require_sign_check()
         if self.state is State.FAULT or (self.state is State.DISABLED and fault.code is not FaultCode.FOREIGN_COMMAND):
             return
         self.fault = self.fault or fault
         self._on(StateEvent.FAULT, now)
-
-    def _change_power(self, change: PowerChange) -> None:
-        for power in self.power:
-            power.change(change)
 
     def _on(self, event: StateEvent, now: float = -math.inf) -> None:
         """Go to the state that `TRANSITIONS` has for this event; stay where it has none."""
@@ -478,13 +465,13 @@ class SafetyMachine:
         if after is None:
             return
         self.state = after
-        self._readings.is_being_proven = after is State.PROVING
+        self.watch.is_being_proven = after is State.PROVING
         self.pose.withdraw()
         self._since = self._now = max(now, self._now)
         if after is State.PROVING:
-            self._change_power(PowerChange.SWITCH_ON)
+            self.watch.change_power(PowerChange.SWITCH_ON)
         elif after is State.RAMPING_IN:
-            self._change_power(PowerChange.SHOWN_ON)
+            self.watch.change_power(PowerChange.SHOWN_ON)
         elif after is State.LETTING_DOWN and before in CARRIED:
             sent = self._sent
             self._descent = ArmDescent(self._since, sent.effort, sent.damping, self.limits.max_effort)

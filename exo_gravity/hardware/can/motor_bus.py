@@ -12,7 +12,7 @@ A motor obeys every sender. A command to one of our motors that we did not send 
 full damping: until then the other sender's torque acts, and no damping. What it moves the joint in between must not add
 up, so for a while all our commands to that motor also hold the joint.
 
-What a motor is sent is the safety machine's decision (core/safety/power.py): this only carries it out. A motor gets one
+What a motor is sent is the safety machine's decision (core/safety/watch.py): this only carries it out. A motor gets one
 frame a cycle, whose reply is awaited: its reply has the ID of the command, and would collide with a second one. Motors
 whose replies have an ID of their own may get more. While such a motor is off, its board is also asked for its settings
 (core/motors/boards.py).

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from multiprocessing import Pipe
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.core.safety.delivery import DELIVERY
 from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.watch import excess_torque, expected_torque
 from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.can.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
@@ -83,8 +83,8 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
     # A motor that replies another torque than it received has been switched off or obeyed another sender.
     effort, damping = list(drive.effort), list(drive.damping)
     for i, joint in enumerate(motors.samples):
-        expected = effort[i] - damping[i] * joint.velocity
-        if DELIVERY.excess(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
+        expected = expected_torque(effort[i], damping[i], joint.velocity)
+        if excess_torque(joint.effort, expected) > 0.0:  # not without a reply: that is NaN
             effort[i], damping[i] = joint.effort, 0.0
     machine = SafetyMachine(arm.limits, arm.period, arm.motors)
     machine.take_over(effort, damping, clock.monotonic())

@@ -31,11 +31,10 @@ from exo_gravity.core.motors.joint_motor import (
     source_of_bus,
 )
 from exo_gravity.core.numbers import Rate
-from exo_gravity.core.safety.delivery import MotorLoad
 from exo_gravity.core.safety.drive import Efforts, FaultCode, State
-from exo_gravity.core.safety.gate import at_least, turns_back
 from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.machine import SafetyMachine
+from exo_gravity.core.safety.start import at_least, turns_back
 from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Reason, words
 from exo_gravity.hardware.can.adapter import serial_of
 from exo_gravity.hardware.can.can_port import ArmOnBus
@@ -70,6 +69,7 @@ FOLLOWS = {
     State.LETTING_DOWN: "the motors are switched off once the arm is down; /diagnostics shows the state",
 }
 MOTOR_UNREACHED = "a motor that was on does not reply and may still be powered, unless its supply is cut: cut it"
+THERMAL_TIME = 60.0  # s; an assumption for motors of this size: the data sheets state none
 
 
 def refuse_simulated_time(node: Node, interface: str) -> None:
@@ -255,6 +255,36 @@ def log_risks(node: Node, interface: str, traffic: Mapping[str, Traffic], rate: 
             log.warning(f"replies on {name} may be late at {rate:g} Hz: at most {fitting} Hz leave them time")
     if opening := open_to_others():
         log.warning(f"{opening}: other hosts can command this arm; unset it, or enforce SROS2")
+
+
+class MotorLoad:
+    """The load of the motors over minutes: RMS torque and power of each joint's motor, which starts cold.
+
+    A motor's heat grows with the square of its torque, so the mean square is averaged over THERMAL_TIME. rated: (n,)
+    Nm, which the motors bear for any time.
+    """
+
+    def __init__(self, rated: Sequence[float]) -> None:
+        self._rated = tuple(rated)
+        self._mean_square = [0.0] * len(self._rated)  # Nm^2
+        self._time = math.inf
+
+    def update(self, now: float, joints: Sequence[JointSample]) -> list[tuple[float, float, float]]:
+        """Add the readings `joints` (n,), the newest at `now` s, and return three figures of each motor.
+
+        They are power (W, > 0 where the motor drives), RMS torque (Nm), and its share of rated torque: above 1 the
+        motor overheats if the load stays. Ten a second are enough. A motor that never replied adds nothing.
+        """
+        share = -math.expm1(-max(0.0, now - self._time) / THERMAL_TIME)
+        self._time = now
+        loads = []
+        for i, joint in enumerate(joints):
+            if joint.time > -math.inf:
+                self._mean_square[i] += share * (joint.effort**2 - self._mean_square[i])
+            power = joint.effort * joint.velocity if joint.time > -math.inf else 0.0
+            rms = math.sqrt(self._mean_square[i])
+            loads.append((power, rms, rms / self._rated[i]))
+        return loads
 
 
 class BridgeReport:

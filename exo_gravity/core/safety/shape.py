@@ -45,7 +45,7 @@ from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_EFFORT_RATE, WALL,
 
 @dataclass(frozen=True)
 class BarrierTuning:
-    """How the barrier acts beyond `driven_speed`."""
+    """How the brake acts beyond `driven_speed`."""
 
     span: float = 1.0  #: rad/s over which the brake rises; less is felt as a step
     #: s, the speed's change over which is added to it. An empty forearm under 3 Nm gains 2 rad/s in a cycle of 4 ms, a
@@ -85,7 +85,7 @@ class Shaped(NamedTuple):
     acted: frozenset[str]  #: which limits acted, for people
 
 
-class Barrier:
+class Shaper:
     """The bounds of one arm's drives.
 
     limits: of the arm.

@@ -1,5 +1,8 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""An independent eye on the compensator: torque that gravity cannot account for, and the speed that it can cause.
+"""Whether the efforts can be used: gravity accounts for their torque, and they are new enough (`RideThrough`).
+
+`MotionMonitor` is an independent eye on the compensator: it finds torque that gravity cannot account for, and the speed
+that it can cause.
 
 It shares no code and no masses with the compensator. Its own ground is `largest_moment`, M1..M4 in kg m: the largest
 first moments of the arm, robot plus wearer, about joints 1 to 4, each along its link (M4 = m4 d4, M3 = m3 d3 + m4 l3,
@@ -49,7 +52,16 @@ class MotionLimits:
     guided: float = 5.0  #: s for which the torque may still be on its way to a tilt that came suddenly
 
 
-MOTION = MotionLimits()
+@dataclass(frozen=True)
+class Ride:
+    """For how long in s late efforts are still applied."""
+
+    longest_age: float = 0.18  #: of efforts; less than the gap after which the compensator ramps in from zero
+    longest: float = 0.13  #: at a time
+    recovery: float = 0.1  #: of riding that each s with sound efforts makes good
+
+
+MOTION, RIDE = MotionLimits(), Ride()
 
 
 class MotionMonitor:
@@ -149,3 +161,48 @@ class MotionMonitor:
     def _down(self, tilt: Tilt) -> Floats3:
         """Return gravity's unit vector (3,) in the arm's base frame, for an arm with axes in its root link's axes."""
         return tilt.gravity_in_trunk if self._limits.axes else tilt.direction
+
+
+class RideThrough:
+    """For a moment the last efforts, and damping that rises, hold the arm as well as new efforts would.
+
+    A compensator that is late on a busy computer, or whose tilt is late, needs no descent. While efforts are older than
+    `timeout` (s), or computed from a late tilt, the motors apply the newest ones, and their damping rises as in a
+    descent; once the efforts are sound again it falls. The ride ends in a fault once it is too long, efforts are too
+    old, or they have been late too often: ordinary computers are late for less than `RIDE.recovery` of the time. Up to
+    `RIDE.longest_age` an arm that moves on at 1 rad/s makes the torque wrong by 18 % of gravity's largest.
+
+    is_riding: whether efforts are late and still used.
+    rides: how often that began.
+    why: of the last ride.
+    ended: s, when it was last going on.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.is_riding = False
+        self.rides = 0
+        self.why, self.ended = "", -math.inf
+        self._timeout = timeout
+        self._left = RIDE.longest
+
+    def step(self, now: float, dt: float, age: float, held: bool) -> Fault | None:
+        """Take the age of the newest efforts; return a fault if they can no longer be used.
+
+        now: s.
+        dt: s that the loop ran since the last call.
+        age: s, of the efforts.
+        held: whether they are computed from a late tilt.
+        """
+        if age <= self._timeout and not held:
+            self.is_riding = False
+            self._left = min(RIDE.longest, self._left + RIDE.recovery * dt)
+            return None
+        self.rides += not self.is_riding
+        self.is_riding, self.ended = True, now
+        self._left = max(0.0, self._left - dt)
+        self.why = f"efforts {1000.0 * age:.0f} ms old" + (", of a tilt that is late" if held else "")
+        if self._left > 0.0 and age <= RIDE.longest_age:
+            return None
+        self.is_riding = False
+        limit = f"{1000.0 * self._timeout:.0f} ms, or {1000.0 * RIDE.longest:.0f} ms more for a moment"
+        return Fault(FaultCode.COMMAND_STALE, f"{self.why}: must be less than {limit}")
