@@ -29,7 +29,7 @@ HEARD = (False,) * 4
 FULL = LIMITS.driven_speed + BARRIER.span  # rad/s
 
 
-def barrier() -> Barrier:
+def barrier() -> Shaper:
     return Shaper(LIMITS, (DAMPING,) * 4)
 
 
