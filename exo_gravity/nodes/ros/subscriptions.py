@@ -16,7 +16,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -74,14 +74,6 @@ class PeriodicThread:
             self.failure = error
 
 
-class OutsideExecutor(ReentrantCallbackGroup):
-    """Keeps its subscriptions out of the executor's wait set."""
-
-    def can_execute(self, entity: Any) -> bool:
-        """Return False: the executor handles none of them."""
-        return False
-
-
 class PolledSubscription(PeriodicThread):
     """Calls `callback(message, info)` for each message of `topic`: on a thread after `start`, or in each `poll`.
 
@@ -102,9 +94,11 @@ class PolledSubscription(PeriodicThread):
         super().__init__(topic, lambda: self.poll(STOP_CHECK_PERIOD), pause)
         self._callback, self._depth = callback, qos.depth
         self._wait_set = rclpy_implementation.WaitSet(1, 0, 0, 0, 0, 0, node.context.handle)
+        group = MutuallyExclusiveCallbackGroup()
         self._subscription = node.create_subscription(
-            msgtype, topic, lambda message: None, qos, callback_group=OutsideExecutor(), raw=raw
+            msgtype, topic, lambda message: None, qos, callback_group=group, raw=raw
         )
+        group.beginning_execution(self._subscription)  # which never ends: the executor handles none of its messages
 
     def poll(self, timeout: float = 0.0) -> None:
         """Call back for each queued message, on the caller's thread; wait up to `timeout` s for the first one.
