@@ -61,7 +61,7 @@ CALLS = {
     "/recorder": {node: READ for node in NODES if node != "/recorder"},
     "/panel": {
         **{node: READ for node in NODES if node != "/panel"},
-        "can_bridge": READ | OPERATION | {"change_state", "get_state"},
+        "can_bridge": READ | OPERATION | {"change_state"},
         "compensator": READ | {"set_parameters_atomically", "weigh"},
         "simulator": READ | {"set_parameters_atomically"},
     },

@@ -33,7 +33,7 @@ from exo_gravity.sim.judge import MAX_SPEED, measure
 
 from ..support import CONFIG
 from ..support.launched_nodes import REAL, LaunchedNodes, children, executable, full_name
-from ..support.ros_probe import RosProbe, Timeout
+from ..support.ros_probe import RosProbe
 from ..support.truth import Truth
 from .fault_case import BEFORE, PROCESS_REACTION, RECOVERY, Action, Arm, FaultCase, Parameters, in_turn, pause
 from .virtual_cases import ON_V3, SEVEN, Steps
@@ -137,7 +137,7 @@ class ProcessRig:
     def bring_to(self, stage: str) -> None:
         """Clear what the last fault left and bring the arm to `stage`: "active" or "letting down".
 
-        Raises Timeout after `CARRY_LIMIT`.
+        Raises AssertionError after `CARRY_LIMIT`.
         """
         probe = self.probe
         if self.left is not None:
@@ -192,7 +192,7 @@ class ProcessRig:
 
     def run_until(self, condition: Callable[[], object], timeout: float) -> bool:
         """Wait until `condition()` holds; return whether it does within `timeout` s."""
-        with contextlib.suppress(Timeout):
+        with contextlib.suppress(AssertionError):
             self.probe.wait_until(condition, timeout)
         return bool(condition())
 

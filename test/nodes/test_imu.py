@@ -174,7 +174,7 @@ def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node_and_i
 
 
 def test_every_sample_gives_tilt_rate_and_acceleration_in_the_trunks_axes_with_the_covariance(imu):
-    expected, in_trunk, estimator, motion = {}, {}, TrunkEstimator(MOUNTING), bowing_and_walking(10.0)
+    expected, in_trunk, estimator, motion = {}, {}, TrunkEstimator(MOUNTING), bowing_and_walking(5.0)
     for moment, *values in zip(1000.0 + motion.times, motion.gyroscope, motion.accelerometer, strict=True):
         stamp = round(moment * 1e9)
         in_imu = (TRUNK_FROM_IMU.inv().apply(value).tolist() for value in values)
@@ -209,7 +209,7 @@ def test_a_refusal_and_silence_are_errors_without_a_tilt_until_the_estimate_has_
     assert round((stamp + 0.8) * 1e9) not in imu.tilts
 
 
-@pytest.mark.parametrize("orientation", [(0.0,) * 4, (math.nan,) * 4])
+@pytest.mark.parametrize("orientation", [(0.0,) * 4, pytest.param((math.nan,) * 4, marks=pytest.mark.thorough)])
 def test_an_orientation_that_the_driver_does_not_have_is_fused_and_values_without_covariance_are_passed_on(
     imu, orientation
 ):

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -24,17 +24,16 @@ InvalidHandle = rclpy_implementation.InvalidHandle
 class NodeThread:
     """Nodes with these names in a separate context, which a thread spins from `start` until `close`.
 
-    after_spin: called on that thread whenever something may have arrived. options: those of `create_node`.
+    options: those of `create_node`.
     """
 
-    def __init__(self, *names: str, after_spin: Callable[[], object] = lambda: None, **options: Any) -> None:
+    def __init__(self, *names: str, **options: Any) -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.nodes = [rclpy.create_node(name, context=self.context, **options) for name in names]
         self.executor = SingleThreadedExecutor(context=self.context)
         for node in self.nodes:
             self.executor.add_node(node)
-        self._after_spin = after_spin
         self._closing = False
         self._thread = threading.Thread(target=self._spin, daemon=True)
 
@@ -45,7 +44,6 @@ class NodeThread:
         while not self._closing:
             with suppress(InvalidHandle):  # a test has just destroyed a publisher
                 self.executor.spin_once(timeout_sec=0.1)
-            self._after_spin()
 
     def close(self) -> None:
         self._closing = True

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,15 +24,12 @@ from exo_gravity.hardware.network import keep_to_this_machine
 from . import CONFIG
 from .keys import broken, documented
 from .node_thread import NodeThread
+from .waiting import wait_until
 
 keep_to_this_machine()
 
 HOME = [0.0, 0.05, 0.05, 0.05]  # rad, hanging and within the limits
 HELP_TIME = 20.0  # s for which config/home.yaml holds the arm: a joint with little friction swings out of its limits
-
-
-class Timeout(AssertionError):
-    """A condition did not hold in time."""
 
 
 class RosProbe:
@@ -46,7 +42,7 @@ class RosProbe:
     def __init__(self, arm: str = "/right") -> None:
         self.arm = arm
         self.home_script: Path = CONFIG / "home.yaml"  # that of the paper's arm
-        self._thread = NodeThread("ros_probe", after_spin=self._notify)
+        self._thread = NodeThread("ros_probe")
         self.context, self.executor, (self.node,) = self._thread.context, self._thread.executor, self._thread.nodes
         self.close = self._thread.close
         self.joint_states: list[JointState] = []
@@ -61,12 +57,7 @@ class RosProbe:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         self._clients: dict[str, Any] = {}
         self._deadline = float("inf")
-        self._news = threading.Condition()
         self._thread.start()
-
-    def _notify(self) -> None:
-        with self._news:
-            self._news.notify_all()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -102,15 +93,11 @@ class RosProbe:
         return self.diagnostic("can_bridge", "fault")
 
     def wait_until(self, condition: Callable[[], Any], timeout: float = 60.0) -> None:
-        """Wait until `condition()` holds. Raises Timeout after `timeout` s, or earlier within a `time_limit`."""
-        deadline = min(time.monotonic() + timeout, self._deadline)
-        with self._news:
-            while not condition():
-                assert not self._broken, self._broken[:10]
-                if time.monotonic() > deadline:
-                    messages = {name: status.message for name, status in self.statuses.items()}
-                    raise Timeout(f"the condition did not hold in time; diagnostics: {messages}")
-                self._news.wait(0.01)  # not every condition is about ROS messages
+        """Wait until `condition()` holds; fail after `timeout` s, or earlier within a `time_limit`."""
+        limit = min(timeout, self._deadline - time.monotonic())
+        said = lambda: {name: status.message for name, status in self.statuses.items()}  # noqa: E731
+        wait_until(condition, timeout=limit, seen=said)
+        assert not self._broken, self._broken[:10]
 
     @contextmanager
     def time_limit(self, seconds: float) -> Iterator[None]:

@@ -18,8 +18,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
 from geometry_msgs.msg import Vector3Stamped
-from lifecycle_msgs.msg import State, Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.client import Client
@@ -78,10 +78,6 @@ ASKED = {  # service and request for each request of a page; None for the parame
     "set": (SetParametersAtomically, f"{COMPENSATOR}/{SET}", None),
     "perform": (SetParametersAtomically, f"{SIMULATOR}/{SET}", None),  # of no page
 }
-STEPS = {  # from the state of a bridge that waits for its operator to the one in which it drives its motors
-    State.PRIMARY_STATE_UNCONFIGURED: (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE),
-    State.PRIMARY_STATE_INACTIVE: (Transition.TRANSITION_ACTIVATE,),
-}
 
 
 class ArmClient:
@@ -93,24 +89,19 @@ class ArmClient:
             for kind, (srv, leaf, _) in ASKED.items()
         }
         self.settings = node.create_client(GetParameters, f"/{name}/{COMPENSATOR}/get_parameters")
-        self._lifecycle = node.create_client(GetState, f"/{name}/{BRIDGE}/get_state")
         self._transitions = node.create_client(ChangeState, f"/{name}/{BRIDGE}/change_state")
         self.control = node.create_publisher(KeyValue, f"/{name}/{BRIDGE}/control", 10)
         self.joints = Latest(node, JointState, f"/{name}/joint_states", joint_rows)
 
     async def activate(self) -> str:
-        """Configure the bridge if it is not, and activate it, which enables the arm; return '' or why not."""
+        """Configure the bridge, unless it is, and activate it, which enables the arm; return '' or why not."""
         try:
-            state = (await answer_of(self._lifecycle, GetState.Request())).current_state
-            if state.id not in STEPS:
-                return f"the bridge does not wait for its operator: it is {state.label}"
-            for step in STEPS[state.id]:
+            for step in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
                 request = ChangeState.Request(transition=Transition(id=step))
-                if not (await answer_of(self._transitions, request, TIMING.transition_timeout)).success:
-                    return "the bridge could not be activated: its log says why"
+                answer = await answer_of(self._transitions, request, TIMING.transition_timeout)
         except ExoGravityError as error:
             return str(error)
-        return ""
+        return "" if answer.success else "the bridge could not be activated: it is active, or its log says why"
 
 
 class Arms:
