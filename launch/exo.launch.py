@@ -5,12 +5,14 @@ A namespace and remappings that a file pushes which includes this one (PushRosNa
 `ros2 launch` is killed the launcher lets the arms down: it watches its standard input.
 """
 
+import signal
 import sys
 
 from launch import LaunchContext, LaunchDescription, LaunchDescriptionEntity
-from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction
-from launch.events import Shutdown
-from launch.events.process import ProcessExited
+from launch.actions import DeclareLaunchArgument, EmitEvent, ExecuteProcess, OpaqueFunction, RegisterEventHandler
+from launch.event_handlers import OnShutdown
+from launch.events import Shutdown, matches_action
+from launch.events.process import ProcessExited, SignalProcess
 from launch.substitutions import LaunchConfiguration
 
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
@@ -72,7 +74,9 @@ def _start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         sigkill_timeout=str(TIMEOUT),
         on_exit=_on_exit,
     )
-    return [launcher]
+    # An interrupt of `ros2 launch` alone reaches no process.
+    end = EmitEvent(event=SignalProcess(signal_number=signal.SIGTERM, process_matcher=matches_action(launcher)))
+    return [RegisterEventHandler(OnShutdown(on_shutdown=[end])), launcher]
 
 
 def generate_launch_description() -> LaunchDescription:

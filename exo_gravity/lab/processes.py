@@ -71,7 +71,7 @@ def program(module: str, name: str) -> list[str]:
 
     It looks for no file in a folder: python-can installs an executable `can_bridge` too.
     """
-    return [sys.executable, str(Path(exo_gravity.__file__).with_name("__main__.py")), module, name]
+    return [sys.executable, str(Path(exo_gravity.__file__).with_name("executable.py")), module, name]
 
 
 def command_of(node: str, module: str = "") -> list[str]:

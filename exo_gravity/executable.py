@@ -1,5 +1,5 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Runs `main` of a module as an executable: `python exo_gravity/__main__.py MODULE NAME [ARGUMENTS]`.
+"""Runs `main` of a module as an executable: `python exo_gravity/executable.py MODULE NAME [ARGUMENTS]`.
 
 EXO_GRAVITY_DELAY: s to wait before.
 """
