@@ -186,29 +186,14 @@ def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day(run):
     assert "Protocol: pilot" in page and "Note: - stiff" in page
 
 
-def thirteen(poses=13):
-    content = yaml.safe_load((CONFIG / "trials" / "thirteen_poses.yaml").read_text())
-    steps = [{"hold": 2.5} if "hold" in step else step for step in content["steps"][: 2 * poses]]
-    return {"name": "thirteen", "steps": steps}
-
-
 @pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
 def test_the_packaged_arm_drifts_less_than_a_fifth_of_a_degree_per_minute_in_all_thirteen_poses(run):
-    ended, folder = run("--offline", script=thirteen())
+    content = yaml.safe_load((CONFIG / "trials" / "thirteen_poses.yaml").read_text())
+    steps = [{"hold": 2.5} if "hold" in step else step for step in content["steps"]]
+    ended, folder = run("--offline", script={"name": "thirteen", "steps": steps[: 2 * 13]})
     rates = np.abs(column(folder, "drift_deg_per_min"))
     assert ended.code == 0 and len(rates) == 4 * 13 and max(rates) < 0.2
-
-
-@pytest.mark.usefixtures("without_pictures")
-@pytest.mark.thorough
-def test_with_masses_a_tenth_off_and_half_the_friction_the_report_names_the_poses_that_give_way(run):
-    masses = [round(1.1 * mass, 4) for mass in (0.585, 0.468, 0.598, 0.203)]
-    heavy = {"robot": {"mass": masses, "cog": [0.046, 0.113, 0.237, 0.128]}}
-    slippery = {"friction": {"coulomb": [0.1, 0.2, 0.1, 0.1]}}
-    ended, _ = run("--offline", script=thirteen(poses=4), compensator=heavy, simulator=slippery)
-    assert ended.code == 1 and "It did not hold." in ended.out
-    assert ended.out.count("the arm was still moving at the end of a hold") > 1
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -228,7 +213,6 @@ BOW, HOLD = {"bow": math.radians(30.0), "over": 3.0}, {"hold": 1.0}
 TRUNK = {  # the trunk's motion, whether its acceleration is compensated, and how far the arm moves in degrees
     "bow": ((BOW, HOLD), True, 0.0, 2.0),
     "walk": (({"walk": 6.0}, HOLD), True, 0.0, 3.0),
-    "bow, tilt alone": ((BOW, HOLD), False, 0.0, 2.0),
     "walk, tilt alone": (({"walk": 4.0},), False, 5.0, math.inf),
 }
 
