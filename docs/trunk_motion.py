@@ -21,8 +21,7 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.lab.trial.from_file import trunk_imu
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
+from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial, trunk_imu
 from exo_gravity.sim import ArmConfig, ImuConfig, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.script import TrialScript
 

@@ -1,6 +1,9 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The torque budget: the gravity torque on each motor over the whole workspace, compared with the motor's limits.
 
+It is given as a table, a verdict, and a map for each joint. Holding an arm up is continuous work, so rated torque
+decides; peak torque lasts for seconds.
+
 The workspace is every pose within the joint limits at every trunk tilt up to a bound. Gravity's torque is linear in the
 masses (M1..M4 of `gravity.py`), hence in the support s of the wearer's arm: tau = tau_robot + s tau_wearer. The largest
 s that keeps a joint within its limit in a pose, |tau_robot + s tau_wearer| <= limit, is therefore a quotient.
@@ -10,19 +13,29 @@ these and improves one coordinate after another until nothing gets worse.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import product
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.springs import Springs
+from exo_gravity.core.arm.wearer import PAPER_LINKS, LinkLoad, Wearer
+from exo_gravity.core.compensation.settings import joint_spring_of
+from exo_gravity.core.errors import named
 from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import scale_at
 from exo_gravity.core.numbers import Vector, floats
 from exo_gravity.core.safety.limits import HEAT
+from exo_gravity.core.safety.explain import GRAVITY
+from exo_gravity.lab.inputs.arms import ConfiguredArm
+from exo_gravity.lab.moments import chain_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Cost = Callable[[np.ndarray], np.ndarray]  # points (m, n + 2) -> (m, n)
 
@@ -32,6 +45,15 @@ STARTS = 5  # poses from which the worst one is sought, because a search can end
 CHUNK = 2_000  # poses, about 1 ms of computation
 TOLERANCE = 1e-3  # Nm, or support; smaller differences are irrelevant to a motor
 STEPS = np.array(sorted(np.linspace(-1.0, 1.0, 21), key=abs))  # 0 comes first, so that the search stays put at a tie
+JOINTS = ("shoulder rotation", "shoulder abduction", "shoulder flexion", "elbow flexion")
+HEADINGS = (
+    ("", "", "rated", "peak", "needs", "within", "within", "", "support", "motor that"),
+    ("joint", "motor", "Nm", "Nm", "Nm", "rated", "peak", "worst pose; pitch, roll (deg)", "within rated", "would do"),
+)
+LINE = "  {:<22}{:<8}{:>7}{:>7}{:>8}{:>10}{:>10}   {:<32}{:>12}{:>12}"
+CELLS = 31  # of a map, along each axis
+REST = 5  # values of each angle that a map does not show
+MOST_RESTS, RANDOM_RESTS = 625, 200  # poses of the angles that a map does not show: at random if a grid has more
 
 
 def motor_for(torque: float) -> str | None:
@@ -114,24 +136,6 @@ def torque_at(arm: Arm, points: np.ndarray) -> np.ndarray:
 
 def budget(
     robot: Arm,
-    load: tuple[Vector, Vector],
-    spring: Springs,
-    support: float,
-    bounds: np.ndarray,
-    rated: Vector,
-    peak: Vector,
-) -> tuple[JointBudget, ...]:
-    """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
-
-    load: mass (n,) in kg and centre of gravity (n,) in m of the wearer's arm on each link, e.g. a `LinkLoad`. spring:
-    the device's own. bounds: of the workspace, (2, n + 2) rad. rated, peak: (n,) Nm at the joints. Raises
-    ParameterError if the load does not fit the robot.
-    """
-    return budget_worn(robot, robot.with_wearer(*load), (spring, Springs()), support, bounds, rated, peak)
-
-
-def budget_worn(
-    robot: Arm,
     full: Arm,
     springs: tuple[Springs, Springs],
     support: float,
@@ -139,19 +143,20 @@ def budget_worn(
     rated: Vector,
     peak: Vector,
 ) -> tuple[JointBudget, ...]:
-    """Return the same where `full` is the robot with the wearer's whole arm. springs: the device's and the wearer's."""
+    """Return the budget of each joint of `robot` when it carries a share `support` (0..1) of a wearer's arm.
+
+    full: the robot with the wearer's whole arm. springs: the device's and the wearer's. bounds: of the workspace,
+    (2, n + 2) rad. rated, peak: (n,) Nm at the joints.
+    """
     (spring, tissue), count = springs, len(rated)
 
     def torques(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques (m, n) in Nm of robot and springs, and what the wearer's arm adds."""
-        chunks = []
-        for chunk in np.array_split(points, len(points) // CHUNK + 1):
-            chunks.append((torque_at(robot, chunk), torque_at(full, chunk)))
-        own, with_all = map(np.concatenate, zip(*chunks, strict=True))
-        theta, added = points[:, :count], with_all - own
-        if tissue.on:
-            added = added + tissue.torques(theta)
-        return own + spring.torques(theta), added
+        chunks = np.array_split(points, len(points) // CHUNK + 1)
+        own, with_all = (np.concatenate([torque_at(arm, chunk) for chunk in chunks]) for arm in (robot, full))
+        theta = points[:, :count]
+        more = tissue.torques(theta) if tissue.on else 0.0
+        return own + spring.torques(theta), with_all - own + more
 
     points = np.random.default_rng(0).uniform(bounds[0], bounds[1], (SAMPLES, count + 2))
     upright = np.repeat((1.0, 0.0), (count, 2))
@@ -208,3 +213,128 @@ def _worst(
         if cost(simpler[None])[0, joint] >= largest - TOLERANCE:
             best = simpler
     return best, largest
+
+
+@dataclass(frozen=True)
+class ArmBudget:
+    """What each joint of an arm needs to carry its wearer's arm."""
+
+    name: str  #: of the arm's namespace
+    joint_names: Sequence[str]
+    carrying: Arm  #: with its share of the wearer's arm
+    support: float  #: 0..1, that share
+    motors: Sequence[str]
+    bounds: np.ndarray  #: of its workspace, (2, n + 2) rad
+    joints: tuple[JointBudget, ...]
+
+    @property
+    def is_beyond(self) -> bool:
+        """Whether a joint needs more than rated torque somewhere."""
+        return any(joint.torque > joint.rated for joint in self.joints)
+
+
+def arm_budget(
+    configured: ConfiguredArm, wearer: Wearer | None, support: float, max_tilt: float, payload: float
+) -> ArmBudget:
+    """Return the budget of an arm that carries `support` (0..1) of the wearer's arm and `payload` kg in the hand.
+
+    wearer: None if nobody wears it. max_tilt: of the trunk, rad. Raises ParameterError if the wearer does not fit the
+    robot.
+    """
+    values, motors = configured.compensator, configured.can_bridge["motor"]
+    names = configured.joint_names if configured.by_urdf else JOINTS
+    bounds = workspace(configured.low, configured.high, max_tilt)
+    with named(f"{configured.namespace}/compensator "):
+        robot = configured.robot.with_payload(payload, values["payload.cog"])
+        links, count = values.get("wearer.links", PAPER_LINKS), len(configured.joint_names)
+        load = LinkLoad(np.zeros(count), np.zeros(count))
+        if wearer and any(links):
+            load = wearer.on_links(configured.robot.length, links)
+        torques = motor_torques(configured.can_bridge)
+        springs = joint_spring_of(values), Springs()
+        joints = budget(robot, robot.with_wearer(*load), springs, support, bounds, *torques)
+        carrying = robot.with_wearer(*load, support)
+    return ArmBudget(configured.namespace, names, carrying, support, motors, bounds, joints)
+
+
+def table_lines(arm: ArmBudget) -> Iterator[str]:
+    """Yield the lines of a table with one row per joint."""
+    yield from (LINE.format(*heading).rstrip() for heading in HEADINGS)
+    for number, joint in enumerate(arm.joints):
+        *pose, pitch, roll = (f"{angle:.0f}" for angle in np.degrees(joint.worst) + 0.0)  # + 0.0: no minus zero
+        yield LINE.format(
+            f"{number + 1} {arm.joint_names[number]}",
+            arm.motors[number],
+            f"{joint.rated:.3g}",
+            f"{joint.peak:.3g}",
+            f"{joint.torque:.2f}",
+            f"{100 * joint.within_rated:.1f} %",
+            f"{100 * joint.within_peak:.1f} %",
+            f"{', '.join(pose)}; {pitch}, {roll}",
+            "none" if joint.support is None else f"{joint.support:.3f}",
+            motor_for(joint.torque) or "none",
+        )
+
+
+def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
+    """Yield the conclusion on `what` the arms `names` carry, the support that fits, and can_bridge's parameter."""
+    if arm.is_beyond:
+        yield f"{what} is beyond the motors of {names}."
+        yield "A larger motor is heavier and loads the joints before it: change the masses and run this again."
+        yield "The wearer can hardly move an AK80-64 by hand: its gear is 64:1."
+    else:
+        yield f"{what} is within rated torque everywhere on {names}."
+    fits = largest_support(arm.joints)
+    if fits is None:
+        yield "The robot alone needs more than rated torque somewhere: no support stays within it."
+    elif arm.support:
+        yield f"The largest support within rated torque everywhere is {fits:g}."
+    skeleton = chain_of(arm.carrying).skeleton()
+    if skeleton is None:  # no single chain, of which the can_bridge judges no efforts
+        return
+    yield f"For the can_bridge of {names}, if it never carries more; add what assistance and terms may add:"
+    rows = {
+        "largest_moment": np.ceil(1000.0 * skeleton.moments) / 1000.0,  # kg m
+        "largest_addition": np.ceil(100.0 * GRAVITY * skeleton.beside) / 100.0,  # Nm
+        **{f"axis_{name}": column for name, column in zip("xyz", skeleton.axes.T, strict=True)},
+        **{f"link_{name}": column for name, column in zip("xyz", skeleton.ways.T, strict=True)},
+    }
+    for name, values in rows.items():
+        if len(values):
+            yield f"    {name}: {(values.round(4) + 0.0).tolist()}"
+
+
+def joint_figure(arm: ArmBudget, joint: int) -> "Figure":
+    """Map the largest torque of a joint (from 0) over two angles: the maximum over the others and the trunk's tilt."""
+    from matplotlib.figure import Figure
+
+    count = len(arm.joints)
+    other = joint + 1 if joint + 1 < count else joint - 1 if joint else 1  # the next, the one before, or the pitch
+    if REST ** (len(arm.bounds.T) - 2) > MOST_RESTS:
+        points = np.random.default_rng(0).uniform(arm.bounds[0], arm.bounds[1], (RANDOM_RESTS, len(arm.bounds.T)))
+    else:
+        axes = [np.linspace(low, high, REST) for low, high in arm.bounds.T]
+        axes[joint] = axes[other] = np.zeros(1)
+        points = np.array(list(product(*axes)))
+    rest = np.vstack((points, arm.joints[joint].worst))
+    across, up = (np.linspace(low, high, CELLS) for low, high in arm.bounds.T[[joint, other]])
+    points = np.tile(rest, (CELLS * CELLS, 1))
+    grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+    points[:, [joint, other]] = np.repeat(grid, len(rest), axis=0)
+    torque = np.abs(torque_at(arm.carrying, points)[:, joint])
+    largest = torque.reshape(CELLS, CELLS, len(rest)).max(axis=-1)
+    figure = Figure(figsize=(6.5, 5.2), layout="constrained")
+    axis = figure.subplots()
+    angles = np.degrees(across), np.degrees(up)
+    mesh = axis.pcolormesh(*angles, largest, cmap="cividis", vmin=0.0, shading="gouraud")
+    figure.colorbar(mesh, ax=axis, label=f"Largest torque at support {arm.support:g} (Nm)")
+    for limit, style in ((arm.joints[joint].rated, "-"), (arm.joints[joint].peak, ":")):
+        if largest.min() < limit < largest.max():
+            axis.clabel(axis.contour(*angles, largest, [limit], colors="red", linestyles=style), fmt=f"{limit:g} Nm")
+    axis.set_title(
+        f"{arm.name} joint {joint + 1}, {arm.joint_names[joint]}: {arm.motors[joint]}", loc="left", weight="bold"
+    )
+    axis.set_xlabel(f"Joint {joint + 1} (deg)")
+    second = f"Joint {other + 1}" if other < count else "Trunk's pitch"
+    axis.set_ylabel(f"{second} (deg); maximum over the other joints and the trunk's tilt")
+    return figure

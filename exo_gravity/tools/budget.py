@@ -14,8 +14,7 @@ from pathlib import Path
 
 from exo_gravity.core.arm.wearer import SEX, TABLES, TYPICAL_LENGTH, Wearer
 from exo_gravity.core.numbers import one_float
-from exo_gravity.lab.arm_budget import ArmBudget, arm_budget, joint_figure, table_lines, verdict
-from exo_gravity.lab.budget import USUAL_TILT
+from exo_gravity.lab.budget import USUAL_TILT, ArmBudget, arm_budget, joint_figure, table_lines, verdict
 from exo_gravity.lab.inputs.arms import configured_arms
 from exo_gravity.lab.report.html import png_of
 from exo_gravity.tools.cli import exit_code

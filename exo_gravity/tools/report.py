@@ -98,7 +98,7 @@ def _run(options: argparse.Namespace) -> int:
     report = trial_report.analyse(bag, criteria, options.min_hold)
     written = trial_report.write(report, options.output or beside, options.figures, options.csv)
     if clip:
-        video.write(bag, clip, screen)
+        clip.write(bag, screen)
     trial_report.print_report(report)
     print(f"Written: {', '.join(path.name for path in written)} in {written[0].parent}")
     return report.exit_code
@@ -111,6 +111,7 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
     from exo_gravity.lab.bag.storage import check_name
     from exo_gravity.lab.parallel import in_processes, on_cluster
     from exo_gravity.lab.report import cohort, overview
+    from exo_gravity.lab.report.table import write_rows
 
     found = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
     recordings = [*{one.resolve(): one for one in found}.values()]  # one that is named twice is one trial
@@ -131,7 +132,7 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
     ):
         task = progress.add_task("", total=len(recordings))
         rows, known = cohort.summaries(recordings, judging, cache, run, lambda: progress.advance(task))
-    cohort.write_csv(output / "cohort.csv", rows)
+    write_rows(output / "cohort.csv", rows)
     trials = overview.trials_of(rows)
     name = options.bag[0].resolve().stem if len(options.bag) == 1 else f"{len(recordings)} recordings"
     (output / "cohort.html").write_text(overview.page(trials, name), encoding="utf-8")

@@ -52,10 +52,8 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
     tell: Callable[..., None] = _print_json if options.attach else lambda **values: None
     stopped = stop_on_signals()
     if options.offline:
-        if clip:
-            os.environ["MUJOCO_GL"] = video.backend()  # before the simulated device imports MuJoCo
         with extras("trial", "sim"):
-            from exo_gravity.lab.trial.from_file import record_offline
+            from exo_gravity.lab.trial.offline import record_offline
         end = record_offline(trial, console, stopped.is_set)
     else:
         trial.prepare()
@@ -76,7 +74,7 @@ def _run(options: argparse.Namespace, params: Path, clip: video.Clip | None, con
         if not options.attach:
             trial_report.print_report(report)
         if clip:
-            video.write(bag, clip, console)
+            clip.write(bag, console)
     log = "" if options.offline else ", log"
     console.print(f"Report, recording{log} and parameters: {folder}", markup=False, soft_wrap=True)
     if trouble:

@@ -15,12 +15,14 @@ from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE
-from exo_gravity.lab.arm_budget import arm_budget, joint_figure, table_lines
 from exo_gravity.lab.budget import (
+    arm_budget,
     budget,
+    joint_figure,
     motor_for,
     motor_torques,
     overload,
+    table_lines,
     torque_at,
     workspace,
 )
@@ -33,6 +35,7 @@ from ..support.urdf_oracle import WornMujocoArm
 LINKS = (0.05, 0.13, 0.30, 0.30)
 ROBOT = ArmModel(LINKS, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))
 LOAD = Wearer(75.0).on_links(LINKS)
+WORN, SLACK = ROBOT.with_wearer(*LOAD), (Springs(), Springs())
 LOW, HIGH = (-1.65, -0.17, -0.78, -0.17), (1.65, 3.14, 2.53, 3.14)
 BUS = {"can.interface": "virtual", "can.channel": "budget"}
 RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)
@@ -40,7 +43,9 @@ RATED, PEAK = (3.0, 9.0, 3.0, 3.0), (9.0, 18.0, 9.0, 9.0)
 
 @functools.cache
 def needs(support=1.0, tilt=20.0, rated=RATED, peak=PEAK, robot=ROBOT):
-    return budget(robot, LOAD, Springs(), support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak)
+    return budget(
+        robot, robot.with_wearer(*LOAD), SLACK, support, workspace(LOW, HIGH, math.radians(tilt)), rated, peak
+    )
 
 
 @pytest.mark.parametrize("support", [0.0, 0.4, 1.0])
@@ -89,7 +94,7 @@ def test_an_arm_that_bends_the_other_way_gets_the_same_support():
     flexion = (-1.65, -0.17, 0.3, -0.17), (1.65, 0.5, 2.53, 3.14)  # gravity always pulls joint 3 in the same direction
     other_way = tuple(-angle for angle in flexion[1]), tuple(-angle for angle in flexion[0])
     one, other = (
-        budget(ROBOT, LOAD, Springs(), 1.0, workspace(*limits, 0.1), RATED, PEAK)[2] for limits in (flexion, other_way)
+        budget(ROBOT, WORN, SLACK, 1.0, workspace(*limits, 0.1), RATED, PEAK)[2] for limits in (flexion, other_way)
     )
     assert other.support == pytest.approx(one.support, abs=2e-3)
 
@@ -101,9 +106,9 @@ def test_strong_motors_support_the_whole_arm_and_none_if_the_robot_alone_needs_m
 
 
 def test_the_devices_own_springs_count():
-    tensed = Springs((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -1.0))
+    tensed = Springs((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -1.0)), Springs()
     bounds = workspace(LOW, HIGH, 0.0)
-    plain, sprung = (budget(ROBOT, LOAD, one, 1.0, bounds, RATED, PEAK)[3] for one in (Springs(), tensed))
+    plain, sprung = (budget(ROBOT, WORN, one, 1.0, bounds, RATED, PEAK)[3] for one in (SLACK, tensed))
     points = np.random.default_rng(2).uniform(LOW, HIGH, (20_000, 4))
     torque = gravity_torque(ROBOT.with_wearer(*LOAD), points)[:, 3] + 0.5 * (points[:, 3] + 1.0)
     assert plain.torque < np.abs(torque).max() <= sprung.torque + 2e-3

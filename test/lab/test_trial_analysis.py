@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 
 from exo_gravity.core.errors import DataError
-from exo_gravity.lab.report.smoothness import LEAST, spectral_arc_length
+from exo_gravity.lab.report.cohort import LEAST, spectral_arc_length
 from exo_gravity.lab.trial.analysis import HoldCriteria, analyse, failures
 from exo_gravity.lab.trial.recording import ARRAYS, ScriptedStep
 

@@ -21,7 +21,7 @@ from exo_gravity.core import Tilt, gravity_torque
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.lab import processes
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.lab.trial.offline import simulated_trials
 from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, to_nanoseconds
 from exo_gravity.sim.script import TrialScript
 

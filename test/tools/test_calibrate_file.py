@@ -35,7 +35,7 @@ from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
-from exo_gravity.lab.trial.from_file import simulated_trials
+from exo_gravity.lab.trial.offline import simulated_trials
 from exo_gravity.sim.script import TrialScript
 
 from ..support import CONFIG

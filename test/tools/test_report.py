@@ -7,10 +7,14 @@ import base64
 import io
 import json
 import math
+import os
 import re
 import shutil
+import signal
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -31,6 +35,7 @@ from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.bag.writer import repair
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import load
+from exo_gravity.lab.parallel import on_cluster
 from exo_gravity.lab.report import cohort, figures, html, wearer_share
 from exo_gravity.lab.report.trial_report import STAMPS, analyse, print_report, write, write_empty
 from exo_gravity.lab.trial.analysis import HoldCriteria
@@ -72,15 +77,11 @@ def printed(report):
     return " ".join(console.file.getvalue().split())
 
 
-class Page:
-    """The report's page in `folder`: its source, which is well-formed, its text and what it refers to."""
-
-    def __init__(self, folder):
-        self.source = (folder / "report.html").read_text(encoding="utf-8")
-        root = ElementTree.fromstring(re.sub(r"<(meta|img|br)\b([^>]*)>", r"<\1\2/>", self.source))
-        self.text = "".join(root.itertext())
-        given = [item for element in root.iter() for item in element.items()]
-        self.references = [value for name, value in given if name in ("src", "href", "srcset", "data")]
+def page_in(folder):
+    """Return the page in `folder`, which is well-formed: its source and its text."""
+    source = (folder / "report.html").read_text(encoding="utf-8")
+    root = ElementTree.fromstring(re.sub(r"<(meta|img|br)\b([^>]*)>", r"<\1\2/>", source))
+    return SimpleNamespace(source=source, text="".join(root.itertext()), root=root)
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def page_of(tmp_path, without_pictures):
 
     def page_of(report):
         write(report, tmp_path)
-        return Page(tmp_path)
+        return page_in(tmp_path)
 
     return page_of
 
@@ -122,9 +123,11 @@ def test_the_terminal_shows_every_hold_and_the_push_and_an_unknown_torque_error_
 
 
 def test_the_page_refers_to_nothing_outside_itself_and_its_pictures_are_the_png_files(held, folder):
-    page = Page(folder)
+    page = page_in(folder)
     assert "url(" not in page.source and f"<h1>{held.title}</h1>" in page.source
-    embedded = [base64.b64decode(ref.removeprefix("data:image/png;base64,")) for ref in page.references]
+    given = [item for element in page.root.iter() for item in element.items()]
+    references = [value for name, value in given if name in ("src", "href", "srcset", "data")]
+    embedded = [base64.b64decode(ref.removeprefix("data:image/png;base64,")) for ref in references]
     assert embedded == [(folder / "right_overview.png").read_bytes()]  # the joints stayed: no drift to draw
     picture = matplotlib.image.imread(folder / "right_overview.png")
     assert picture.shape[1] >= 1600 and picture[..., :3].std() > 0.05
@@ -201,7 +204,8 @@ def test_a_recording_without_a_hold_is_reported_with_figures_and_1_and_of_nothin
     assert report.exit_code == 1 and "never still" in page_of(report).text
     assert (tmp_path / "right_overview.png").exists()
     write_empty(tmp_path, "demo", "stopped by the operator")
-    assert "demo" in Page(tmp_path).text and "Nothing was recorded: stopped by the operator." in Page(tmp_path).text
+    text = page_in(tmp_path).text
+    assert "demo" in text and "Nothing was recorded: stopped by the operator." in text
 
 
 LIMITED = {  # what differs of the recording, which is carried until s; what is said, and the exit code
@@ -281,7 +285,7 @@ SOURCES = [(("virtual", "stage"), "simulated"), (("socketcan", "can0"), "real"),
 @pytest.mark.parametrize(("bridge", "source"), SOURCES)
 def test_page_rows_figures_and_terminal_say_where_the_numbers_come_from(page_of, tmp_path, bridge, source, monkeypatch):
     stamped = []
-    monkeypatch.setattr(html, "stamp", lambda figure, text: stamped.append(text))
+    monkeypatch.setattr(html, "saved", lambda *given: stamped.append(given[-1]) or b"")
     report = analyse(made.bag_of(WHOLE, parameters={"/right/can_bridge": BRIDGE.format(*bridge)}))
     text = page_of(report).text
     assert text.index(SAID[source]) < text.index(report.held) and f"source: {source}" in printed(report)
@@ -435,7 +439,7 @@ def test_the_share_of_the_recording_and_of_each_joint_is_found_and_said(share, i
     assert simulated == f"In the simulation, t{said[1:]}" and f"{100 * share:.0f} % of their arm's weight" in said
     assert not is_paper or ("not distinguishable from zero" in said) == (share == 0.0)
     assert "right_wearer.png" in [path.name for path in write(report, tmp_path)]
-    page = Page(tmp_path).text
+    page = page_in(tmp_path).text
     assert wearer_share.sentence(part, Source.UNKNOWN).split("(")[0] in page  # as this recording has it
     shown = [name for name, is_known in zip(recording.joint_names, known, strict=True) if is_known]
     assert all(f"{name} {100 * share:.0f} % (±" in page for name in shown)
@@ -512,7 +516,7 @@ def test_a_recording_is_read_again_where_its_content_or_the_criteria_change_and_
     cache.put(key, rows)
     with path.open("a") as stream:
         stream.write('["cut')
-    assert cohort.Cache(path, JUDGING).get(key) == rows
+    assert cohort.Cache(path, JUDGING).rows[key] == rows
     assert cohort.Cache(path, replace(JUDGING, min_hold=3.0)).key(bag) != key
     before = cohort.recordings_below(trials)
     copy, _ = repair(trials / "cut" / "bag")
@@ -522,6 +526,25 @@ def test_a_recording_is_read_again_where_its_content_or_the_criteria_change_and_
     data[len(data) // 2] ^= 1
     (tmp_path / "bag" / "bag.mcap").write_bytes(data)
     assert cache.key(tmp_path / "bag") != key
+
+
+@pytest.mark.thorough
+def test_when_a_worker_of_a_cluster_is_killed_no_recording_is_lost_and_none_is_there_twice(tmp_path):
+    from distributed import Client, LocalCluster  # a second of imports, which no other test needs
+
+    content = list(made.messages(drifting(1.0)))
+    recordings = [made.write_bag(tmp_path / f"more_{number}" / "bag", content) for number in range(8)]
+    expected = [row for recording in recordings for row in cohort.summary(str(recording), JUDGING)]
+    workers = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(host="127.0.0.1", **workers) as cluster, Client(cluster) as client:
+        running = sorted(client.run(os.getpid).values())[:1]
+
+        def done():  # the first recording is finished
+            while running:
+                os.kill(running.pop(), signal.SIGKILL)
+
+        run, cache = partial(on_cluster, cluster.scheduler_address), cohort.Cache(tmp_path / "cache.jsonl", JUDGING)
+        assert cohort.summaries(recordings, JUDGING, cache, run, done) == (expected, 0)
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(trials, monkeypatch, run_tool):

@@ -15,11 +15,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from subprocess import PIPE
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -29,64 +27,21 @@ from rich.console import Console
 from rosbags.rosbag2 import Reader
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
-from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import MIT
-from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab import processes
 from exo_gravity.lab.report import video as clips
 from exo_gravity.lab.trial import run as running
-from exo_gravity.lab.trial.from_file import trunk_imu
-from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen, describe
 from exo_gravity.lab.trial.scripted import analysed, read_script
-from exo_gravity.sim import ArmConfig, ImuConfig
 from exo_gravity.sim.script import Step, TrialScript
 from exo_gravity.tools import trial
 
 from ..support import CONFIG, csv_rows
 from ..support import synthetic_bags as made
 from ..support.launched_nodes import PORTS, LaunchedNodes
-from ..support.simulated_device import joints_of, make_device
 from ..support.waiting import PATIENCE
 
-FRICTION = 0.03  # Nm in each joint
 POSE = (0.0, 0.4, 0.5, 1.0)  # rad
-LENGTH = (0.05, 0.13, 0.30, 0.30)
-ROBOT = ArmModel(LENGTH, (0.046, 0.113, 0.237, 0.128), (0.585, 0.468, 0.598, 0.203))  # of config/exo.yaml
-TRUE = ArmModel(LENGTH, (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.198))  # of config/sim.yaml
-MOUNTING = (0.0, 0.0, 0.5**0.5, 0.5**0.5)
-RATE = 250.0  # Hz, that of exo.yaml
-JOINTS = ("rotation", "abduction", "flexion", "elbow")
-
-
-def trunk_trial(*steps: dict[str, Any], seed: int = 0, **settings: Any) -> OfflineTrial:
-    """Return a trial: the arm is brought to POSE and let go, and 1 s later `steps` begin."""
-    rated = (3.0, 9.0, 3.0, 3.0)
-    limits = Limits(
-        JOINTS,
-        (-1.65, -0.17, -0.78, -0.17),
-        (1.65, 3.14, 2.53, 3.14),
-        (5.0, 5.0, 5.0, 6.0),
-        rated,
-        sign_check_torque=0.0,
-    )
-    device = make_device(config=ArmConfig(TRUE, coulomb_friction=(FRICTION,) * 4))
-    trunk = trunk_imu(ImuConfig(MOUNTING, seed=seed), MOUNTING, RATE)
-    script = TrialScript.parse({"name": "trunk", "steps": [{"move": list(POSE), "over": 2.0}, {"hold": 1.0}, *steps]})
-    setup = ArmSetup("right", device, joints_of((MIT,) * 4), limits, Settings("right", ROBOT, **settings), RATE, trunk)
-    return OfflineTrial(setup, script, 3.0)
-
-
-def moved(recording: Recording, steps: Sequence[str]) -> float:
-    """Return by how many degrees a joint moved at most while the `steps` (actions) lasted, from their start."""
-    spans = [step for step in recording.steps if step.action in steps]
-    during = (recording.time >= spans[0].start) & (recording.time <= spans[-1].end)
-    position = np.degrees(recording.position[during])
-    return float(np.abs(position - position[0]).max())
-
-
 SHORT = {"name": "short", "steps": [{"move": [0.1, 0.6, 1.2, 0.5], "over": 2.0}, {"hold": 4.0}]}
 RATED = (3.0, 9.0, 3.0, 3.0)  # Nm
 
@@ -159,31 +114,24 @@ def column(folder, name):
     return [float(row[name]) for row in csv_rows(folder / "holds.csv")]
 
 
-def test_an_offline_trial_ends_with_a_report_of_its_recording(run, run_tool):
-    ended, folder = run("--offline")
+def test_an_offline_trial_of_a_subject_ends_with_a_report_of_its_recording_in_the_subjects_folder(run, run_tool):
+    ended, above = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
+    (folder,) = above.glob("*-*-*/short_*")
     report_files = {"holds.csv", "motions.csv", "report.html", "right_overview.png"}  # it held: no drift to draw
-    assert {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
+    assert above.name == "P01" and {path.name for path in folder.iterdir()} == {"params.yaml", "bag", *report_files}
     assert ended.code == 0 and "times real time" in ended.out and "It held." in ended.out
     np.testing.assert_allclose(column(folder, "pose_deg"), np.degrees(SHORT["steps"][0]["move"]), atol=2.0)
     with Reader(folder / "bag") as recorded:  # rosbags' own
         assert {"/right/joint_states", "/right/effort_commands", "/diagnostics"} <= set(recorded.topics)
     metadata = yaml.safe_load((folder / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert metadata["custom_data"] == {"source.right": "simulated"}
-    assert "Simulated: programs made" in (folder / "report.html").read_text(encoding="utf-8")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    assert all(text in page for text in ("Simulated: programs made", "Protocol: pilot", "Note: - stiff"))
+    rows = csv_rows(folder / "holds.csv")
+    assert {(row["subject"], row["trial"], row["mode"]) for row in rows} == {("P01", folder.name, "one_g")}
     assert run_tool("report", folder / "bag", "--output", folder / "again").code == 0
     for table in ("holds.csv", "motions.csv"):
         assert csv_rows(folder / "again" / table) == csv_rows(folder / table)
-
-
-@pytest.mark.usefixtures("without_pictures")
-def test_a_trial_of_a_subject_is_in_the_folder_of_the_subject_and_the_day(run):
-    ended, folder = run("--offline", "--subject", "P01", "--protocol", "pilot", "--note=- stiff")
-    (found,) = folder.glob("*-*-*/short_*")
-    assert ended.code == 0 and folder.name == "P01"
-    rows = {(row["subject"], row["trial"], row["mode"]) for row in csv_rows(found / "holds.csv")}
-    assert rows == {("P01", found.name, "one_g")}
-    page = (found / "report.html").read_text(encoding="utf-8")
-    assert "Protocol: pilot" in page and "Note: - stiff" in page
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -217,14 +165,20 @@ TRUNK = {  # the trunk's motion, whether its acceleration is compensated, and ho
 }
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
 @pytest.mark.parametrize(("steps", "inertial", "least", "most"), TRUNK.values(), ids=TRUNK)
 def test_an_arm_with_little_friction_stays_where_it_is_unless_a_walking_trunks_acceleration_is_left_out(
-    steps, inertial, least, most
+    run, steps, inertial, least, most
 ):
-    trial = trunk_trial(*steps, inertial=inertial)
-    assert least < moved(trial.run(), ("bow", "walk")) < most
-    assert trial.trouble == ""
+    script = {"name": "trunk", "steps": [{"move": [*POSE], "over": 2.0}, {"hold": 1.0}, *steps]}
+    simulator = {"friction": {"coulomb": [0.03] * 4}}
+    _, folder = run("--offline", script=script, simulator=simulator, compensator={"inertial": inertial})
+    recording = made.only(folder / "bag")
+    spans = [step for step in recording.steps if step.action in ("bow", "walk")]
+    during = (recording.time >= spans[0].start) & (recording.time <= spans[-1].end)
+    position = np.degrees(recording.position[during])
+    assert least < np.abs(position - position[0]).max() < most and recording.steps[-1].action in steps[-1]
 
 
 # On running nodes
@@ -386,11 +340,14 @@ def test_a_start_that_has_ended_ends_a_trial_unless_a_person_may_start_it_again(
     assert found == ("stopped by the operator" if guided else f"right/can_bridge: {NO_SENTENCE}")
 
 
-@pytest.mark.parametrize(
-    ("bridges", "reports", "is_missing"),
-    [((), "right/compensator", True), ((), "right/can_bridge", False), (("right/can_bridge",), "compensator", False)],
-    ids=["no bridge", "a bridge that is off", "a bridge of the trial, whose process is watched"],
-)
+NO_BRIDGE = {
+    "no bridge": ((), "right/compensator", True),
+    "a bridge that is off": ((), "right/can_bridge", False),
+    "a bridge of the trial, whose process is watched": (("right/can_bridge",), "compensator", False),
+}
+
+
+@pytest.mark.parametrize(("bridges", "reports", "is_missing"), NO_BRIDGE.values(), ids=NO_BRIDGE)
 def test_a_trial_on_running_nodes_ends_after_a_few_seconds_without_a_bridge(bridges, reports, is_missing):
     screen = Screen(bridges=bridges)
     for now in (100.0, 100.1 + BRIDGE_TIMEOUT):
@@ -418,37 +375,22 @@ def test_the_steps_of_the_trunk_and_of_a_load_are_instructions_too(step, words):
 
 # As a clip
 
-CLIPS = {  # the file, the speed, the graphics libraries, the packages that are needed, and what is said
-    "another format": ("clip.avi", 1.0, {"EGL"}, (), "a file that ends with .mp4 or .gif"),
-    "no format": ("clip", 1.0, {"EGL"}, (), "a file that ends with .mp4 or .gif"),
-    "no folder": ("missing/clip.gif", 1.0, {"EGL"}, (), "a file in a folder that exists"),
-    "no speed": ("clip.gif", 0.0, {"EGL"}, (), "a number from 0.1 to 100"),
-    "a speed that is none": ("clip.gif", float("nan"), {"EGL"}, (), "a number from 0.1 to 100"),
-    "no encoder": ("clip.gif", 1.0, {"EGL"}, ("no_such_encoder",), r"no_such_encoder is not installed: .*sim"),
-    "no graphics": ("clip.gif", 1.0, set(), (), "apt install libegl1"),
-    "other graphics": ("clip.gif", 1.0, {"OSMesa"}, (), "apt install libegl1"),
+CLIPS = {  # the file, the speed, the packages that are needed, and what is said
+    "another format": ("clip.avi", 1.0, (), "a file that ends with .mp4 or .gif"),
+    "no folder": ("missing/clip.gif", 1.0, (), "a file in a folder that exists"),
+    "a speed that is none": ("clip.gif", float("nan"), (), "a number from 0.1 to 100"),
+    "no encoder": ("clip.gif", 1.0, ("no_such_encoder",), r"no_such_encoder is not installed: .*sim"),
 }
 
 
-@pytest.mark.parametrize(("video", "speed", "libraries", "needed", "said"), CLIPS.values(), ids=CLIPS)
-def test_a_wrong_clip_is_refused_before_the_trial(tmp_path, monkeypatch, video, speed, libraries, needed, said):
-    monkeypatch.setattr(clips, "find_library", lambda name: name if name in libraries else None)
+@pytest.mark.parametrize(("video", "speed", "needed", "said"), CLIPS.values(), ids=CLIPS)
+def test_a_wrong_clip_is_refused_before_the_trial(tmp_path, monkeypatch, video, speed, needed, said):
     monkeypatch.setattr(clips, "NEEDED", needed)
-    monkeypatch.setenv("MUJOCO_GL", "egl")
     with pytest.raises(ParameterError, match=said):
         clips.requested(str(tmp_path / video), speed)
 
 
-@pytest.mark.parametrize(("installed", "expected"), [({"EGL", "OSMesa"}, "egl"), ({"OSMesa"}, "osmesa"), ({}, "")])
-def test_egl_is_preferred_to_osmesa_and_mujoco_gl_to_both(monkeypatch, installed, expected):
-    monkeypatch.setattr(clips, "find_library", lambda name: name if name in installed else None)
-    for chosen, found in (("disabled", expected), ("osmesa", "osmesa" * bool(installed)), ("glfw", "glfw")):
-        monkeypatch.setenv("MUJOCO_GL", chosen)
-        assert clips.backend() == found
-
-
-def test_from_frame_to_frame_the_recording_goes_on_at_the_speed_of_the_clip(monkeypatch, tmp_path):
-    monkeypatch.setattr(clips, "find_library", lambda name: name)
+def test_from_frame_to_frame_the_recording_goes_on_at_the_speed_of_the_clip(tmp_path):
     assert clips.requested(None, 1.0) is None
     for kind, step in (("gif", 0.4), ("mp4", 0.16)):
         assert clips.requested(str(tmp_path / f"clip.{kind}"), 4.0).step == pytest.approx(step)
@@ -460,24 +402,15 @@ def colourful(frame):
     return int(np.count_nonzero(np.ptp(pixels, axis=-1) > 60))
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.thorough
-@pytest.mark.timeout(300)  # software rendering on a busy machine
-@pytest.mark.parametrize(("kind", "speed"), [("gif", "20"), ("mp4", "50")])  # a frame every 2 s
-def test_a_clip_of_an_offline_trial_shows_the_arm_move_and_its_torques(tmp_path, kind, speed):
-    """In a separate process: MuJoCo chooses how it draws when it is imported, which other tests have done in this."""
-    script, clip = tmp_path / "short.yaml", tmp_path / f"clip.{kind}"
-    steps = [{"move": [0.0, 0.8, 0.6, 0.4], "over": 1.0}, {"hold": 2.0}]
-    script.write_text(yaml.safe_dump({"name": "short", "steps": steps}))
-    words = [str(script), "--offline", "--params", str(CONFIG / "sim.yaml"), "--output", str(tmp_path)]
-    words += ["--video", str(clip), "--video-speed", speed]
-    code = f"from exo_gravity.tools.trial import main; raise SystemExit(main({words}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
-    if not clips.backend():  # a machine without OpenGL
-        assert (done.returncode, clips.NO_GRAPHICS in done.stderr) == (2, True)
-        return
-    assert done.returncode == 0, done.stdout + done.stderr
+@pytest.mark.parametrize(("kind", "speed"), [("gif", 20), ("mp4", 50)])  # a frame every 2 s
+def test_a_clip_of_an_offline_trial_shows_the_arm_move_and_its_torques(run, tmp_path, kind, speed):
+    clip, steps = tmp_path / f"clip.{kind}", [{"move": [0.0, 0.8, 0.6, 0.4], "over": 1.0}, {"hold": 2.0}]
+    ended, _ = run("--offline", "--video", clip, "--video-speed", speed, script={"name": "short", "steps": steps})
+    assert f"Clip: {clip}" in ended.out
     frames = iio.imread(clip, plugin="pillow" if kind == "gif" else "pyav")
-    assert 8 <= len(frames) <= 12
-    held = frames[5]  # at 10 s
+    held = frames[len(frames) // 2]
+    assert 4 <= len(frames) <= 12
     assert np.count_nonzero(np.any(held != frames[0], axis=-1)) > 0.01 * held.shape[0] * held.shape[1]
     assert colourful(held) > 1.5 * colourful(frames[0])

@@ -6,7 +6,6 @@ recording that fails becomes a row that says why. Rows are kept in a cache by th
 that has not changed is not read again. `overview` shows the rows.
 """
 
-import csv
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -22,12 +21,14 @@ from exo_gravity import version
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.lab.bag.storage import REPAIRED, Storage, kind_of
 from exo_gravity.lab.parallel import Outcome
-from exo_gravity.lab.report.smoothness import spectral_arc_length
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording
 
 SPEED_RATE = 50.0  # Hz, at which the speed of a movement is taken
 BLOCK = 2**22  # bytes that are hashed at once
+HIGHEST = 10.0  # Hz, of a movement
+LEAST = 0.05  # of the largest amplitude
+PADDING = 4  # powers of two
 COLUMNS = (
     "recording", "date", "subject", "protocol", "arm", "source", "mode", "support", "held", "verdict", "problem",
     "holds", "held_s", "wearer_share", "smoothness_sparc", "joint", "drift_deg_per_min", "stray_in_10_s_deg",
@@ -77,7 +78,7 @@ def summary(path: str, judging: Judging) -> list[Row]:
         "verdict": report.verdict[0],
         "problem": "; ".join(report.bag.problems),
     }
-    rows = []
+    rows: list[Row] = []
     for recording, analysis in report.arms:
         settings = report.settings[recording.name].at(math.inf)
         part = report.wearers.get(recording.name)
@@ -96,17 +97,13 @@ def summary(path: str, judging: Judging) -> list[Row]:
             of_joint = {"joint": name, **_of_joint(recording, analysis, joint)}
             of_joint["wearer_share_of_joint"] = part and float(part.joints.value[joint])
             row = dict.fromkeys(COLUMNS) | of_arm | of_joint
-            rows.append({key: _plain(value) for key, value in row.items()})
+            unknown = {key: None for key, value in row.items() if isinstance(value, float) and not math.isfinite(value)}
+            rows.append(row | unknown)  # JSON has no NaN
     return rows
 
 
 def _failed(path: str, problem: str) -> Row:
     return {**dict.fromkeys(COLUMNS), "recording": path, "problem": problem}
-
-
-def _plain(value: Any) -> Any:
-    """Return a value that JSON and CSV hold; None for a number that is unknown."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _of_joint(recording: Recording, analysis: TrialAnalysis, joint: int) -> Row:
@@ -137,16 +134,39 @@ def smoothness(recording: Recording, analysis: TrialAnalysis) -> float:
     return float(np.nanmedian(found)) if np.isfinite(found).any() else math.nan
 
 
+def spectral_arc_length(speed: np.ndarray, rate: float) -> float:
+    """Return the spectral arc length (SPARC) of a speed profile (n,) sampled at `rate` Hz; NaN where nothing moves.
+
+    Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet (2015), "On the analysis of movement smoothness", J.
+    Neuroeng. Rehabil. 12:112: the length of the curve of the speed's normalised spectrum, up to the highest frequency
+    below 10 Hz at which it reaches 5 %. A single bell-shaped movement has about -1.4; more negative is less smooth.
+    """
+    if len(speed) < 4 or not np.any(speed):
+        return math.nan
+    size = 2 ** (math.ceil(math.log2(len(speed))) + PADDING)
+    frequency = np.arange(size // 2) * rate / size
+    amplitude = np.abs(np.fft.fft(speed, size))[: size // 2]
+    amplitude /= amplitude.max()
+    low = frequency <= HIGHEST
+    reached = np.flatnonzero(amplitude[low] >= LEAST)
+    part = slice(reached[0], reached[-1] + 1)
+    frequency, amplitude = frequency[low][part], amplitude[low][part]
+    if len(frequency) < 2:
+        return math.nan
+    steps = np.diff(frequency) / (frequency[-1] - frequency[0])
+    return -float(np.sum(np.hypot(steps, np.diff(amplitude))))
+
+
 class Cache:
     """Rows by the content of their recording and how it is judged: a line of JSON for each in a file."""
 
     def __init__(self, path: Path, judging: Judging) -> None:
         self._path, self._settings = path, repr((version(), COLUMNS, judging))
-        self._rows: dict[str, list[Row]] = {}
+        self.rows: dict[str, list[Row]] = {}
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else ():
             try:
                 key, rows = json.loads(line)
-                self._rows[key] = [dict(row) for row in rows]
+                self.rows[key] = [dict(row) for row in rows]
             except (ValueError, TypeError):  # a line that was cut off: that recording is read again
                 continue
 
@@ -161,13 +181,9 @@ class Cache:
                     digest.update(block)
         return digest.hexdigest()
 
-    def get(self, key: str) -> list[Row] | None:
-        """Return the rows of a key; None if it is unknown."""
-        return self._rows.get(key)
-
     def put(self, key: str, rows: list[Row]) -> None:
         """Keep the rows of a key."""
-        self._rows[key] = rows
+        self.rows[key] = rows
         with self._path.open("a", encoding="utf-8") as file:
             file.write(f"{json.dumps([key, rows])}\n")
 
@@ -193,8 +209,8 @@ def summaries(
         except (DataError, OSError) as error:
             found[path] = [_failed(path, str(error))]
         else:
-            if (rows := cache.get(keys[path])) is not None:
-                found[path] = rows
+            if keys[path] in cache.rows:
+                found[path] = cache.rows[keys[path]]
         if path in found:
             done()
     known = sum(path in keys for path in found)
@@ -205,12 +221,3 @@ def summaries(
             cache.put(keys[path], found[path])
         done()
     return [{**row, "recording": str(named)} for path, named in paths.items() for row in found[path]], known
-
-
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write the rows as CSV; an unknown value is an empty cell. Raises OSError."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({key: f"{value:.6g}" if isinstance(value, float) else value for key, value in row.items()})

@@ -103,11 +103,6 @@ def make_plain(axis: "Axes") -> None:
     axis.set_axisbelow(True)
 
 
-def stamp(figure: "Figure", text: str) -> None:
-    """Write a text at the lower right of a figure, which a picture that is copied elsewhere keeps."""
-    figure.text(0.995, 0.004, text, ha="right", va="bottom", color=INK, fontsize=9, weight="bold")
-
-
 def png_of(figure: "Figure", dpi: int = DPI) -> bytes:
     """Return a figure as PNG."""
     buffer = BytesIO()
@@ -115,12 +110,19 @@ def png_of(figure: "Figure", dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def save_vector(figure: "Figure", path: Path) -> None:
-    """Write a figure as PDF or SVG whose text stays text, in fonts that journals accept (no Type 3)."""
+def saved(figure: "Figure", path: Path, formats: Iterable[str], stamp: str) -> bytes:
+    """Write a figure as the PNG `path` and, beside it, as PDF or SVG whose text stays text; return the PNG.
+
+    stamp: at the lower right, which a picture that is copied elsewhere keeps.
+    """
     import matplotlib
 
-    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):
-        figure.savefig(path)
+    figure.text(0.995, 0.004, stamp, ha="right", va="bottom", color=INK, fontsize=9, weight="bold")
+    path.write_bytes(png := png_of(figure))
+    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):  # journals accept no Type 3
+        for suffix in formats:
+            figure.savefig(path.with_suffix(f".{suffix}"))
+    return png
 
 
 def picture(png: bytes, caption: str) -> str:

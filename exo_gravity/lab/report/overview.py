@@ -22,7 +22,7 @@ from scipy.stats import linregress
 from exo_gravity.lab.report import html
 from exo_gravity.lab.report.cohort import Row
 from exo_gravity.lab.report.table import shown
-from exo_gravity.lab.report.verdict import MODES
+from exo_gravity.lab.report.trial_report import MODES
 
 LEAST_SESSIONS = 3  # for a trend
 LEGEND = 10  # lines at most that a figure names
@@ -54,23 +54,6 @@ TERMS = (
     "of the moves from pose to pose: a single bell-shaped movement has about -1.4, a jerky one less. Share is what the "
     "wearer carried of their arm's weight."
 )
-
-
-class Trend(NamedTuple):
-    """How the measures of one condition change from one session to the next."""
-
-    condition: str
-    sessions: int
-    changes: tuple[tuple[Measure, float, float], ...]  #: in its unit, with the standard error
-
-    @property
-    def sentence(self) -> str:
-        """The trend in words."""
-        changes = ", ".join(
-            f"{one.name} {change:+.{one.digits}f} ± {error:.{one.digits}f}{one.unit}"
-            for one, change, error in self.changes
-        )
-        return f"{self.condition}: change from one of {self.sessions} sessions to the next: {changes}"
 
 
 def trials_of(rows: Iterable[Row]) -> list[Row]:
@@ -115,18 +98,18 @@ def _values(rows: Iterable[Row], measure: Measure) -> np.ndarray:
     return measure.factor * np.array([math.nan if value is None else value for value in found])
 
 
-def trends_of(trials: Iterable[Row]) -> Iterator[Trend]:
-    """Yield the trend of each condition with LEAST_SESSIONS or more."""
+def trends_of(trials: Iterable[Row]) -> Iterator[str]:
+    """Yield how the measures of each condition with LEAST_SESSIONS or more change, with their standard errors."""
     for condition, rows in conditions_of(trials):
         session, changes = sessions_of(rows), []
-        for measure in MEASURES:
-            values = _values(rows, measure)
+        for one in MEASURES:
+            values = _values(rows, one)
             known = np.isfinite(values)
             if len(np.unique(session[known])) >= LEAST_SESSIONS:
                 line = linregress(session[known], values[known])
-                changes.append((measure, float(line.slope), float(line.stderr)))
+                changes.append(f"{one.name} {line.slope:+.{one.digits}f} ± {line.stderr:.{one.digits}f}{one.unit}")
         if changes:
-            yield Trend(condition, int(session[-1]), tuple(changes))
+            yield f"{condition}: change from one of {session[-1]} sessions to the next: {', '.join(changes)}"
 
 
 def _cells(row: Row) -> list[str]:
@@ -170,7 +153,7 @@ def print_trials(trials: Sequence[Row], console: Console) -> None:
         table.add_row(*(escape(text) for text in (row["subject"] or "", condition, *_cells(row))))
     console.print(table)
     for trend in trends_of(trials):
-        console.print(f"{trend.sentence}.", markup=False)
+        console.print(f"{trend}.", markup=False)
     for problem in problems_of(trials):
         console.print(f"Not reported: {problem}", markup=False)
 
@@ -194,7 +177,7 @@ def page(trials: Sequence[Row], name: str) -> str:
         [
             html.verdict(f"{summary_of(trials)}.", good=bool(read) and held and not problems),
             html.bullets("Not reported", problems),
-            html.bullets("Trends, with standard errors", [trend.sentence for trend in trends_of(trials)]),
+            html.bullets("Trends, with standard errors", trends_of(trials)),
             html.picture(html.png_of(drawn), "Each subject and condition over their sessions.") if drawn else "",
             html.heading("Trials", 2),
             html.table(("Subject", "Condition", *HEADINGS), groups),

@@ -129,7 +129,7 @@ def shown(value: float, digits: int) -> str:
 
 
 def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[[str, float], Row]) -> None:
-    """Write a table as CSV, a row for each joint; an unknown number is an empty cell. Without rows, write nothing.
+    """Write a table as CSV, a row for each joint. Without rows, write nothing.
 
     row_head: returns the first cells of a row, from the arm's name and the time in s.
     """
@@ -139,13 +139,20 @@ def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[
             shared = {**row_head(recording.name, one.start), **kind.lead(number, one)}
             numbers = {column.key: column.of(one) for column in kind.columns}
             for joint, name in enumerate(recording.joint_names):
-                row = {**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}}
-                rows.append({key: _csv_value(value) for key, value in row.items()})
+                rows.append({**shared, "joint": name, **{key: values[joint] for key, values in numbers.items()}})
     if rows:
-        with (folder / f"{kind.name}.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, rows[0])
-            writer.writeheader()
-            writer.writerows(rows)
+        write_rows(folder / f"{kind.name}.csv", rows)
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows of the same columns as CSV; an unknown number is an empty cell. Raises OSError."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        for row in rows:
+            numbers = {key: f"{value:.6g}" for key, value in row.items() if isinstance(value, float | np.floating)}
+            unknown = {key: "" for key, text in numbers.items() if text in ("nan", "inf", "-inf")}
+            writer.writerow({**row, **numbers, **unknown})
 
 
 def write_time_series(path: Path, columns: Mapping[str, np.ndarray]) -> None:
@@ -154,20 +161,10 @@ def write_time_series(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         writer = csv.writer(file)
         writer.writerow(columns)
         for start in range(0, len(columns["time_s"]), ROWS):
-            parts = (column[start : start + ROWS] for column in columns.values())
-            writer.writerows(zip(*(_cells_of(part) for part in parts), strict=True))
-
-
-def _cells_of(column: np.ndarray) -> list[Any]:
-    if column.dtype.kind != "f":
-        return column.tolist()
-    return [value if math.isfinite(value) else "" for value in column.astype(float).round(6).tolist()]
-
-
-def _csv_value(value: Any) -> str:
-    if isinstance(value, str | int):
-        return str(value)
-    return f"{value:.6g}" if math.isfinite(value) else ""
+            parts = [column[start : start + ROWS] for column in columns.values()]
+            parts = [part.astype(float).round(6) if part.dtype.kind == "f" else part for part in parts]
+            for row in zip(*(part.tolist() for part in parts), strict=True):
+                writer.writerow("" if value != value else value for value in row)  # NaN alone differs from itself
 
 
 def arm_section(recording: Recording, analysis: TrialAnalysis, figures: Iterable[str]) -> Iterator[str]:

@@ -1,9 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where a clip goes, and whether this computer can draw it: checked before a trial runs, not after."""
+"""Where a clip goes, and whether this computer has what draws it: checked before a trial runs, not after."""
 
 import argparse
-import os
-from ctypes.util import find_library
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,14 +15,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 FRAME_RATE = {".mp4": 25, ".gif": 10}  # frames per second
-NEEDED = ("mujoco", "imageio", "av", "PIL")
+NEEDED = ("imageio", "av", "PIL")
 MAX_SPEED = 100.0
-# The libraries by which MuJoCo draws without a screen, and its name for each.
-BACKENDS = {"EGL": "egl", "OSMesa": "osmesa"}
-NO_GRAPHICS = (
-    "no OpenGL that draws without a screen is installed (EGL, OSMesa, or what MUJOCO_GL names): "
-    "apt install libegl1 libgl1-mesa-dri, or apt install libosmesa6"
-)
 
 
 class Clip(NamedTuple):
@@ -33,6 +25,13 @@ class Clip(NamedTuple):
     path: Path
     step: float  #: s of the recording from one frame to the next
     frame_rate: int  #: frames per second
+
+    def write(self, bag: Bag, console: "Console") -> None:
+        """Write the clip of a recording, and print where it is. Raises DataError."""
+        from exo_gravity.lab.report.clip import write_clip  # by packages that only clips need
+
+        write_clip(bag, *self, console)
+        console.print(f"Clip: {self.path}", markup=False, soft_wrap=True)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def requested(video: str | None, speed: float) -> Clip | None:
     """Return the clip of the command line, None for none.
 
-    Raises ParameterError for a wrong file or speed, and if a package or OpenGL is missing.
+    Raises ParameterError for a wrong file or speed, and if a package is missing.
     """
     if video is None:
         return None
@@ -56,27 +55,7 @@ def requested(video: str | None, speed: float) -> Clip | None:
         raise ParameterError("video", video, "a file in a folder that exists")
     frame_rate = FRAME_RATE[path.suffix.lower()]
     clip = Clip(path, one_float("video_speed", speed, 0.1, MAX_SPEED) / frame_rate, frame_rate)
-    problems = [missing(module, "sim") for module in NEEDED if not find_spec(module)]
-    if not problems and not backend():
-        problems = [NO_GRAPHICS]
-    if problems:
-        raise ParameterError("video", video, f"left out: {problems[0]}")
+    for module in NEEDED:
+        if not find_spec(module):
+            raise ParameterError("video", video, f"left out: {missing(module, 'sim')}")
     return clip
-
-
-def backend() -> str:
-    """Return the name by which MuJoCo draws without a screen; MUJOCO_GL, if set, decides. '' if it finds no library."""
-    chosen = os.environ.get("MUJOCO_GL", "disabled")
-    if chosen not in ("disabled", *BACKENDS.values()):
-        return chosen
-    found = (name for library, name in BACKENDS.items() if chosen in ("disabled", name) and find_library(library))
-    return next(found, "")
-
-
-def write(bag: Bag, clip: Clip, console: "Console") -> None:
-    """Write the clip of a recording, and print where it is. Raises DataError."""
-    os.environ["MUJOCO_GL"] = backend()
-    from exo_gravity.lab.report.clip import write_clip
-
-    write_clip(bag, *clip, console)
-    console.print(f"Clip: {clip.path}", markup=False, soft_wrap=True)

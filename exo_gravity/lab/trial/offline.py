@@ -3,36 +3,47 @@
 
 The loop, the bus and the safety machine are those of `can_bridge` (sim/virtual_arm.py); the compensator answers the
 samples of each cycle at once. Nothing is ever late: only a run in real time shows the delays and lost frames of a busy
-computer.
+computer. `trial --offline` is the only tool that imports `sim`: without ROS it cannot start the simulator as a node.
 """
 
 import itertools
 import math
+import time
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import Progress, TaskID
 
 from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.errors import DataError
+from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.safety.drive import CARRYING, Efforts, Fault, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import NONE
+from exo_gravity.hardware.trunk_estimator import VQF, ImuSample, TrunkEstimator
 from exo_gravity.lab.bag.content import BRIDGE, Event, NodeStatus
-from exo_gravity.lab.inputs.parameter_file import node_of
-from exo_gravity.lab.trial.recording import CARRIED, Recording, ScriptedStep, Span
+from exo_gravity.lab.bag.simulated import write_recordings
+from exo_gravity.lab.inputs.arms import node_values, read_arm
+from exo_gravity.lab.inputs.parameter_file import load, node_of
+from exo_gravity.lab.trial.recording import ARRAYS, CARRIED, Recording, ScriptedStep, Span
+from exo_gravity.lab.trial.run import Trial, TrialEnd
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.device import SimulatedDevice
-from exo_gravity.sim.script import IDLE, TrialScript
-from exo_gravity.sim.virtual_arm import TrunkSensor, VirtualArm
+from exo_gravity.sim.imu import ImuConfig, SimulatedImu, measured_tilt
+from exo_gravity.sim.params import device_of, imu_of, set_faults, simulator_table
+from exo_gravity.sim.script import IDLE, TRUNK_ACTIONS, TrialScript
+from exo_gravity.sim.trunk_motion import TrunkState
+from exo_gravity.sim.virtual_arm import TrunkReading, TrunkSensor, VirtualArm, resting
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 NOT_OK = 2  # the level of an event, as diagnostic_msgs/DiagnosticStatus has it
 GRACE = 0.5  # s from the end of the script until the arm is let down
-COLUMNS = ("position", "velocity", "effort", "command")  # of the recording, each of all joints, after the time
 
 
 @dataclass(frozen=True)
@@ -81,11 +92,6 @@ class OfflineTrial:
         self.safety = self._carrier.safety
         if arm.settings.use_imu and arm.trunk:
             self._carrier.add_imu(arm.trunk, self.compensator, 1.0 / arm.rate)
-
-    @property
-    def samples(self) -> Sequence[JointSample]:
-        """The newest sample of each joint."""
-        return self._carrier.loop.samples
 
     def run(self, should_stop: Callable[[float], bool] = lambda now: False) -> Recording:
         """Run the script, let the arm down, and return what `recorder` would have recorded.
@@ -154,8 +160,8 @@ class OfflineTrial:
     def _recording(self) -> Recording:
         if not self._rows:
             raise DataError(self.trouble or f"{self.arm.name}: nothing was recorded")
-        table = np.array(self._rows).reshape(-1, 1 + len(COLUMNS) * len(self._no_effort))
-        position, velocity, effort, command = np.split(table[:, 1:], len(COLUMNS), axis=1)
+        table = np.array(self._rows).reshape(-1, 1 + len(ARRAYS) * len(self._no_effort))
+        position, velocity, effort, command = np.split(table[:, 1:], len(ARRAYS), axis=1)
         steps = self.script.steps
         starts = itertools.accumulate((step.duration for step in steps), initial=self._start)
         end = float(table[-1, 0])
@@ -166,3 +172,95 @@ class OfflineTrial:
         )
         name, joint_names = self.arm.name, self.arm.limits.joint_names
         return Recording(name, joint_names, table[:, 0], position, velocity, effort, command, script, self._carried)
+
+
+def simulated_trials(params: Path, script: TrialScript) -> list[OfflineTrial]:
+    """Return a trial of each simulated arm of a parameter file.
+
+    Raises ParameterError that names the node and the parameter.
+    """
+    nodes = load(params)
+    found = [node for node in nodes if node.endswith("/simulator")]
+    simulators = {node: node_values(nodes, node, simulator_table(nodes[node])) for node in found}
+    if not simulators:
+        raise ParameterError("params", str(params), "a file with a simulator: --offline runs the simulated device only")
+    with_imu = next((values for values in simulators.values() if values["imu.topic"] and "/imu" in nodes), None)
+    rotation = nodes.get("/imu", {}).get("rotation_trunk_from_imu", [])
+    moves = any(step.action in TRUNK_ACTIONS for step in script.steps)
+    trials: list[OfflineTrial] = []
+    trunk: TrunkSensor | None = None
+    if with_imu and not moves:
+        with named("/imu "):
+            true = with_imu["trunk.pitch"], with_imu["trunk.roll"]
+            trunk = resting(*measured_tilt(*true, SimulatedImu(imu_of(with_imu)), rotation))
+    for node, simulator in simulators.items():
+        arm = read_arm(nodes, node.removesuffix("/simulator"))
+        with named(f"{node} "):
+            device = device_of(simulator)
+            set_faults(device, simulator)
+        rate = arm.can_bridge["rate"]
+        if with_imu and moves:
+            trunk = trunk_imu(imu_of(with_imu), rotation, rate)
+        setup = ArmSetup(arm.name, device, arm.motors, arm.limits, arm.settings, rate, trunk)
+        trials.append(OfflineTrial(setup, script, simulator["trial_delay"]))
+    return trials
+
+
+def record_offline(trial: Trial, console: Console, should_stop: Callable[[], bool]) -> TrialEnd:
+    """Prepare and run a trial on the simulated arms of its parameter file, and record it in the folder `bag`.
+
+    Raises ParameterError for a wrong parameter, DataError if nothing was recorded or it cannot be written.
+    """
+    assert trial.params is not None, "arms that are carried already are not simulated here"
+    simulated = simulated_trials(trial.params, trial.script)
+    nodes = load(trial.prepare(with_recorder=False))
+    recordings = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        for one in simulated:
+            task, begin = progress.add_task(one.arm.name, total=one.script.duration), time.perf_counter()
+
+            def on_second(now: float, task: TaskID = task) -> bool:
+                progress.update(task, completed=now)
+                return should_stop()
+
+            recordings.append(one.run(on_second))
+            taken, length = time.perf_counter() - begin, float(recordings[-1].time[-1])
+            speed = f"{length:.0f} s simulated in {taken:.1f} s, {length / taken:.0f} times real time"
+            console.print(f"{one.arm.name}: {speed}")
+    events = sorted((event for one in simulated for event in one.events), key=lambda event: event.time)
+    texts = {
+        node: yaml.safe_dump({node: {"ros__parameters": values}}, default_flow_style=None, width=120)
+        for node, values in nodes.items()
+    }
+    write_recordings(trial.folder / "bag", recordings, events, texts, trial.session)
+    trouble = next((one.trouble for one in simulated if one.trouble), "")
+    return TrialEnd(trouble, int(bool(trouble)))
+
+
+def trunk_imu(config: ImuConfig, rotation_trunk_from_imu: Sequence[float], cycle_rate: float) -> TrunkSensor:
+    """Return the simulated IMU `config`, and the estimator that follows it, in every n-th of `cycle_rate` cycles per s.
+
+    rotation_trunk_from_imu: the mounting that the controller assumes. Raises ParameterError.
+    """
+    if VQF is None:
+        raise ParameterError("vqf", None, "installed (extra imu) for a trial in which the trunk moves")
+    cycles = max(1, round(cycle_rate / config.rate))
+    rate = cycle_rate / cycles
+    imu = SimulatedImu(replace(config, rate=rate))
+    estimator = TrunkEstimator(rotation_trunk_from_imu, rate, config.gyroscope_range, config.accelerometer_range)
+    due = itertools.cycle((True, *[False] * (cycles - 1)))
+
+    def measure(now: float, state: TrunkState) -> TrunkReading | None:
+        if not next(due):
+            return None
+        angular_velocity, acceleration = imu.sample(state)
+        try:
+            answer = estimator.update(ImuSample(now, angular_velocity.tolist(), acceleration.tolist()))
+        except ParameterError:  # refused samples are not published
+            return None
+        if answer is None:
+            return None
+        force, turning = estimator.rotation @ acceleration, estimator.rotation @ angular_velocity
+        return TrunkReading(answer.gravity.tolist(), force.tolist(), turning.tolist())
+
+    return measure

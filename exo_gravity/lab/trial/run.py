@@ -19,8 +19,6 @@ from rich.console import Console
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import params_of
 from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
-from exo_gravity.core.safety.drive import State
-from exo_gravity.core.vocabulary import NONE
 from exo_gravity.lab.inputs.node_checks import check_nodes, check_start
 from exo_gravity.lab.inputs.parameter_file import load, stages
 from exo_gravity.lab.inputs.ros_yaml import text_of
@@ -95,16 +93,15 @@ class TrialEnd:
 
 
 def run_trial(trial: Trial, console: Console, stopped: Stopping, on_progress: Callable[[int, float], None]) -> TrialEnd:
-    """Run a trial that is prepared. on_progress: as in `TrialScreen`."""
+    """Run a trial that is prepared until the script is done, a fault latches or `stopped` is set.
+
+    on_progress: as in `TrialScreen`.
+    """
     # On arms that are carried already the clock leads: a simulator's newest step may be that of an earlier trial.
     unguided = START_TIME if trial.params is None else None
     lead = LEAD if trial.guided else unguided
     bridges = [node.lstrip("/") for node in stages(load(trial.params))[0]] if trial.params else []
-    return run_nodes(trial, TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress), stopped)
-
-
-def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
-    """Run the nodes of a trial until the script is done, a fault latches or `stopped` is set."""
+    screen = TrialScreen(trial.script, trial.guided, console, bridges, lead, on_progress)
     last_errors: dict[str, str] = {}
     path = trial.folder / "log.txt"
     with path.open("w", 1, encoding="utf-8") as log, screen.live, ThreadPoolExecutor(1) as pool:
@@ -122,7 +119,7 @@ def run_nodes(trial: Trial, screen: TrialScreen, stopped: Stopping) -> TrialEnd:
         nodes = pool.submit(launcher.run, ending)
         trouble = follow(screen, stopped, lambda: launcher.exit_code(RECORDER), nodes)
         down_by = time.monotonic() + DESCENT_TIMEOUT
-        while is_falling(screen.status) and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
+        while screen.is_falling and screen.silence < 1.0 and time.monotonic() < down_by and not nodes.done():
             time.sleep(0.05)  # the recording shows how the arm comes down
         if not nodes.done():
             screen.end("letting the arm down and closing the recording")
@@ -148,7 +145,7 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
             return f"the recorder has sent no data for {RECORDER_TIMEOUT:g} s"
         if screen.has_no_bridge:
             return f"no can_bridge has reported on /diagnostics within {BRIDGE_TIMEOUT:g} s: no arm is carried here"
-        if message := fault_of(screen.status)[1] or ("" if screen.guided else refusal_of(screen.status)):
+        if message := screen.message_of("fault") or (not screen.guided and screen.message_of("refusal")):
             return message
         if screen.done:
             stopped.wait(GRACE)
@@ -158,25 +155,6 @@ def follow(screen: TrialScreen, stopped: Stopping, recorder_code: Callable[[], i
         if time.monotonic() > deadline:
             return f"the trial did not finish in time: {'; '.join(screen.faults) or 'no node reports a fault'}"
     return "stopped by the operator" if stopped.is_set() else ""
-
-
-def is_falling(status: Status) -> bool:
-    """Return whether an arm is being let down."""
-    return any(values.get("state") == State.LETTING_DOWN.value for values in status.values())
-
-
-def fault_of(status: Status) -> tuple[str, str]:
-    """Return the code and the message of the first fault that a bridge reports, or ('', '')."""
-    for name, values in status.items():
-        if values.get("fault", NONE) != NONE:
-            return str(values["fault"]), f"{name}: {values['message']}"
-    return "", ""
-
-
-def refusal_of(status: Status) -> str:
-    """Return the message of a bridge whose start has ended without a fault, or '': only a person starts it again."""
-    ended = (name for name, values in status.items() if values.get("refusal", NONE) != NONE)
-    return next((f"{name}: {status[name]['message']}" for name in ended), "")
 
 
 def stall_of(status: Status) -> str:

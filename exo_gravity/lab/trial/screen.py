@@ -17,6 +17,7 @@ from rich.live import Live
 from rich.text import Text
 
 from exo_gravity.core.safety.drive import State
+from exo_gravity.core.vocabulary import NONE
 from exo_gravity.sim.script import Step, TrialScript
 
 SETTLING = 0.5  # s between letting go and the position from which drift is measured
@@ -82,6 +83,16 @@ class TrialScreen:
         return self.clock() - self._last_line if self._arms else 0.0
 
     @property
+    def is_falling(self) -> bool:
+        """Whether an arm is being let down."""
+        return State.LETTING_DOWN.value in self._states.values()
+
+    def message_of(self, key: str) -> str:
+        """Return the message of the first bridge with a fault or, after its start has ended, a refusal; '' for none."""
+        found = (name for name, values in self.status.items() if values.get(key, NONE) != NONE)
+        return next((f"{name}: {self.status[name]['message']}" for name in found), "")
+
+    @property
     def has_no_bridge(self) -> bool:
         """Whether no bridge reports although all nodes run already. Those that are started may need longer."""
         is_late = self.clock() - self._first_line > BRIDGE_TIMEOUT
@@ -109,8 +120,7 @@ class TrialScreen:
 
     @property
     def _all_active(self) -> bool:
-        states = self._states
-        return bool(states) and set(self.bridges) <= set(states) and set(states.values()) == {State.ACTIVE.value}
+        return set(self.bridges) <= {*self._states} and {*self._states.values()} == {State.ACTIVE.value}
 
     def _follow(self, simulated_steps: list[int]) -> None:
         index, now = self._index, self.clock()
@@ -170,14 +180,16 @@ def describe(step: Step, guided: bool) -> str:
     angles, time = " ".join(f"{math.degrees(angle):.0f}" for angle in step.value), f"for {step.duration:g} s"
     pushed = "once, briefly" if step.duration < 1.0 else f"{time}, then let go"
     over = f"{angles} deg {'forward' if step.action == 'bow' else 'to the right'} in {step.duration:g} s"
-    arm = {
-        "hold": (f"hands off {time}",) * 2,
-        "move": (f"bring the arm to {angles} deg, then let go", f"the wearer brings the arm to {angles} deg"),
-        "push": (f"push the arm {pushed}", "the wearer pushes the arm"),
+    bring, then = ("bring", ", then let go") if guided else ("the wearer brings", "")
+    said = {
+        "hold": f"hands off {time}",
+        "move": f"{bring} the arm to {angles} deg{then}",
+        "push": f"push the arm {pushed}" if guided else "the wearer pushes the arm",
     }
-    trunk = {"walk": f"walk {time}", "sit": "sit down hard", "bow": f"bow to {over}", "lean": f"lean to {over}"}
-    if step.action == "load":
-        trunk["load"] = f"take {step.value[0]:g} kg into the hand" if step.value[0] else "let go of the load"
-    if step.action in trunk:
-        return f"{'' if guided else 'the wearer: '}{trunk[step.action]}, and leave the arm alone"
-    return arm[step.action][0 if guided else 1]
+    loaded = step.action == "load" and step.value[0]
+    trunk = {
+        "walk": f"walk {time}", "sit": "sit down hard", "bow": f"bow to {over}", "lean": f"lean to {over}",
+        "load": f"take {loaded:g} kg into the hand" if loaded else "let go of the load",
+    }  # fmt: skip
+    alone = f"{'' if guided else 'the wearer: '}{trunk.get(step.action)}, and leave the arm alone"
+    return said.get(step.action, alone)

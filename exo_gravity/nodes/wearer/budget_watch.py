@@ -16,7 +16,7 @@ from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, Reason
-from exo_gravity.lab.budget import USUAL_TILT, budget_worn, largest_support, motor_torques, overload, workspace
+from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.vocabulary import Budget
 from exo_gravity.nodes.ros.parameters import NodeParameters
@@ -75,7 +75,7 @@ def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -
     try:
         bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
         rated, peak = motor_torques(bridge)
-        joints = budget_worn(robot, full, springs, support, bounds, rated, peak)
+        joints = budget(robot, full, springs, support, bounds, rated, peak)
     except ParameterError as error:
         return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
     overloaded = overload(names, joints)
