@@ -233,22 +233,17 @@ def _link(name: str) -> Mapping[str, Any]:
     return dict(links[0]) if links else {}
 
 
-def of_use_sim_time(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
-    """Judge each node that waits for /clock. bridges: those with a real bus refuse it."""
+def of_nodes(nodes: Nodes, bridges: Mapping[str, Mapping[str, Any]]) -> Iterator[Finding]:
+    """Judge each node that waits for /clock, which `bridges` with a real bus refuse, or lacks a Python package."""
     for node, given in nodes.items():
-        if given.get("use_sim_time") is True:
-            is_real = node in bridges and bridges[node]["can.interface"] not in SIMULATED_BUSES
-            level, wanted = Level.FAULT if is_real else Level.WARNING, "false, or a program that publishes /clock"
-            yield Finding(f"{node}: use_sim_time", "true", wanted, level, "remove use_sim_time from the file")
-
-
-def of_packages(nodes: Nodes) -> Iterator[Finding]:
-    """Judge whether the Python packages are installed without which a node does not start."""
-    for node in nodes:
         try:
             check_packages((node.rpartition("/")[2],))
         except MissingPackageError as error:
             yield Finding(f"{node}: packages", "missing", "installed", Level.WARNING, str(error))
+        if given.get("use_sim_time") is True:
+            is_real = node in bridges and bridges[node]["can.interface"] not in SIMULATED_BUSES
+            level, wanted = Level.FAULT if is_real else Level.WARNING, "false, or a program that publishes /clock"
+            yield Finding(f"{node}: use_sim_time", "true", wanted, level, "remove use_sim_time from the file")
 
 
 def of_port(port: str, root: Path) -> Finding:
@@ -303,7 +298,6 @@ def examine(nodes: Nodes, seconds: float, root: Path) -> list[Finding]:
         *of_computer(root, wakeups, period, late.level > Level.FINE, priority),
         *of_middleware(middleware or MIDDLEWARE, reach, open_to_others()),
         of_multicast(any(s["can.interface"] == "udp_multicast" for s in settings)),
-        *of_packages(nodes),
-        *of_use_sim_time(nodes, bridges),
+        *of_nodes(nodes, bridges),
         *buses,
     ]

@@ -23,7 +23,7 @@ from exo_gravity.lab.view.scene import (
     arm_shapes,
     gravity_shapes,
     state_of,
-)
+)  # fmt: skip
 from exo_gravity.lab.view.urdf import Described, PapersPicture, described, urdf
 from exo_gravity.sim.urdf import UrdfConfig
 

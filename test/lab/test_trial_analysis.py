@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def test_each_still_span_is_a_hold_of_its_mean_position_and_the_motion_between_t
     assert kinds(whole) == ["move"]
 
 
-@pytest.mark.parametrize("per_minute", [0.0, 0.1, 0.2, -0.2, 1.0, -5.0, 30.0])
+@pytest.mark.parametrize("per_minute", [0.0, 0.03, 0.2, -5.0, 30.0])
 @pytest.mark.parametrize("noise", [0.0, POSITION_CODE])
 def test_a_known_drift_is_found_within_twice_its_uncertainty(per_minute, noise):
     drift = per_minute * DEG_PER_MIN * np.array([1.0, 0.7, -0.4, 0.15])
@@ -81,13 +82,6 @@ def test_a_known_drift_is_found_within_twice_its_uncertainty(per_minute, noise):
     assert np.all(np.abs(hold.drift_rate - drift) < 2 * hold.drift_rate_uncertainty)
     if abs(per_minute) <= 1.0:  # a minute shows well below a fifth of a degree per minute
         assert np.all(hold.drift_rate_uncertainty < 0.05 * DEG_PER_MIN)
-
-
-@pytest.mark.parametrize("phase", np.linspace(0.0, 1.0, 7))
-def test_quantisation_alone_is_within_the_uncertainty_wherever_the_code_changes(phase):
-    drift = 0.03 * DEG_PER_MIN  # 1.4 codes in a minute
-    (hold,) = analyse(recording(still(POSE_A + phase * POSITION_CODE, 60.0, drift))).holds
-    assert np.all(np.abs(hold.drift_rate - drift) < hold.drift_rate_uncertainty)
 
 
 def test_a_5_s_touch_of_a_tenth_of_a_degree_hardly_changes_the_drift():
@@ -161,16 +155,6 @@ def test_a_let_down_has_the_peak_speed_of_each_joint_until_the_wearer_moves_the_
     assert len(spans(twice)) == 2 and kinds(twice) == ["let down"]
 
 
-@pytest.mark.parametrize("change", ["shape", "order", "nan"])
-def test_inconsistent_arrays_are_rejected(change):
-    good = recording(still(POSE_A, 1.0))
-    position = good.position.copy()
-    position[7, 2] = math.nan
-    wrong = {"shape": {"effort": good.effort[:-1]}, "order": {"time": good.time[::-1]}, "nan": {"position": position}}
-    with pytest.raises(DataError, match="right: "):
-        replace(good, **wrong[change])
-
-
 def released(pose_at_end):
     """Move to `POSE_A`, release at 2 s, and move to another pose within 1 s."""
     return recording(ARRIVAL, smooth(POSE_A, pose_at_end, 1.0), still(pose_at_end, 9.0), steps=SCRIPT)
@@ -218,15 +202,18 @@ def test_an_arm_that_was_never_carried_or_never_still_fails():
     assert "never still" in failed(recording(ARRIVAL))[0]
 
 
-def test_joints_are_put_in_the_order_asked_for_and_others_are_refused_by_name():
+def test_joints_are_put_in_the_order_asked_for_and_others_and_inconsistent_arrays_are_refused():
     whole = two_poses()
     names = whole.joint_names[::-1]
     turned = whole.in_order(names)
     assert turned.joint_names == names
     for field in ARRAYS:
         np.testing.assert_array_equal(getattr(turned, field), getattr(whole, field)[:, ::-1])
-    with pytest.raises(DataError, match="must be a, b, c, d"):
-        whole.in_order(("a", "b", "c", "d"))
+    lost = np.where(whole.time[:, None] == 1.0, math.nan, whole.position)
+    wrong = ({"effort": whole.effort[:-1]}, {"time": whole.time[::-1]}, {"position": lost})
+    for refused in (partial(whole.in_order, ("a", "b", "c", "d")), *(partial(replace, whole, **one) for one in wrong)):
+        with pytest.raises(DataError, match=r"^right: "):
+            refused()
 
 
 BELL = np.exp(-5.0 * np.arange(-1.0, 1.0, 1.0 / 100.0) ** 2)

@@ -17,6 +17,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
+from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import configured_arms
 from exo_gravity.lab.view.urdf import Described, PapersPicture, urdf
@@ -192,6 +193,18 @@ def test_limits_friction_and_own_meshes_are_in_the_description():
     meshes = [mesh.get("filename") for link in root.iter("link") for mesh in link.iter("mesh")]
     names = ("trunk", "left_link_1", "left_link_2", "left_link_3", "left_link_4")
     assert meshes == [f"package://mine/meshes/{name}.stl" for name in names]
+
+
+REFUSED = {  # what differs of each arm's robot, and what is said
+    "two arms on one side": ([{}, {}], "one arm for each side"),
+    "a link without mass": ([{"mass": (0.6, 0.5, 0.6, 0.0)}], "above 0 kg for each link"),
+}
+
+
+@pytest.mark.parametrize(("robots", "said"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_described_is_refused(robots, said):
+    with pytest.raises(ParameterError, match=said):
+        urdf([description(**robot) for robot in robots])
 
 
 def test_the_command_writes_one_arm_or_both(tmp_path, run_tool):

@@ -111,6 +111,8 @@ def test_what_delays_threads_is_a_warning_only_where_they_were_late(computer, wh
         (computer / path).write_text(content)
     levels = [of_computer(computer, is_late)[what].level for is_late in (False, True)]
     assert levels == [Level.NOTE, Level.WARNING]
+    silent = of_computer(computer / "none", is_late=True)  # a container states nothing of its CPUs: no fault
+    assert max(row.level for row in silent.values()) is Level.UNKNOWN
 
 
 def test_the_command_for_idle_states_names_those_that_are_too_deep_for_the_rate(computer):
@@ -164,6 +166,12 @@ def test_an_environment_that_would_end_every_node_is_refused_before_one_starts(
     monkeypatch.setenv(variable, value)
     code, _, err = run_tool(tool)
     assert code == 2 and said in err
+
+
+def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
+    assert settings.of_multicast(True).level is Level.FINE
+    monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
+    assert settings.of_multicast(True).level is Level.FAULT and settings.of_multicast(False).level is Level.FINE
 
 
 @pytest.mark.parametrize(("rate", "level"), [(250, Level.FINE), (900, Level.WARNING), (1100, Level.FAULT)])

@@ -1,14 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of a file, checked as the nodes check them at their start."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import COMPENSATOR, compensator_table
 from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
-from exo_gravity.core.params import Param
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.network import check_environment
@@ -37,7 +33,9 @@ def check_nodes(nodes: Nodes) -> None:
                 TrunkEstimator(*(values[setting] for setting in settings))
         elif name == "compensator":
             table = compensator_table(given)
-            values = node_values({node: _used(given, table)}, node, table)
+            ignored = {param.name for param in COMPENSATOR} - {param.name for param in table}  # of the paper's arm
+            used = {name: value for name, value in given.items() if name not in ignored}
+            values = node_values({node: used}, node, table)
             if values["law"] != URDF_LAW or values["urdf.file"]:
                 with named(f"{node} "):
                     settings_from(values)
@@ -56,10 +54,3 @@ def check_start(nodes: Nodes) -> None:
         for channel, (_, own) in buses_of(values["can.channel"], options, len(values["joint_names"])).items():
             if holder := bridge_of((values["can.interface"], channel, own)):
                 raise BusError(f"{node}: CAN bus {channel} is held by {holder}, which may carry an arm: stop it first")
-
-
-def _used(given: Mapping[str, Any], table: Sequence[Param]) -> dict[str, Any]:
-    """Return the parameters without those of the paper's arm that the node of another ignores."""
-    used = {param.name for param in table}
-    unused = {param.name for param in COMPENSATOR} - used
-    return {name: value for name, value in given.items() if name not in unused}

@@ -85,19 +85,6 @@ def stages(nodes: Iterable[str]) -> tuple[list[str], list[str], list[str]]:
 
 def _check_together(nodes: Nodes) -> None:
     """Raise ParameterError for nodes that contradict each other: buses, names of joints, sides, a second IMU."""
-    _check_buses(nodes)
-    _check_names(nodes)
-    for node, given in nodes.items():
-        of_namespace, side = node.split("/")[-2], given.get("side")
-        if side in SIDES and of_namespace in SIDES and side != of_namespace:
-            raise ParameterError(f"{node} side", side, f"{of_namespace}, as its namespace says")
-    imus = [node for node in nodes if node.endswith("/imu")]
-    if len(imus) > 1:
-        raise ParameterError("params", imus, "a file with one imu, which serves both arms: all publish /imu/pitch_yaw")
-
-
-def _check_buses(nodes: Nodes) -> None:
-    """Raise ParameterError if two bridges would command motors on the same bus, which has one owner."""
     owner: dict[tuple[tuple[str, str], ...], str] = {}
     for node in stages(nodes)[0]:
         given = nodes[node]
@@ -110,16 +97,16 @@ def _check_buses(nodes: Nodes) -> None:
             other = owner.setdefault(bus, node)
             if other != node:
                 raise ParameterError(f"{node} can", dict(bus), f"different from the bus of {other}: one arm per bus")
-
-
-def _check_names(nodes: Nodes) -> None:
-    """Raise ParameterError if the nodes of an arm name its joints in different orders.
-
-    Efforts are looked up by name: the motors of two exchanged names would each get the torque of the other.
-    """
-    for node in stages(nodes)[0]:
+        # Efforts are looked up by name: the motors of two exchanged names would each get the torque of the other.
         for executable in ("compensator", "simulator"):
             other = f"{node.rpartition('/')[0]}/{executable}"
-            own, others = (nodes.get(name, {}).get("joint_names") for name in (node, other))
-            if own and others and list(own) != list(others):
-                raise ParameterError(f"{node} joint_names", list(own), f"those of {other}, {list(others)}")
+            names, others = (one.get("joint_names") for one in (given, nodes.get(other, {})))
+            if names and others and list(names) != list(others):
+                raise ParameterError(f"{node} joint_names", list(names), f"those of {other}, {list(others)}")
+    for node, given in nodes.items():
+        of_namespace, side = node.split("/")[-2], given.get("side")
+        if side in SIDES and of_namespace in SIDES and side != of_namespace:
+            raise ParameterError(f"{node} side", side, f"{of_namespace}, as its namespace says")
+    imus = [node for node in nodes if node.endswith("/imu")]
+    if len(imus) > 1:
+        raise ParameterError("params", imus, "a file with one imu, which serves both arms: all publish /imu/pitch_yaw")

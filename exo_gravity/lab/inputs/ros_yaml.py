@@ -88,22 +88,15 @@ class _Reader:
         if not isinstance(self._next, yaml.MappingStartEvent):
             raise ParameterError("params", self._source, f"a mapping of {FORM}")
         for key in self._mapping("", lines):
-            self._check_node(key, lines[key])
+            if not NODE.fullmatch(key):
+                expected = f"the full name of one node, of letters A-Z, digits and _, as in {FORM} (line {lines[key]})"
+                raise ParameterError("node name", key, expected)
             nodes[key] = self._parameters(key)
         if not nodes:
             raise ParameterError("params", self._source, f"a mapping of {FORM}")
         if not self._is(yaml.DocumentEndEvent) or not self._is(yaml.StreamEndEvent):
             self._refuse("a second document", "one document, without '---' inside")
         return nodes
-
-    def _check_node(self, node: str, line: int) -> None:
-        if "*" in node:
-            self._refuse(node, "the full name of one node: wildcards are not applied", line)
-        if not node.startswith("/") or node.endswith("/"):
-            raise ParameterError("node name", node, f"fully qualified, as in {FORM} (line {line})")
-        if not NODE.fullmatch(node):
-            expected = f"of letters A-Z, digits and _, no part of it empty or with a digit first (line {line})"
-            raise ParameterError("node name", node, expected)
 
     def _parameters(self, node: str) -> dict[str, Any]:
         """Return the parameters of one node by their dotted names."""
@@ -217,11 +210,7 @@ class _Text(str):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes lists on one line, and no aliases, which rcl does not read."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        """Return True."""
-        return True
+    """Writes lists on one line. It writes no aliases, which rcl does not read: `dumped` copies every list."""
 
 
 _Dumper.add_representer(_Text, lambda dumper, text: dumper.represent_scalar(STRING, text, style='"'))

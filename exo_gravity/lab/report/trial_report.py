@@ -360,20 +360,17 @@ def _conditions(report: Report) -> Iterator[str]:
     yield html.bullets("", [f"{name}: {text}" for name, text in given.items() if text])
     lines = [(arm, report.bag.source(arm).value, *words.in_words) for arm, words in report.settings.items()]
     yield html.table(("Arm", "Source", "Mode", "Support", "Wearer"), [((), [line]) for line in lines])
-    recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
-    yield f"<p>{escape(f'{_criteria_text(report.criteria)} {recorder}')}</p>"
-
-
-def _criteria_text(criteria: HoldCriteria) -> str:
-    """Say what "it held" means."""
+    criteria = report.criteria
     stray, after_push, rate, offset = np.degrees(
         (criteria.max_stray, criteria.max_stray_after_push, 60.0 * criteria.max_rate, criteria.max_offset)
     )
     rated = f"no joint drifts more than {rate:g} degrees per minute, " if math.isfinite(rate) else ""
-    return (
+    held = (
         f"Criteria: within any 10 s of a hold no joint moves more than {stray:g} degrees, {after_push:g} after a push; "
         f"{rated}at the end of a hold the arm is still, and within {offset:g} degrees of where it was let go."
     )
+    recorder = f"Recorded by exo_gravity {session.version}." if session.version else ""
+    yield f"<p>{escape(f'{held} {recorder}')}</p>"
 
 
 def _after_start(bag: Bag) -> list[Event]:

@@ -7,15 +7,14 @@ start.
 """
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.laws import URDF_LAW
-from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.vocabulary import Source
@@ -40,7 +39,9 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     Raises ParameterError or DataError that says why it is not known.
     """
     values = recorded_of(bag.parameters, recording.name, "compensator")
-    settings = _settings_of(values) if values else None
+    law = URDF_LAW if values.get("law") == URDF_LAW else "exact"
+    why = ": the URDF came from a topic, which is not recorded"
+    settings = settings_from({**values, "law": law}, why) if values else None
     if settings is None or not any(settings.wearer_mass):
         return None  # without a wearer in the model, the weight of their arm would count as their torque
     times, rows = bag.trunk[:, 0].tolist(), bag.trunk[:, 1:].tolist()
@@ -63,12 +64,6 @@ def of_arm(bag: Bag, recording: Recording) -> WearerPart | None:
     if not len(curve.time):
         return None
     return WearerPart(curve, share_of(curve, SHARE.window), share_of(curve), joint_shares(curve))
-
-
-def _settings_of(values: Mapping[str, Any]) -> Settings:
-    """Return the settings of recorded parameter values. Raises ParameterError, also if a URDF is not there any more."""
-    law = URDF_LAW if values["law"] == URDF_LAW else "exact"
-    return settings_from({**values, "law": law}, ": the URDF came from a topic, which is not recorded")
 
 
 def sentence(part: WearerPart, source: Source) -> str:

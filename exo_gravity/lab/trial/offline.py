@@ -111,7 +111,11 @@ class OfflineTrial:
                 second += 1.0
                 if should_stop(now) and not self.trouble:
                     self._abort(now, "stopped by the operator")
-            self._follow_script(now)
+            if self._start == math.inf and safety.state in CARRYING:  # the motors are on
+                self.arm.device.start(self.wearer, self._delay)
+                self._start = now + self._delay
+            elif now > self._start + self.script.duration + GRACE:
+                safety.disable(now)
         carrier.bus.stop()
         if safety.refusal:
             self._abort(now, f"the arm was never carried: {safety.refusal}")
@@ -135,15 +139,6 @@ class OfflineTrial:
         if reason and reason != self._reason:
             self._note(now, "compensator", f"withdrawn: {reason}", None)
         self._reason = reason
-
-    def _follow_script(self, now: float) -> None:
-        """Start the wearer when the motors are on, and let the arm down after the script."""
-        if self._start == math.inf:
-            if self.safety.state in CARRYING:
-                self.arm.device.start(self.wearer, self._delay)
-                self._start = now + self._delay
-        elif now > self._start + self.script.duration + GRACE:
-            self.safety.disable(now)
 
     def _abort(self, now: float, why: str, fault: Fault | None = None) -> None:
         why = f"{why} ({self._reason})" if self._reason else why

@@ -121,11 +121,7 @@ class Described:
     @property
     def base(self) -> Point:
         """Origin of joint 1 in the trunk's axes, m."""
-        return tuple(self._hanging[0].tolist())
-
-    @property
-    def _hanging(self) -> np.ndarray:
-        return self.pose([0.0] * len(self.limits.joint_names))[0]
+        return tuple(self.pose([0.0] * len(self.limits.joint_names))[0][0].tolist())
 
     def pose(self, theta: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return where the arm is at `theta` (n,) rad, in the trunk's axes.
@@ -134,10 +130,6 @@ class Described:
         vectors (n, 3) along the links, as far as these are across the axes.
         """
         return self.robot.pose(theta)
-
-    def link_vectors(self) -> np.ndarray:
-        """Return the vector (n, 3) in m from each joint to the next, in the trunk's axes while all angles are 0."""
-        return np.diff(self._hanging, axis=0).round(12)
 
     def bodies(self) -> list[tuple[float, Point]]:
         """Return mass in kg and centre of gravity (3,) in m of each link, from its joint, in the same axes.
@@ -193,8 +185,9 @@ def joint_names(arms: Sequence[Described]) -> list[tuple[str, ...]]:
 
 def _arm(arm: Described, names: Sequence[str], meshes: str) -> Iterator[Element]:
     """Yield the joints and links of one arm."""
-    limits, vectors = arm.limits, arm.link_vectors()
-    _, axes, _ = arm.pose((0.0,) * len(names))
+    limits = arm.limits
+    origins, axes, _ = arm.pose((0.0,) * len(names))
+    vectors = np.diff(origins, axis=0).round(12)  # from each joint to the next
     parent, origin = ROOT, arm.base
     for n, (mass, centre) in enumerate(arm.bodies()):
         end, length = tuple(vectors[n].tolist()), float(np.linalg.norm(vectors[n]))
