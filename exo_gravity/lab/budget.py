@@ -29,8 +29,8 @@ from exo_gravity.core.motors.ak import AK
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.joint_motor import scale_at
 from exo_gravity.core.numbers import Vector, floats
-from exo_gravity.core.safety.limits import HEAT
 from exo_gravity.core.safety.explain import GRAVITY
+from exo_gravity.core.safety.limits import HEAT
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.moments import chain_of
 
