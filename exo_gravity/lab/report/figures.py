@@ -12,8 +12,7 @@ from matplotlib.figure import Figure
 
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.report.html import FAINT, HOLD_COLOUR, INK, PUSH_COLOUR, joint_colours, make_plain
-from exo_gravity.lab.report.table import UNMOVED, joint_labels, per_minute, shown
-from exo_gravity.lab.report.trial_report import unmoved
+from exo_gravity.lab.report.table import UNMOVED, joint_labels, per_minute, shown, unmoved
 from exo_gravity.lab.report.wearer_share import WearerPart
 from exo_gravity.lab.trial.analysis import HoldCriteria, TrialAnalysis
 from exo_gravity.lab.trial.recording import Recording, in_blocks

@@ -128,6 +128,12 @@ def shown(value: float, digits: int) -> str:
     return f"{round(float(value), digits) + 0.0:.{digits}f}" if math.isfinite(value) else "–"
 
 
+def unmoved(hold: Hold) -> str:
+    """Say that no joint moved in a hold, and below what angle a motion would not show: one position code."""
+    code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
+    return "no measurable movement" + (f" (below {code:.3f} degrees)" if math.isfinite(code) else "")
+
+
 def write_csv(folder: Path, kind: Kind, arms: Iterable[Arm], row_head: Callable[[str, float], Row]) -> None:
     """Write a table as CSV, a row for each joint. Without rows, write nothing.
 

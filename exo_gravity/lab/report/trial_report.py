@@ -27,7 +27,7 @@ from exo_gravity.lab.inputs.arms import recorded_of
 from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report import html, table, wearer_share
 from exo_gravity.lab.source import STATEMENTS, of_all
-from exo_gravity.lab.trial.analysis import MIN_HOLD, Hold, HoldCriteria, TrialAnalysis, failures
+from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 from exo_gravity.lab.trial.recording import Recording
 
@@ -199,13 +199,7 @@ def _events(report: Report, recording: Recording, analysis: TrialAnalysis) -> It
             bad = bool(hold.stray.max() > report.criteria.stray_allowed(hold))
             yield _event(recording, f"within 10 s of hold {number}, ", hold.stray, bad)
         else:
-            yield False, 0.0, f"{recording.name}: {unmoved(hold)}"
-
-
-def unmoved(hold: Hold) -> str:
-    """Say that no joint moved in a hold, and below what angle a motion would not show: one position code."""
-    code = math.degrees(np.max(hold.drift_rate_uncertainty) * hold.duration)
-    return "no measurable movement" + (f" (below {code:.3f} degrees)" if math.isfinite(code) else "")
+            yield False, 0.0, f"{recording.name}: {table.unmoved(hold)}"
 
 
 def _event(recording: Recording, what: str, angle: np.ndarray, bad: bool, speed: np.ndarray | None = None) -> Worst:
