@@ -9,39 +9,31 @@ from dataclasses import replace
 
 import pytest
 
-from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.acceptance import STEPS, Bench, BenchStep, Lift, Weight, accept, record
-from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
 from exo_gravity.lab.inputs.arms import configured_arm, node_values
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
-from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
-from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.params import device_of, simulator_table
 from exo_gravity.sim.virtual_arm import VirtualArm
 
-from ..support.simulated_device import SPECS
 from ..support.thorough import quick
 
-RATE = 125.0  # Hz
-WEIGHT = Weight(0.6, 0.2)  # on a forearm that the device carries from the beginning
-MOTORS = tuple(JointMotor(spec, can_id) for can_id, spec in enumerate(SPECS, 1))
-LIMITS = Limits(("a", "b", "c", "elbow"))
+SIMULATOR = "/right/simulator"
+WEIGHT, ON_URDF = Weight(0.6, 0.2), Weight(1.0, 0.2)
 NAMES = [step.__name__ for step in STEPS]
 
 
 class Person:
     """Does what is asked; the loop runs meanwhile."""
 
-    def __init__(self) -> None:
+    def __init__(self, forgets: bool) -> None:
         self.arm: VirtualArm | None = None
         self.said: list[str] = []
-        self.forgets_the_supply = False
+        self.forgets = forgets
 
     def ask(self, request: str, watch: Callable[[], str]) -> None:
-        is_switched = "switch the motors' supply off and on" in request and not self.forgets_the_supply
+        is_switched = "switch the motors' supply off and on" in request and not self.forgets
         for on in (False, True) if is_switched else (True,):
             for motor in self.arm.device.motors:
                 motor.unplugged = not on
@@ -50,68 +42,39 @@ class Person:
                 watch()
 
 
-def loaded_links():
-    """The simulated arm's links with the weight on the last one."""
-    mass, cog = DEFAULT_LINKS.mass.copy(), DEFAULT_LINKS.cog.copy()
-    cog[-1] = (mass[-1] * cog[-1] + WEIGHT.mass * WEIGHT.lever) / (mass[-1] + WEIGHT.mass)
-    mass[-1] += WEIGHT.mass
-    return replace(DEFAULT_LINKS, mass=mass, cog=cog)
-
-
 def acceptance(
-    true: tuple[JointMotor, ...] = MOTORS, assumed: tuple[JointMotor, ...] = MOTORS, **spoil
+    name: str = "sim",
+    weight: Weight = WEIGHT,
+    forgets: bool = False,
+    cold: float = 25.0,
+    assumed_timeout: float | None = None,
+    **simulator: object,
 ) -> list[BenchStep]:
-    """Run the acceptance of a device with the motors `true`, which the file takes for `assumed`.
+    """Run the acceptance of an arm of config, whose device carries the weight from the beginning.
 
-    spoil: attributes of the person, `temperature` of the first motor, or `timeout` of the firmware.
+    forgets: whether the person forgets the supply. cold: temperature of the first motor, degC. assumed_timeout: of the
+    last motor, as the file has it, s. simulator: parameters of the device.
     """
-    firmware = Firmware(timeout=spoil.pop("timeout", 0.0))
-    boards = [SimulatedMotor(one, firmware) for one in true]
-    device = SimulatedDevice(SimulatedArm(ArmConfig(links=loaded_links())), boards)
-    person = Person()
-    for motor in device.motors[1:]:
+    params = packaged_config(f"{name}.yaml")
+    arm, nodes = configured_arm(params, "right"), load(params)
+    none = [0.0] * (len(arm.motors) - 1)
+    nodes[SIMULATOR] |= {"wearer.mass": [*none, weight.mass], "wearer.cog": [*none, weight.lever]}
+    nodes[SIMULATOR] |= {"trunk.pitch": 0.0, "trunk.roll": 0.0, **simulator}
+    device = device_of(node_values(nodes, SIMULATOR, simulator_table(nodes[SIMULATOR])))
+    for motor in device.motors:
         motor.temperature = 25.0
-    device.motors[0].temperature = spoil.pop("temperature", 25.0)
-    for name, value in spoil.items():
-        setattr(person, name, value)
-    return played(device, assumed, LIMITS, MomentModel(DEFAULT_LINKS, True), WEIGHT, person, RATE)
-
-
-def played(
-    device: SimulatedDevice,
-    assumed: tuple[JointMotor, ...],
-    limits: Limits,
-    model: MomentModel,
-    weight: Weight,
-    person: Person,
-    rate: float,
-) -> list[BenchStep]:
-    """Run the acceptance of `device`, which already carries the weight; the rest is what the file says."""
-    lift = Lift(limits, 1.0 / rate)
-    person.arm = arm = VirtualArm(device, lift, assumed, limits, rate)
-    bench = Bench(arm.loop, lift, assumed, model, weight, arm.run, person.ask, arm.clock)
+    device.motors[0].temperature = cold
+    last = arm.motors[-1]
+    motors = (*arm.motors[:-1], last if assumed_timeout is None else replace(last, timeout=assumed_timeout))
+    person, rate = Person(forgets), arm.can_bridge["rate"]
+    lift = Lift(arm.limits, 1.0 / rate)
+    person.arm = played = VirtualArm(device, lift, motors, arm.limits, rate)
+    bench = Bench(played.loop, lift, motors, model_of(arm), weight, played.run, person.ask, played.clock)
     results = accept(bench, person.said.append)
     assert not device.powered
     assert len(person.said) == len(results)
-    arm.bus.stop()
+    played.bus.stop()
     return results
-
-
-def of_urdf(name: str, weight: Weight, scale: float = 1.0) -> list[BenchStep]:
-    """Run the acceptance of an arm of config whose motors give `scale` of what they are commanded."""
-    params = packaged_config(f"{name}.yaml")
-    arm, nodes = configured_arm(params, "right"), load(params)
-    none, simulator = [0.0] * (len(arm.motors) - 1), nodes["/right/simulator"]
-    simulator |= {"wearer.mass": [*none, weight.mass], "wearer.cog": [*none, weight.lever]}
-    simulator["torque_scale"] = [scale] * len(arm.motors)
-    device = device_of(node_values(nodes, "/right/simulator", simulator_table(simulator)))
-    for motor in device.motors:
-        motor.temperature = 25.0
-    return played(device, arm.motors, arm.limits, model_of(arm), weight, Person(), arm.can_bridge["rate"])
-
-
-def with_timeout(timeout: float) -> tuple[JointMotor, ...]:
-    return (*MOTORS[:3], replace(MOTORS[3], timeout=timeout))
 
 
 def failed(results: list[BenchStep]) -> str:
@@ -133,25 +96,19 @@ def test_a_device_as_its_file_says_passes_every_step_and_leaves_a_record():
     assert not record(results[:-1], "right", Source.REAL)["passed"]  # a step is missing
 
 
-def test_an_arm_from_a_urdf_passes_every_step_and_one_with_weak_motors_fails_at_the_known_weight():
-    weight = Weight(1.0, 0.2)
-    results = of_urdf("three_joints", weight)
+def test_an_arm_from_a_urdf_passes_every_step_and_a_weight_that_its_last_joint_hardly_feels_is_refused():
+    results = acceptance("three_joints", ON_URDF)
     assert failed(results) == "", results[-1].sentence
-    assert failed(of_urdf("three_joints", weight, scale=0.6)) == "torque"
-
-
-def test_a_weight_that_the_last_joint_hardly_feels_is_refused():
-    results = of_urdf("three_joints", Weight(0.05, 0.02))
+    results = acceptance("three_joints", Weight(0.05, 0.02))
     assert failed(results) == "torque" and "must be at least 0.3: take a heavier one" in results[-1].sentence
 
 
-WRONG_RANGE = (*MOTORS[:3], replace(MOTORS[3], spec=replace(MOTORS[3].spec, torque_range=9.0)))
 SPOILT = {  # what is the case, the step that fails, and what is said
-    "a cold motor without the offset of its temperature": ({"temperature": -15.0}, "cold", ""),
-    "a supply that was not switched": ({"forgets_the_supply": True}, "zero", ""),
-    "another torque range": ({"true": WRONG_RANGE}, "torque", "ratio"),
-    "no time-out": ({"assumed": with_timeout(0.2)}, "time_out", "the motor held; it must let go"),
-    "a time-out": ({"assumed": with_timeout(0.0), "timeout": 0.2}, "time_out", "the motor let go; it must hold"),
+    "a cold motor without the offset of its temperature": ({"cold": -15.0}, "cold", ""),
+    "a supply that was not switched": ({"forgets": True}, "zero", ""),
+    "weak motors": ({"torque_scale": [0.6] * 4}, "torque", "ratio"),
+    "no time-out": ({"assumed_timeout": 0.2}, "time_out", "the motor held; it must let go"),
+    "a time-out": ({"assumed_timeout": 0.0, "firmware.timeout": 0.2}, "time_out", "the motor let go; it must hold"),
 }
 
 
@@ -160,8 +117,3 @@ def test_what_is_not_as_the_file_says_fails_at_its_step(case):
     spoil, step, said = SPOILT[case]
     results = acceptance(**spoil)
     assert failed(results) == step and said in results[-1].sentence
-
-
-def test_the_moments_of_the_weight_are_those_of_the_loaded_links():
-    bench = Bench(None, None, MOTORS, MomentModel(DEFAULT_LINKS, True), WEIGHT, None, None, None)
-    assert bench.moments == pytest.approx(loaded_links().moments)

@@ -75,15 +75,6 @@ def test_rmse_largest_error_and_torque_are_those_of_a_known_error():
     assert row.largest[2] == pytest.approx(1.1)
 
 
-def test_the_arm_is_read_from_dotted_and_nested_names_and_its_limits_from_the_bridge_beside_it(params_with):
-    mass, cog = [0.1, 0.2, 0.3, 0.4], [0.01, 0.02, 0.03, 0.04]
-    limits = {"position_min": [-1.0, 0.0, 0.0, 0.0], "position_max": [1.0, 1.5, 1.5, 2.0]}
-    for named in ({"robot": {"mass": mass, "cog": cog}}, {"robot": {}, "robot.mass": mass, "robot.cog": cog}):
-        found = configured_arm(params_with("sim.yaml", {COMPENSATOR: {**named, "gravity": 9.8}, BRIDGE: limits}))
-        assert found.robot == ArmModel((0.05, 0.13, 0.3, 0.3), cog, mass, gravity=9.8)
-        assert found.high.tolist() == limits["position_max"]
-
-
 def test_all_checks_hold_on_the_packaged_arm_and_a_table_and_figures_are_written(quick):
     code, printed, folder, _ = quick
     assert code == 0 and "FAILED" not in printed and printed.count("\nheld") == 4

@@ -31,6 +31,7 @@ from exo_gravity.lab.view.scene import LINE, SPHERE, ArmView, arm_shapes
 from exo_gravity.lab.view.urdf import COLOURS, Described, described
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
+COLOURS_OF_A_GIF, SAMPLES = 64, 12  # one palette for all frames keeps it small
 INK, LEADER = "#282c34", "#969ca4"
 NO_TORQUE = 0.05  # Nm, below which a motor is off
 STEPS = {"move": "the wearer moves the arm", "hold": "hands off", "push": "a push"}
@@ -64,7 +65,11 @@ def write_clip(bag: Bag, path: Path, step: float, frame_rate: int, console: Cons
     try:
         stage = Stage(bag, GIF_SIZE if is_gif else SIZE)
         if is_gif:
-            first, *others = (Image.fromarray(stage.picture(time)).quantize() for time in drawn)
+            few = np.concatenate([stage.picture(time) for time in times[:: 1 + len(times) // SAMPLES]])
+            found = np.unique(few.reshape(-1, 3), axis=0)  # each once: a torque is drawn by few pixels
+            palette = Image.fromarray(found[None]).quantize(COLOURS_OF_A_GIF)
+            drawings = (Image.fromarray(stage.picture(time)) for time in drawn)
+            first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in drawings)
             duration = round(1000 / frame_rate)  # ms
             first.save(path, save_all=True, append_images=others, duration=duration, loop=0)
             return
