@@ -73,7 +73,9 @@ class Recordings:
         return {"recording": recording, "trial": self._progress, "saved": self._saved, "session": session}
 
     def close(self) -> None:
-        """End the trial. The recorder ends with this process, by its standard input."""
+        """End the recording and the trial."""
+        if self._recorder is not None:
+            self._recorder.process(RECORDER).terminate()
         if self._trial is not None and self._trial.returncode is None:
             self._trial.terminate()
 

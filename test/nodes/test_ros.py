@@ -24,7 +24,7 @@ import pytest
 import rclpy
 import yaml
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import LoggerLevel, ParameterValue
@@ -53,16 +53,16 @@ from exo_gravity.core.params import Param
 from exo_gravity.hardware import network
 from exo_gravity.hardware.network import keep_to_this_machine, open_to_others
 from exo_gravity.lab.inputs.parameter_file import load
-from exo_gravity.nodes.ros import inner, subscriptions
+from exo_gravity.nodes.ros import inner, pose_prompt, subscriptions
 from exo_gravity.nodes.ros import run as running
 from exo_gravity.nodes.ros.inner import Until, prepare_transitions
-from exo_gravity.nodes.ros.messages import milliseconds, row
+from exo_gravity.nodes.ros.messages import NO_POSE, POSE_TO_CONFIRM, milliseconds, row
 from exo_gravity.nodes.ros.parameters import NodeParameters, accept_changes, declare
 from exo_gravity.nodes.ros.run import handle_signals
 from exo_gravity.nodes.ros.subscriptions import NEWEST_ONLY, PolledSubscription, Publishers
 
 from ..support import CONFIG
-from ..support.node_thread import Served, own_node
+from ..support.node_thread import NodeThread, Served, own_node
 from ..support.waiting import pause, wait_until
 
 keep_to_this_machine()
@@ -326,6 +326,38 @@ def test_an_executor_that_stood_still_knows_it_without_stamps_of_the_middleware(
     served.executor.spin_once(0.0)
     time.sleep(0.3)
     assert served.executor._age(SimpleNamespace()) >= 0.3
+
+
+def test_a_person_at_a_terminal_is_asked_once_for_each_question_and_their_yes_reaches_the_bridge(monkeypatch, capsys):
+    thread, asked, confirmed, reports = NodeThread("can_bridge", namespace="right"), [], [], itertools.count()
+    (bridge,) = thread.nodes
+    statuses = bridge.create_publisher(DiagnosticArray, "/diagnostics", 1)
+
+    def confirm(_request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        confirmed.append(next(reports))
+        response.message = "confirmed (degrees)"
+        return response
+
+    def report() -> None:
+        is_asking = not confirmed or next(reports) > confirmed[0] + 10
+        pair = KeyValue(key=POSE_TO_CONFIRM, value="b 0, d 23" if is_asking else NO_POSE)
+        statuses.publish(DiagnosticArray(status=[DiagnosticStatus(name="right/can_bridge", values=[pair])]))
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        if confirmed:
+            raise EOFError
+        return "y"
+
+    bridge.create_service(Trigger, "~/confirm_pose", confirm)
+    bridge.create_timer(0.05, report)
+    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr(sys, "argv", ["pose_prompt", "/right/can_bridge"])
+    thread.start()
+    pose_prompt.main()
+    thread.close()
+    assert len(asked) == 2 and "/right/can_bridge: does the arm hang as it is drawn, joints at b 0, d 23" in asked[0]
+    assert "/right/can_bridge: confirmed (degrees)" in capsys.readouterr().out
 
 
 # Discovery, signals and the clock

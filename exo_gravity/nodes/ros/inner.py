@@ -117,11 +117,10 @@ def wake(node: Node) -> None:
 
 
 def guard(node: Node) -> None:
-    """Let rclpy's own services of `node` answer a failure where their handlers raise; it is logged once."""
-    said: set[str] = set()
+    """Let rclpy's own services of `node` answer a failure where their handlers raise; it is logged now and then."""
     for service in node.services:
         if getattr(service.callback, "__module__", "").startswith("rclpy."):
-            service.callback = partial(_guarded, node, said, service.srv_name, service.callback)
+            service.callback = partial(_guarded, node, service.srv_name, service.callback)
 
 
 def prepare_transitions(node: Node, prepare: Callable[[ChangeState.Request], Coroutine[None, None, str]]) -> None:
@@ -143,18 +142,14 @@ def prepare_transitions(node: Node, prepare: Callable[[ChangeState.Request], Cor
             service.callback_group = ReentrantCallbackGroup()
 
 
-def _guarded(
-    node: Node, said: set[str], name: str, callback: Callable[[Any, Any], Any], request: Any, response: Any
-) -> Any:
+def _guarded(node: Node, name: str, callback: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
     try:
         return callback(request, response)
     except Exception as error:
         if _is_ours(error):
             raise
         reason = f"{name}: a request that cannot be carried out: {type(error).__name__}: {error}"
-    if name not in said:
-        said.add(name)
-        node.get_logger().warning(reason)
+    node.get_logger().warning(reason, throttle_duration_sec=60.0)
     return _failure(request, response, reason)
 
 
