@@ -13,7 +13,6 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.wait_for_message import wait_for_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from exo_gravity.core.arm.tilt import SIDES
@@ -165,6 +164,8 @@ def _description(node: Node, values: dict[str, Any]) -> str:
     """Return the URDF from its file or topic. Raises ParameterError."""
     path, topic = values["urdf.file"], values["urdf.topic"]
     if not path:
+        from std_msgs.msg import String  # as below
+
         arrived, message = wait_for_message(String, node, topic, qos_profile=LATCHED, time_to_wait=DESCRIPTION_TIMEOUT)
         if not arrived:
             raise ParameterError("urdf.topic", topic, f"published, latched, within {DESCRIPTION_TIMEOUT:g} s")
@@ -211,6 +212,8 @@ class MultiArrayInterface(PeriodicThread):
     """
 
     def __init__(self, node: Node, names: Sequence[str], values: Mapping[str, Any]) -> None:
+        from std_msgs.msg import Float64MultiArray  # not for the paper's arm: 5 % of a start
+
         super().__init__("fade", self._tick, TICK)
         self.topic = values["multi_array.joint_states"]
         self._names = names

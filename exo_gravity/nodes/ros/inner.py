@@ -16,7 +16,6 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -123,7 +122,7 @@ def guard(node: Node) -> None:
             service.callback = partial(_guarded, node, service.srv_name, service.callback)
 
 
-def prepare_transitions(node: Node, prepare: Callable[[ChangeState.Request], Coroutine[None, None, str]]) -> None:
+def prepare_transitions(node: Node, prepare: Callable[[Any], Coroutine[None, None, str]]) -> None:
     """Await `prepare` before each transition that the service change_state asks for; if it returns why not, refuse.
 
     rclpy's own handler does not await: a transition that takes long would keep the executor from everything else.
@@ -137,7 +136,7 @@ def prepare_transitions(node: Node, prepare: Callable[[ChangeState.Request], Cor
         return callback(request, response)
 
     for service in node.services:
-        if service.srv_type is ChangeState:
+        if service.srv_name.endswith("/change_state"):
             service.callback = partial(change_state, service.callback)
             service.callback_group = ReentrantCallbackGroup()
 
