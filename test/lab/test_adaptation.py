@@ -100,21 +100,18 @@ def test_without_a_usable_estimate_the_support_falls_back(is_known: bool) -> Non
     assert arm.adaptation.requested == pytest.approx(0.4, abs=0.006)
 
 
-@pytest.mark.parametrize("off", [{"support_adapts": False}, {"mode": "one_g"}])
-def test_nothing_is_asked_for_while_nothing_may_adapt(off: dict[str, Any]) -> None:
-    arm = Arm(**off)
-    assert arm.move(-0.05, 5.0) == 0.4 and arm.adaptation.requested is None
-
-
 @pytest.mark.parametrize(("gap", "is_kept"), [(0.8 * REQUEST.expires, True), (1.2 * REQUEST.expires, False)])
-def test_a_gap_changes_nothing_until_the_request_has_expired(gap: float, is_kept: bool) -> None:
+def test_a_gap_changes_nothing_until_the_request_has_expired_and_nothing_is_asked_for_where_nothing_may_adapt(
+    gap: float, is_kept: bool
+) -> None:
     arm = raised()
-    requested = arm.adaptation.requested
+    expected = arm.adaptation.requested if is_kept else 0.4
     arm.now += gap
     arm.angle -= 0.5
-    expected = requested if is_kept else 0.4
     assert arm.move(0.0, 0.5) == pytest.approx(expected, abs=0.01)
     assert arm.adaptation.requested == pytest.approx(expected, abs=0.01)
+    arm.settings = replace(arm.settings, **({"support_adapts": False} if is_kept else {"mode": "one_g"}))
+    assert arm.move(-0.05, 5.0) == 0.4 and arm.adaptation.requested is None
 
 
 @pytest.mark.parametrize("adapts", [True, False])

@@ -137,17 +137,8 @@ SIMULATED, REAL, UNKNOWN = Source.SIMULATED, Source.REAL, Source.UNKNOWN
 def test_an_arm_is_real_only_if_its_file_names_a_bus_that_leads_to_motors(interface, channel, has_simulator, source):
     bridge = {} if interface is None else {"can.interface": interface, "can.channel": channel}
     assert source_of(bridge, has_simulator) is source
-
-
-def test_several_arms_are_real_only_together():
-    assert of_all([REAL, REAL]) is REAL
+    assert of_all([REAL, REAL]) is REAL and of_all([REAL, UNKNOWN]) is of_all([]) is UNKNOWN
     assert of_all([REAL, SIMULATED]) is of_all([SIMULATED, UNKNOWN]) is SIMULATED
-    assert of_all([REAL, UNKNOWN]) is of_all([]) is UNKNOWN
-
-
-@pytest.mark.parametrize("code", ["", "P01", "0042", "pilot-3_b", "A" * 32])
-def test_a_code_names_the_folder_of_the_subject_and_the_day_and_without_one_there_is_none(code):
-    assert Session(code).folder(date(2026, 3, 14)) == (f"{code}/2026-03-14" if code else "")
 
 
 NO_CODES = ("Anna Meier", "../P01", "a/b", ".", "-P01", "Jörg", "P01\n", "A" * 33, "P.1", "CON:")
@@ -156,7 +147,9 @@ NO_TEXTS = ({"note": "x" * 1001}, {"note": "calm \ud83d"}, {"protocol": "a\0"}, 
 
 
 @pytest.mark.parametrize("wrong", [*({"subject": code} for code in NO_CODES), *NO_TEXTS])
-def test_what_is_no_code_for_a_folder_and_no_whole_text_of_this_length_is_refused_by_name(wrong):
+def test_a_code_names_a_folder_and_what_is_none_and_no_whole_text_of_this_length_is_refused_by_name(wrong):
+    for code in ("P01", "0042", "pilot-3_b", "A" * 32):
+        assert Session(code).folder(date(2026, 3, 14)) == f"{code}/2026-03-14" and not Session().folder(date.today())
     ((name, value),) = wrong.items()
     with pytest.raises(ParameterError, match="subject = .*: must be a code" if value in NO_CODES else name):
         Session(**wrong)

@@ -190,28 +190,23 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     arm.wait_until(lambda: arm.publish(1) or process.poll() is not None)
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
-    assert len(read_bag(tmp_path / "bag").recordings[0].time) > 50
+    assert len(read_bag(tmp_path / "bag").recordings[0].time) > 20  # all but what was in the last chunk
 
 
 @pytest.mark.thorough
 def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_recording(arm, tmp_path):
     process = start(tmp_path / "bag")
     arm.wait_until(arm.is_recorded)
-    for k in range(20):
-        arm.publish(k)
-    time.sleep(0.2)  # so that all arrive before the recorder stops
-    process.send_signal(signal.SIGSTOP)
-    for k in range(20, 3000):
-        arm.publish(k)
-    process.send_signal(signal.SIGCONT)
-    for k in range(3000, 3051):
+    for k in range(3051):
+        if k in (20, 3000):
+            time.sleep(0.2)  # so that all arrive before the recorder stops
+            process.send_signal(signal.SIGSTOP if k == 20 else signal.SIGCONT)
         arm.publish(k)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0
     missed, unwritten = map(int, re.findall(r"messages lost so far: (\d+) did not arrive, (\d+) were not", errors)[-1])
-    found = [len(recorded(tmp_path / "bag", topic)) for topic, _, _ in FIELDS]
-    assert unwritten == 0 and missed >= sum(3050 - count for count in found) > 100
+    lost = sum(3051 - len(recorded(tmp_path / "bag", topic)) for topic, _, _ in FIELDS)
+    assert process.returncode == unwritten == 0 and missed >= lost > 100
     expected = f"the recorder lost messages: {missed} did not arrive"
     assert any(expected in note for note in read_bag(tmp_path / "bag").notes)
 

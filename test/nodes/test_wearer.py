@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
@@ -221,35 +219,24 @@ def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_wh
 # Compensator, wearer and the tools make the same arm of a URDF whose chain has joints that are not the arm's
 
 
-def given_of(urdf: Path, names: list[str], hand: str = "") -> dict[str, Any]:
-    own = {"joint_names": names, "urdf.file": str(urdf), "urdf.hand": hand, "max_effort": [30.0] * len(names)}
-    return {"law": "urdf", "use_imu": False, **own}
-
-
-def compensator(given: dict[str, Any]) -> Node:
-    overrides = [Parameter(name, value=value) for name, value in given.items()]
-    with_them: dict[str, Any] = {"automatically_declare_parameters_from_overrides": True}
-    return rclpy.create_node("compensator", parameter_overrides=overrides, **with_them)
-
-
-def files(given: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    count = len(given["joint_names"])
-    of_joints = {"motor": ["AK80-9"] * count, "can_id": list(range(1, count + 1)), "max_effort": [9.0] * count}
-    ranges = {"position_min": [-1.0] * count, "position_max": [1.0] * count}
-    bus = {"can.interface": "virtual", "can.channel": "one_urdf_arm"}
-    bridge = {"joint_names": given["joint_names"], **bus, **of_joints, **ranges}
-    return {"/right/can_bridge": bridge, "/right/compensator": given}
-
-
 def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(wearer, tmp_path):
     text, names = random_chain(3, seed=5)
     urdf, listed = tmp_path / "chain.urdf", [names[0], names[2]]
     urdf.write_text(text)
-    given = given_of(urdf, listed, "hand")
-    node = compensator(given)
+    given = {"law": "urdf", "use_imu": False, "joint_names": listed, "urdf.file": str(urdf), "urdf.hand": "hand"}
+    given["max_effort"] = [30.0] * 2
+    bridge = {
+        "joint_names": listed, "can.interface": "virtual", "can.channel": "one_urdf_arm", "motor": ["AK80-9"] * 2,
+        "can_id": [1, 2], "max_effort": [9.0] * 2, "position_min": [-1.0] * 2, "position_max": [1.0] * 2,
+    }  # fmt: skip
+    own = [Parameter(name, value=value) for name, value in given.items()]
+    node = rclpy.create_node(
+        "compensator", parameter_overrides=own, automatically_declare_parameters_from_overrides=True
+    )
     _, values, read, arm = declared(node)
     assert arm.fixed == (names[1],)
-    made = (read(values), wearer._read(values), read_arm(files(given), "/right").settings)
+    of_tools = read_arm({"/right/can_bridge": bridge, "/right/compensator": given}, "/right").settings
+    made = read(values), wearer._read(values), of_tools
     oracle = MujocoArm(text, listed)
     for theta in np.random.default_rng(0).uniform(-2.0, 2.0, (10, 2)):
         for settings in made:

@@ -55,10 +55,12 @@ class Timeline:
         A time of 0 is unknown: such a message has the time of its neighbours in the file.
         """
         part, last = self.part(ordinal), len(self.first) - 1
-        low = self.begin[part] - np.where(part == 0, CLOCK.outside, CLOCK.edge)
-        high = self.end[part] + np.where(part == last, CLOCK.outside, CLOCK.edge)
-        neighbours = self.known[np.minimum(np.searchsorted(self.ordinal, ordinal), len(self.known) - 1)]
-        return np.where(arrival > 0, np.clip(arrival + self.offset[part], low, high), neighbours)
+        low = self.begin - np.where(np.arange(last + 1) == 0, CLOCK.outside, CLOCK.edge)
+        high = self.end + np.where(np.arange(last + 1) == last, CLOCK.outside, CLOCK.edge)
+        times = np.clip(arrival + self.offset[part], low[part], high[part])
+        lost = np.flatnonzero(arrival <= 0)
+        times[lost] = self.known[np.minimum(np.searchsorted(self.ordinal, ordinal[lost]), len(self.known) - 1)]
+        return times
 
     def of(self, series: JointSeries) -> tuple[np.ndarray, np.ndarray, float]:
         """Return times of arrival (n,) and stamps (n,) in ns, and the share of stamps that are near.

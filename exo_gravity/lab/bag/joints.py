@@ -36,7 +36,8 @@ class JointArrays(Decoder):
         super().__init__(JOINT_STATE)
         self.topic, self.fields, self.every = topic, tuple(fields), every
         self._seen: dict[tuple[str, ...], int] = {}  # messages by their joints, also those that are not kept
-        self._kept: dict[tuple[str, ...], list[JointSeries]] = {}
+        # Columns grow in place: parts that are joined in the end need twice the memory.
+        self._kept: dict[tuple[str, ...], list[bytearray]] = {}
 
     def add(self, batch: Batch) -> None:
         """Decode the messages of a batch."""
@@ -57,8 +58,9 @@ class JointArrays(Decoder):
                 for number, field in enumerate(self.fields):
                     if field in given:
                         values[:, number] = numbers[field]
-            found = JointSeries(batch.ordinal[rows], batch.arrival[rows], stamp, values)
-            self._kept.setdefault(names, []).append(found)
+            columns = self._kept.setdefault(names, [bytearray() for _ in JointSeries._fields])
+            for column, found in zip(columns, (batch.ordinal[rows], batch.arrival[rows], stamp, values), strict=True):
+                column += found.tobytes()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,14 +77,17 @@ class JointArrays(Decoder):
         They are forgotten then.
         """
         chosen, others = list[JointSeries](), 0
-        for names, parts in self._kept.items():
+        for names in [*self._kept]:
+            *times, values = self._kept.pop(names)
             if set(joints) <= set(names):
+                found = np.frombuffer(values, np.float32).reshape(-1, len(self.fields), len(names))
                 order = [names.index(joint) for joint in joints]
-                chosen += [part._replace(values=part.values[:, :, order]) for part in parts]
+                found = found if names == tuple(joints) else found[:, :, order]
+                ordinal, arrival, stamp = (np.frombuffer(column, np.int64) for column in times)
+                chosen.append(JointSeries(ordinal, arrival, stamp, found))
             else:
                 others += self._seen[names]
-        self._kept.clear()
-        series = JointSeries(*map(np.concatenate, zip(*chosen, strict=True)))
+        series = JointSeries(*map(np.concatenate, zip(*chosen, strict=True))) if len(chosen) > 1 else chosen[0]
         if np.any(np.diff(series.ordinal) < 0):
             order_of_file = np.argsort(series.ordinal, kind="stable")
             series = JointSeries(*(column[order_of_file] for column in series))

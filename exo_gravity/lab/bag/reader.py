@@ -301,8 +301,9 @@ class _Contents:
         kept = self._plausible(name, names, values[:, FIELDS.index("position")])
         if not kept.any():
             return None
-        order = np.flatnonzero(kept)[np.argsort(arrival[kept], kind="stable")]
-        arrival, stamp, values = arrival[order], stamp[order], values[order]
+        if not kept.all() or np.any(np.diff(arrival) < 0):
+            order = np.flatnonzero(kept)[np.argsort(arrival[kept], kind="stable")]
+            arrival, stamp, values = arrival[order], stamp[order], values[order]
         stamped = near > 0.5 and bool(np.all(np.diff(stamp) >= -CLOCK.back))
         clock = np.maximum.accumulate(stamp) if stamped else arrival
         command, time = self._commands(topic, names, clock, stamped), (clock - self.start) / 1e9

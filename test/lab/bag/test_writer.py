@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, ReaderError, StoragePlugin, Writer
@@ -51,15 +50,6 @@ def bag(opened):
     opened.close()
     assert opened.error is None
     return opened.path
-
-
-def test_mcap_decodes_the_joint_names_from_the_schema_in_the_file(bag):
-    with (bag / "bag.mcap").open("rb") as file:
-        decoded = list(make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    assert [message.position[0] for _, _, _, message in decoded] == [k / 1000 for k in range(100)]
-    schema, channel, record, message = decoded[7]
-    assert (schema.name, channel.topic, record.log_time) == (JOINT_STATE, STATES, START + 7)
-    assert list(message.name) == NAMES
 
 
 def test_rosbags_reads_topics_types_messages_and_the_offered_quality_of_service_and_hashes_are_those_of_jazzy(bag):
