@@ -389,8 +389,8 @@ def test_memory_follows_the_samples_that_are_kept(tmp_path):
             peaks.append(tracemalloc.get_traced_memory()[1])
             tracemalloc.stop()
     whole, thinned = (after - before for before, after in zip(peaks[:2], peaks[2:], strict=True))
-    assert 6000 * 100 < whole < 6000 * 500  # bytes of the two messages of a sample, which have 470
-    assert thinned < 6000 * 120  # the commands alone
+    assert whole < 6000 * 200  # bytes of the two messages of a sample, which have 470
+    assert thinned < 6000 * 80  # the commands alone
 
 
 # What is on the topics
