@@ -135,20 +135,20 @@ def test_a_clamped_joint_is_damped_while_it_sinks_and_free_while_it_is_lifted():
     asked = (3.0, 9.0, 2.0, 3.0)
     arm = barrier()
     sinking = arm.shape(0.2, joints(velocity=-0.3), asked, WHOLE, asked, NOTHING)
-    assert sinking.damping == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
+    assert sinking[1] == pytest.approx((DAMPING, DAMPING, 0.0, DAMPING))
     lifted = arm.shape(0.1, joints(velocity=0.3), asked, WHOLE, asked, NOTHING)
-    assert lifted.damping == pytest.approx((0.5 * DAMPING, 0.5 * DAMPING, 0.0, 0.5 * DAMPING))
+    assert lifted[1] == pytest.approx((0.5 * DAMPING, 0.5 * DAMPING, 0.0, 0.5 * DAMPING))
     hot = barrier().shape(0.2, joints(velocity=-0.3, temperature=80), asked, WHOLE, (1.0,) * 4, NOTHING)
-    assert min(hot.damping) == pytest.approx(DAMPING)
+    assert min(hot[1]) == pytest.approx(DAMPING)
 
 
 def test_a_wall_pushes_back_before_a_joint_limit():
     low, high = LIMITS.position_min[3], LIMITS.position_max[3]
     for position, sign in ((low + 0.05, 1), (high - 0.05, -1)):
-        limited = barrier().shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, NOTHING)
-        assert limited.effort[3] == pytest.approx(sign * 1.25)
-        assert limited.damping[3] == 5.0
-        assert "soft wall (d)" in limited.acted
+        arm = barrier()
+        effort, damping = arm.shape(1.0, joints(position=position), NOTHING, WHOLE, NOTHING, NOTHING)
+        assert effort[3] == pytest.approx(sign * 1.25) and damping[3] == 5.0
+        assert "soft wall (d)" in arm.acted
 
 
 def descend(joint: JointDescent, velocity: float, duration: float) -> list[float]:

@@ -249,7 +249,7 @@ ROWS: dict[str, Sequence[Step]] = {
     "late efforts are ridden through under rising damping, which falls again": [
         carried, let(effort_age=LATE), wait(), has(lambda arm: 0.0 < min(arm.drive.damping) < 0.2),
         wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 1),
-        has(lambda arm: min(arm.drive.damping) == pytest.approx(DAMPING * 0.104 / DESCENT.damping_rise)),
+        has(lambda arm: min(arm.drive.damping) == pytest.approx(0.104 * DESCENT.damping_rate)),
         has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)),
         let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: max(arm.drive.damping) == 0.0),
         has(lambda arm: max(arm.steps) <= 1e-6),
@@ -488,7 +488,7 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
         run.changes = [{"position": v * moved, "velocity": v * run.damped} for v in speeds]
         dampings.append(run.cycle().drive.damping)
     assert run.drive.damping == NO_TORQUE
-    assert np.abs(np.diff(dampings, axis=0)).max() <= DAMPING / DESCENT.damping_rise * PERIOD * 1.001
+    assert np.abs(np.diff(dampings, axis=0)).max() <= DESCENT.damping_rate * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE
 
 

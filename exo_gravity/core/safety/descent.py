@@ -56,8 +56,8 @@ class Descent:
     brake_growth: float = 3.0  #: Nm/s beyond it: gravity of an arm of 75 kg changes no faster while it sinks
     min_fade_rate: float = 0.5  #: Nm/s
     fade_time: float = 2.0  #: s from full torque to none: the wearer has time to take over the arm
-    #: s to DAMPING, less of which lets a joint swing longer; a rise at once would be a torque step
-    damping_rise: float = 0.2
+    #: Nm s/rad a second to DAMPING, more of which lets a joint swing longer; a rise at once would be a torque step
+    damping_rate: float = DAMPING / 0.2
     damping_fade: float = 0.4  #: s, time constant
     min_damping: float = 0.01  #: Nm s/rad; smaller values become zero
     #: Nm s/rad that holds no joint: 0.07 Nm at `speed`. A swing without friction keeps so much
@@ -68,11 +68,6 @@ class Descent:
     blind_hold: float = 3.0  #: s for which a silent joint's torque stays: a bus that is back by then finds no step
     blind_fade_time: float = 8.0  #: s from full torque to none of a silent joint, as slowly as a horizontal arm sinks
 
-    @property
-    def damping_rate(self) -> float:
-        """Nm s/rad a second, by which damping rises."""
-        return DAMPING / self.damping_rise
-
 
 DESCENT = Descent()
 
@@ -80,8 +75,8 @@ DESCENT = Descent()
 class JointDescent:
     """One joint on its way down: `effort` in Nm and `damping` in Nm s/rad are to be applied now.
 
-    effort, damping: what the motor applies when the descent starts; the damping first rises to DAMPING, within
-    `damping_rise`. max_effort: Nm, which the brake exceeds only where `effort` does.
+    effort, damping: what the motor applies when the descent starts; the damping first rises to DAMPING.
+    max_effort: Nm, which the brake exceeds only where `effort` does.
     """
 
     def __init__(self, effort: float, damping: float, max_effort: float) -> None:

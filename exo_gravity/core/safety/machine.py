@@ -373,11 +373,11 @@ class SafetyMachine:
         is_guided = damped or self.state is State.RAMPING_IN
         share = [1.0 - left for left in self._rise.shares]
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
-        wanted = (DAMPING,) * len(guided) if self.ride.is_riding else guided
-        shaped = self.shaper.shape(self._dt, joints, effort, share, self._sent.effort, wanted)
-        self.acted.update(dict.fromkeys(shaped.acted, self._now))
-        damping = [max(self._guard, own) for own in shaped.damping]
-        return self._powered(shaped.effort, damping, self._commands)
+        late = DAMPING if self.ride.is_riding else 0.0
+        sent = self._sent.effort
+        torque, damping = self.shaper.shape(self._dt, joints, effort, share, sent, guided, late, self._guard)
+        self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
+        return self._powered(torque, damping, self._commands)
 
     def _descend(self) -> Drive:
         """Return a drive that lowers the arm, or stands once it is down."""

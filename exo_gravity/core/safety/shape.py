@@ -2,7 +2,9 @@
 """The last hand on every drive: no torque that is asked for, whatever asks for it, throws an arm.
 
 `shape` limits the torque of an arm that is carried, in this order: soft wall before a joint limit, clamp to the
-permitted torque (derated when hot), rate limit. A joint that moves against torque which it does not get is damped.
+permitted torque (derated when hot), rate limit. Its damping is the largest that any cause asks for. What a guided
+motion, late efforts, and torque that a moving joint does not get ask for rises and falls slowly; what the soft wall and
+a pause of the loop ask for counts at once.
 
 `damping` then bounds each drive that leaves the safety machine, whether the arm is carried or let down. With tau the
 feed-forward of a joint, v > 0 its speed along tau, V = `driven_speed` and F = V + BARRIER.span, the motor gets at least
@@ -34,7 +36,6 @@ driven joint is not.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
@@ -77,81 +78,135 @@ class VibrationLimits:
 BARRIER, VIBRATION = BarrierTuning(), VibrationLimits()
 
 
-class Shaped(NamedTuple):
-    """What a carried arm gets of what is asked for."""
+class JointShaper:
+    """Shapes what the motor of joint `i` gets; peak: the most that it can apply, Nm s/rad."""
 
-    effort: tuple[float, ...]  #: (n,) Nm
-    damping: tuple[float, ...]  #: (n,) Nm s/rad
-    acted: frozenset[str]  #: which limits acted, for people
+    def __init__(self, limits: Limits, i: int, peak: float) -> None:
+        self._name, self._limits, self._i, self._peak = limits.joint_names[i], limits, i, peak
+        self._slowly = 0.0  # Nm s/rad, of the causes that neither rise nor fall at once
+        self._slow = 0.0  # rad/s, the speed low-passed by BARRIER.lead
+        self._brake = self._given = 0.0  # Nm s/rad, and all that was given last
+        self._steady = math.inf  # Nm s/rad, the most that the joint gets of what is asked for
+        self._way = 1.0  # 1 or -1, in which it was last faster than VIBRATION.speed
+        self._since = math.inf  # s since it has turned
+
+    def shape(
+        self,
+        dt: float,
+        sample: JointSample,
+        effort: float,
+        share: float,
+        before: float,
+        guided: float,
+        late: float,
+        pause: float,
+        acted: set[str],
+    ) -> tuple[float, float]:
+        """Return torque (Nm) and damping (Nm s/rad) of a carried joint; see `Shaper.shape`. Raises ParameterError."""
+        most, limit = self._limits.max_command[self._i], self._limits.max_effort[self._i]
+        if not abs(effort) <= most:
+            raise ParameterError(f"effort of {self._name}", effort, f"from -{most:g} to {most:g} Nm")
+        spring, wall = self._wall(sample)
+        colder = HEAT.span if sample.temperature is None else HEAT.most - sample.temperature
+        permitted = limit * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
+        wanted = share * (effort + spring)
+        clamped = max(-permitted, min(permitted, wanted))
+        given = limited(clamped, before, MAX_EFFORT_RATE * dt)
+        # The compensator may have clamped it already: all that is permitted counts as clamped.
+        missing = given if abs(given) >= permitted else wanted - given
+        withheld = DAMPING if missing * sample.velocity < 0.0 else 0.0
+        self._slowly = limited(max(guided, late, withheld), self._slowly, DESCENT.damping_rate * dt)
+        limiting = {
+            "soft wall": wall > 0.0,
+            "derating": permitted < limit,
+            "max_effort": clamped != wanted,
+            "max_effort_rate": given != clamped,
+        }
+        acted.update([f"{name} ({self._name})" for name, acts in limiting.items() if acts])
+        return given, max(self._slowly, wall, pause)
+
+    def _wall(self, sample: JointSample) -> tuple[float, float]:
+        """Return spring in Nm and damping in Nm s/rad of the soft wall in which the joint is; zeros outside."""
+        above = sample.position - self._limits.position_max[self._i] + WALL.width
+        below = self._limits.position_min[self._i] + WALL.width - sample.position
+        depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
+        # Once the joint leaves the wall, no spring pushes it.
+        is_left = math.copysign(sample.velocity, sample.velocity * depth) < -WALL.release
+        spring = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
+        return spring, DAMPING * min(1.0, abs(depth) / WALL.edge)
+
+    def bound(
+        self, dt: float, sample: JointSample, is_silent: bool, effort: float, damping: float, is_late: bool
+    ) -> float:
+        """Return the damping in Nm s/rad of the joint's part of a drive; see `Shaper.damping`."""
+        first, velocity = self._limits.driven_speed, sample.velocity if math.isfinite(sample.velocity) else 0.0
+        change = velocity - self._slow  # over the lead, or over a cycle that is longer
+        self._slow += min(1.0, dt / BARRIER.lead) * change
+        sign = math.copysign(1.0, effort)
+        ahead = sign * velocity + max(0.0, BARRIER.lead / max(BARRIER.lead, dt) * sign * change)
+        falling = max(0.0, 1.0 - dt / BARRIER.hold) * self._brake
+        self._brake = needed = max(_rising(effort, ahead, first, first + BARRIER.span), falling)
+        self._steady += VIBRATION.recovery * dt
+        self._since += dt
+        if sample.velocity * self._way < -VIBRATION.speed:
+            if self._given and self._since <= VIBRATION.half_period:
+                self._steady = max(VIBRATION.least, VIBRATION.share * min(DAMPING, self._steady))
+            self._way, self._since = -self._way, 0.0
+        speed, most = 0.0 if is_silent else abs(sample.velocity), max(self._limits.max_effort[self._i], abs(effort))
+        if is_late:
+            along = math.copysign(speed, effort * sample.velocity)
+            needed = max(needed, _rising(effort, along, BARRIER.calm, BARRIER.still))
+        asked = min(damping, self._steady)
+        wanted = min(self._peak, asked if is_silent else max(asked, needed))
+        self._given = most / speed if wanted * speed > most else wanted
+        return self._given
 
 
 class Shaper:
     """The bounds of one arm's drives.
 
-    limits: of the arm.
     peak_damping: the most that each motor can apply, (n,) Nm s/rad.
+
+    acted: which limits acted in the last `shape`, for people.
     """
 
     def __init__(self, limits: Limits, peak_damping: Sequence[float]) -> None:
-        self._limits, self._peak = limits, tuple(peak_damping)
-        self._asked = [0.0] * len(self._peak)  # Nm s/rad, that neither rises nor falls at once
-        self._slow = [0.0] * len(self._peak)  # rad/s, the speed low-passed by BARRIER.lead
-        self._brake = [0.0] * len(self._peak)  # Nm s/rad
-        self._steady = [math.inf] * len(self._peak)  # Nm s/rad, the most that a joint gets of what is asked for
-        self._way = [1.0] * len(self._peak)  # 1 or -1, in which a joint was last faster than VIBRATION.speed
-        self._since = [math.inf] * len(self._peak)  # s since it has turned
-        self._given = [0.0] * len(self._peak)  # Nm s/rad, last
+        self._joints = [JointShaper(limits, i, peak) for i, peak in enumerate(peak_damping)]
+        self.acted: set[str] = set()
 
     def shape(
         self,
         dt: float,
-        joints: Sequence[JointSample],
+        samples: Sequence[JointSample],
         effort: Sequence[float],
         share: Sequence[float],
         before: Sequence[float],
-        damping: Sequence[float],
-    ) -> Shaped:
-        """Return what a carried arm gets.
+        guided: Sequence[float],
+        late: float = 0.0,
+        pause: float = 0.0,
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return torque (n,) in Nm and damping (n,) in Nm s/rad of a carried arm.
 
-        dt: s since the last call.
-        joints: the newest readings (n,).
-        effort, damping: what is asked for, (n,) Nm and (n,) Nm s/rad.
+        dt: s since the last call. samples: the newest readings (n,).
+        effort: what is asked for, (n,) Nm.
         share: 0..1, the factor (n,) on effort and soft wall where torque begins.
         before: the torque of the last drive, (n,) Nm.
+        guided, late, pause: the damping that a guided motion (n,), late efforts and a pause ask for, Nm s/rad.
 
         Raises ParameterError if an effort is NaN or beyond `max_command`.
         """
-        step, step_of_damping = MAX_EFFORT_RATE * dt, DESCENT.damping_rate * dt
-        shaped, dampings, acted = [], [], set()
-        for i, (name, joint) in enumerate(zip(self._limits.joint_names, joints, strict=True)):
-            if not abs(effort[i]) <= (most := self._limits.max_command[i]):
-                raise ParameterError(f"effort of {name}", effort[i], f"from -{most:g} to {most:g} Nm")
-            spring, wall = self._wall(i, joint)
-            permitted = self._permitted(i, joint)
-            wanted = share[i] * (effort[i] + spring)
-            clamped = max(-permitted, min(permitted, wanted))
-            given = limited(clamped, before[i], step)
-            # The compensator may have clamped it already: all that is permitted counts as clamped.
-            missing = given if abs(given) >= permitted else wanted - given
-            asked = DAMPING if missing * joint.velocity < 0.0 else damping[i]
-            self._asked[i] = limited(asked, self._asked[i], step_of_damping)
-            shaped.append(given)
-            # A wall's damping rises at once, since it already rises with the position.
-            dampings.append(max(wall, self._asked[i]))
-            if wall:
-                acted.add(f"soft wall ({name})")
-            if permitted < self._limits.max_effort[i]:
-                acted.add(f"derating ({name})")
-            if clamped != wanted:
-                acted.add(f"max_effort ({name})")
-            if given != clamped:
-                acted.add(f"max_effort_rate ({name})")
-        return Shaped(tuple(shaped), tuple(dampings), frozenset(acted))
+        self.acted = set()
+        columns = zip(self._joints, samples, effort, share, before, guided, strict=True)
+        given = [
+            joint.shape(dt, sample, asked, part, last, calm, late, pause, self.acted)
+            for joint, sample, asked, part, last, calm in columns
+        ]
+        return tuple([torque for torque, _ in given]), tuple([damping for _, damping in given])
 
     def damping(
         self,
         dt: float,
-        joints: Sequence[JointSample],
+        samples: Sequence[JointSample],
         silent: Sequence[bool],
         effort: Sequence[float],
         damping: Sequence[float],
@@ -159,65 +214,14 @@ class Shaper:
     ) -> tuple[float, ...]:
         """Return the damping (n,) in Nm s/rad of a drive that is to apply `effort` (n,) Nm.
 
-        dt: s since the last call.
-        joints: the newest readings (n,).
+        dt: s since the last call. samples: the newest readings (n,).
         silent: which motors (n,) do not reply: their speed is not known, so that it bounds nothing.
-        damping: what is asked for, (n,) Nm s/rad.
-        is_late: whether a motor is late with its replies.
+        damping: what is asked for, (n,) Nm s/rad. is_late: whether a motor is late with its replies.
         """
-        brakes = self.brake(dt, joints, effort)
-        self._watch(dt, joints)
-        steady = map(min, damping, self._steady)
-        columns = zip(joints, silent, effort, steady, brakes, self._peak, self._limits.max_effort, strict=True)
-        bounded = []
-        for joint, is_silent, tau, asked, brake, peak, limit in columns:
-            speed, most = 0.0 if is_silent else abs(joint.velocity), max(limit, abs(tau))
-            along = math.copysign(speed, tau * joint.velocity)
-            needed = max(brake, _rising(tau, along, BARRIER.calm, BARRIER.still)) if is_late else brake
-            wanted = min(peak, asked if is_silent else max(asked, needed))
-            bounded.append(most / speed if wanted * speed > most else wanted)
-        self._given = bounded
-        return tuple(bounded)
-
-    def brake(self, dt: float, joints: Sequence[JointSample], effort: Sequence[float]) -> Sequence[float]:
-        """Return the damping (n,) in Nm s/rad that joints need which `effort` (n,) Nm drives; see the module."""
-        first, last = self._limits.driven_speed, self._limits.driven_speed + BARRIER.span
-        share, kept = min(1.0, dt / BARRIER.lead), max(0.0, 1.0 - dt / BARRIER.hold)
-        ahead = BARRIER.lead / max(BARRIER.lead, dt)
-        for i, (joint, tau) in enumerate(zip(joints, effort, strict=True)):
-            velocity = joint.velocity if math.isfinite(joint.velocity) else 0.0
-            change = velocity - self._slow[i]  # over the lead, or over a cycle that is longer
-            self._slow[i] += share * change
-            sign = math.copysign(1.0, tau)
-            driven = sign * velocity + max(0.0, ahead * sign * change)
-            self._brake[i] = max(_rising(tau, driven, first, last), kept * self._brake[i])
-        return tuple(self._brake)
-
-    def _watch(self, dt: float, joints: Sequence[JointSample]) -> None:
-        """Reduce the damping limit of each joint that vibrates, and let the limits rise again."""
-        for i, joint in enumerate(joints):
-            self._steady[i] += VIBRATION.recovery * dt
-            self._since[i] += dt
-            if not joint.velocity * self._way[i] < -VIBRATION.speed:
-                continue
-            if self._given[i] and self._since[i] <= VIBRATION.half_period:
-                self._steady[i] = max(VIBRATION.least, VIBRATION.share * min(DAMPING, self._steady[i]))
-            self._way[i], self._since[i] = -self._way[i], 0.0
-
-    def _wall(self, i: int, joint: JointSample) -> tuple[float, float]:
-        """Return spring in Nm and damping in Nm s/rad of the soft wall in which a joint is; zeros outside."""
-        above = joint.position - self._limits.position_max[i] + WALL.width
-        below = self._limits.position_min[i] + WALL.width - joint.position
-        depth = above if above > 0.0 else -max(0.0, below)  # rad in a wall, > 0 in the upper one
-        # Once the joint leaves the wall, no spring pushes it.
-        is_left = math.copysign(joint.velocity, joint.velocity * depth) < -WALL.release
-        spring = 0.0 if is_left or not depth else -max(-WALL.most, min(WALL.most, WALL.stiffness * depth))
-        return spring, DAMPING * min(1.0, abs(depth) / WALL.edge)
-
-    def _permitted(self, i: int, joint: JointSample) -> float:
-        """Return the torque in Nm that a joint's motor may apply at its temperature."""
-        colder = HEAT.span if joint.temperature is None else HEAT.most - joint.temperature
-        return self._limits.max_effort[i] * (0.5 + 0.5 * max(0.0, min(1.0, colder / HEAT.span)))
+        columns = zip(self._joints, samples, silent, effort, damping, strict=True)
+        return tuple(
+            [joint.bound(dt, sample, mute, tau, asked, is_late) for joint, sample, mute, tau, asked in columns]
+        )
 
 
 def _rising(torque: float, speed: float, first: float, last: float) -> float:
