@@ -17,7 +17,7 @@ from exo_gravity.core.motors.joint_motor import UNKNOWN, JointSample
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.descent import DESCENT, JointDescent
 from exo_gravity.core.safety.explain import MOTION, MotionMonitor
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE, Limits
+from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.shape import BARRIER, VIBRATION, Shaper
 
 from ..support import ROBOT
@@ -56,7 +56,7 @@ def damped(rate: float, lag: float, inertia: float = 0.0036) -> np.ndarray:
     speed = filtered = 0.5
     torque, speeds = 0.0, []
     for cycle in range(round(3.0 * rate)):
-        asked = (min(DAMPING, DESCENT.damping_rate * cycle / rate),) * 4
+        asked = (min(DAMPING, DAMPING_RATE * cycle / rate),) * 4
         damping = arm.damping(1.0 / rate, joints(velocity=filtered), HEARD, NOTHING, asked, is_late=False)
         for _ in range(round(1.0 / (rate * dt))):
             filtered += (speed - filtered) * dt / 0.02

@@ -14,12 +14,11 @@ from hypothesis import strategies as st
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.numbers import NO_TORQUE, Rate
-from exo_gravity.core.safety.descent import DESCENT
 from exo_gravity.core.safety.drive import CARRYING, Fault, FaultCode, Send, State
 from exo_gravity.core.safety.explain import RIDE
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.core.safety.lease import LEASE_TIME, Lease
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
+from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE
 from exo_gravity.core.safety.start import SWITCH_ON, SignCheck
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
 
@@ -249,7 +248,7 @@ ROWS: dict[str, Sequence[Step]] = {
     "late efforts are ridden through under rising damping, which falls again": [
         carried, let(effort_age=LATE), wait(), has(lambda arm: 0.0 < min(arm.drive.damping) < 0.2),
         wait(0.1), see(State.ACTIVE), has(lambda arm: arm.machine.ride.rides == 1),
-        has(lambda arm: min(arm.drive.damping) == pytest.approx(0.104 * DESCENT.damping_rate)),
+        has(lambda arm: min(arm.drive.damping) == pytest.approx(0.104 * DAMPING_RATE)),
         has(lambda arm: arm.drive.effort == pytest.approx(EFFORT)),
         let(**FRESH), wait(0.12), see(State.ACTIVE), has(lambda arm: max(arm.drive.damping) == 0.0),
         has(lambda arm: max(arm.steps) <= 1e-6),
@@ -488,7 +487,7 @@ def test_while_the_load_changes_only_a_joint_that_moves_is_damped_and_damping_ne
         run.changes = [{"position": v * moved, "velocity": v * run.damped} for v in speeds]
         dampings.append(run.cycle().drive.damping)
     assert run.drive.damping == NO_TORQUE
-    assert np.abs(np.diff(dampings, axis=0)).max() <= DESCENT.damping_rate * PERIOD * 1.001
+    assert np.abs(np.diff(dampings, axis=0)).max() <= DAMPING_RATE * PERIOD * 1.001
     assert run.machine.state is State.ACTIVE
 
 

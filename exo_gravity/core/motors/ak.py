@@ -202,36 +202,6 @@ def error_text(error: int) -> str:
     return f"{MOTOR_ERRORS.get(error, 'unknown')}; as a bit mask: {', '.join(bits) or 'none'}"
 
 
-def pack_reply(
-    spec: MotorSpec,
-    motor_id: int,
-    position: float,
-    velocity: float,
-    torque: float,
-    temperature: int | None = None,
-    error: int | None = None,
-) -> bytes:
-    """Return the bytes of a reply: 8, or 6 without `temperature` (degC, -40..215) and `error` (0..255).
-
-    Raises ParameterError on NaN, infinity or a value outside the spec's range.
-    """
-    reply = MotorReply(motor_id, position, velocity, torque, temperature, error)
-    data = bytes((byte_of("motor_id", motor_id),)) + state_of(spec, reply)
-    if temperature is None or error is None:
-        return data
-    warmth = byte_of("temperature", temperature, -40.0, 215.0, TEMPERATURE_OFFSET)
-    return data + bytes((warmth, byte_of("error", error)))
-
-
-def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
-    """Return the content of a reply. Raises FrameError unless it is 6, 7 or 8 bytes."""
-    if len(data) not in REPLY_LENGTHS:
-        raise FrameError(data, "a reply of 6, 7 or 8 bytes")
-    position, velocity, torque = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
-    temperature, error = (data[6] - TEMPERATURE_OFFSET, data[7]) if len(data) == 8 else (None, None)
-    return MotorReply(data[0], position, velocity, torque, temperature, error)
-
-
 @dataclass(frozen=True)
 class MitFormat(WireFormat):
     """The frames of V1 and V2 boards; the methods are those of `WireFormat`."""
@@ -239,28 +209,31 @@ class MitFormat(WireFormat):
     reply_lengths: tuple[int, ...] = REPLY_LENGTHS
     alias_length: int = OPEN_DRIVE_LENGTH
     id_bits: int = 7
+    error_text = staticmethod(error_text)
 
     def pack_reply(self, spec: MotorSpec, reply: MotorReply, on: bool = False) -> bytes:
         """Return the data of a reply, which is the same on or off. Raises ParameterError."""
-        return pack_reply(spec, *reply)
+        data = bytes((byte_of("motor_id", reply.motor_id),)) + state_of(spec, reply)
+        if reply.temperature is None or reply.error is None:
+            return data
+        warmth = byte_of("temperature", reply.temperature, -40.0, 215.0, TEMPERATURE_OFFSET)
+        return data + bytes((warmth, byte_of("error", reply.error)))
 
     def unpack_reply(self, spec: MotorSpec, motor_id: int, data: bytes | bytearray) -> MotorReply:
-        """Return the content of a reply. Raises FrameError."""
-        return unpack_reply(spec, data)
-
-    def error_text(self, error: int) -> str:
-        """Return what the error byte means."""
-        return error_text(error)
+        """Return the content of a reply. Raises FrameError unless it is 6, 7 or 8 bytes."""
+        if len(data) not in REPLY_LENGTHS:
+            raise FrameError(data, "a reply of 6, 7 or 8 bytes")
+        position, velocity, torque = unpack_fields(spec, int.from_bytes(data[:6], "big"), *MotorReply._fields[1:4])
+        temperature, error = (data[6] - TEMPERATURE_OFFSET, data[7]) if len(data) == 8 else (None, None)
+        return MotorReply(data[0], position, velocity, torque, temperature, error)
 
     def classify(
         self, frame_id: int, data: bytes | bytearray, reply_ids: Collection[int], is_remote: bool = False
     ) -> tuple[str, int]:
         """Return what a frame is. The first byte of a command is never its motor's ID."""
-        if is_status(frame_id, reply_ids):
-            return SERVO, frame_id & 0xFF
         own, length = frame_id & OPEN_DRIVE_BITS, len(data)
         if frame_id >= EXTENDED:
-            return OTHER, 0
+            return (SERVO, frame_id & 0xFF) if is_status(frame_id, reply_ids) else (OTHER, 0)
         if length and data[0] in reply_ids and frame_id in (MASTER_ID, data[0]) and not is_remote:
             return (REPLY if length in self.reply_lengths else MALFORMED), data[0]
         if own not in reply_ids:
@@ -318,9 +291,7 @@ class V3Format(WireFormat):
         steps = _steps(spec)
         return MotorReply(motor_id, position * steps[0], speed * steps[1], current * steps[2], temperature, error)
 
-    def error_text(self, error: int) -> str:
-        """Return what the error byte means."""
-        return error_text(error)
+    error_text = staticmethod(error_text)
 
     def questions(self, motor_id: int) -> tuple[Frame, ...]:
         """Return none: a board reports by itself, and a command would switch its motor on."""
@@ -360,3 +331,24 @@ MIT_V3 = V3Format(
     reply_lengths=(_STATUS.size,),
 )
 AK = Family(FAMILY, MOTORS, {MIT.name: MIT, MIT_V3.name: MIT_V3})
+
+
+def pack_reply(
+    spec: MotorSpec,
+    motor_id: int,
+    position: float,
+    velocity: float,
+    torque: float,
+    temperature: int | None = None,
+    error: int | None = None,
+) -> bytes:
+    """Return the bytes of a reply: 8, or 6 without `temperature` (degC, -40..215) and `error` (0..255).
+
+    Raises ParameterError on NaN, infinity or a value outside the spec's range.
+    """
+    return MIT.pack_reply(spec, MotorReply(motor_id, position, velocity, torque, temperature, error))
+
+
+def unpack_reply(spec: MotorSpec, data: bytes | bytearray) -> MotorReply:
+    """Return the content of a reply. Raises FrameError unless it is 6, 7 or 8 bytes."""
+    return MIT.unpack_reply(spec, 0, data)

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT_RATE
+from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, MAX_EFFORT_RATE
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
 
 DESCENT_TIMEOUT = 40.0  # s for a bridge to let its arm down before its launcher kills it
@@ -56,8 +56,6 @@ class Descent:
     brake_growth: float = 3.0  #: Nm/s beyond it: gravity of an arm of 75 kg changes no faster while it sinks
     min_fade_rate: float = 0.5  #: Nm/s
     fade_time: float = 2.0  #: s from full torque to none: the wearer has time to take over the arm
-    #: Nm s/rad a second to DAMPING, more of which lets a joint swing longer; a rise at once would be a torque step
-    damping_rate: float = DAMPING / 0.2
     damping_fade: float = 0.4  #: s, time constant
     min_damping: float = 0.01  #: Nm s/rad; smaller values become zero
     #: Nm s/rad that holds no joint: 0.07 Nm at `speed`. A swing without friction keeps so much
@@ -144,7 +142,7 @@ class JointDescent:
 
     def _raise_damping(self, dt: float, share: float = 1.0) -> None:
         """Raise the damping by this share of the full rate."""
-        self.damping = min(DAMPING, self.damping + DESCENT.damping_rate * share * dt)
+        self.damping = min(DAMPING, self.damping + DAMPING_RATE * share * dt)
 
     def _step_damping(self, dt: float, excess: float) -> None:
         if self._is_rising:

@@ -33,6 +33,8 @@ MAX_COMMAND, MAX_OF_PEAK = 40.0, 2.0
 MAX_EFFORT = 500.0  # Nm, of any motor that a person's arm may hang in
 CONFIRM, HANGING = START_POSES = ("confirm", "hanging")
 DAMPING = 5.0  # Nm s/rad, the range of kd on the wire
+# Nm s/rad a second, by which damping rises and falls: more lets a joint swing longer, a rise at once is a torque step
+DAMPING_RATE = DAMPING / 0.2
 MAX_EFFORT_RATE = 50.0  # Nm/s; the full torque of an AK60-6 in 60 ms, slow enough not to jolt the arm
 
 

@@ -27,7 +27,7 @@ from collections.abc import Iterable, Sequence
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointMotor, JointSample
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.descent import DESCENT, ArmDescent
+from exo_gravity.core.safety.descent import ArmDescent
 from exo_gravity.core.safety.drive import (
     CARRYING,
     TRANSITIONS,
@@ -41,7 +41,7 @@ from exo_gravity.core.safety.drive import (
 )
 from exo_gravity.core.safety.explain import MotionMonitor, RideThrough
 from exo_gravity.core.safety.guidance import GuidedMotion, guide_damping
-from exo_gravity.core.safety.limits import CONFIRM, DAMPING, MAX_EFFORT_RATE, Limits
+from exo_gravity.core.safety.limits import CONFIRM, DAMPING, DAMPING_RATE, MAX_EFFORT_RATE, Limits
 from exo_gravity.core.safety.shape import Shaper
 from exo_gravity.core.safety.start import (
     HANGING_ARM,
@@ -93,7 +93,6 @@ class SafetyMachine:
         self._sent = self._off = Drive.off(count)  # last sent to the motors
         self._descent = ArmDescent(0.0, self._none, self._none, self._none)
         self._rise = GuidedMotion(count)  # of the torque, where it begins
-        self._guard = 0.0  # Nm s/rad, after a pause of the loop; falls to 0
         self.pose = PoseQuestion(limits.joint_names)
         self.motion = MotionMonitor(limits)
         self._switching = SwitchingOn(self._replies)
@@ -116,7 +115,7 @@ class SafetyMachine:
     @property
     def is_off(self) -> bool:
         """Whether the arm is down, and each motor has confirmed that it is off."""
-        return self._is_standing and not self._may_be_powered
+        return self._is_standing and not any(motor.may_be_on for motor in self.watch.joints)
 
     @property
     def motors(self) -> Motors:
@@ -205,41 +204,31 @@ class SafetyMachine:
         self._now, self._dt = now, min(now - self._now, self._period)
         watch = self.watch
         watch.read(now, joints, self.held_back, self._sent.powered, self._dt)
-        self._share_supply()
+        if self._left:
+            self._share_supply(self._left)
         if self.state is State.CHECKING:
             self._check(efforts)
         elif self.state in CARRYING:
-            self._trip(self._carried_fault(efforts))
-        self._watch_stalls()
+            self._latch(self._carried_fault(efforts), self._now)
+        self._latch(watch.step_pause(now, self._dt, self._sent.effort, self.state in CARRIED), now)
         effort = efforts.effort
         if effort is not None and self.state in CARRIED:
             effort, fault = self.motion.step(self._dt, watch.samples, effort, now - efforts.answered)
-            self._trip(fault)
+            self._latch(fault, self._now)
         if self.state is State.PROVING:
             self._prove(efforts.effort or self._none)
         self._sent = self._drive(effort or self._none, efforts.damped)
         return self._sent
 
-    def _share_supply(self) -> None:
-        """Take motors that another process left for on that hold too little for their replies to tell.
+    def _share_supply(self, left: Sequence[float]) -> None:
+        """Take motors that were left with `left` (n,) Nm for on, too, once one is: the arm has one supply.
 
-        The motors of an arm share a supply: one that shows torque tells of the others.
+        The replies of one that holds too little do not tell.
         """
-        if self._left and any(motor.power is Power.ON for motor in self.watch.joints):
-            for motor, held in zip(self.watch.joints, self._left, strict=True):
+        if any(motor.power is Power.ON for motor in self.watch.joints):
+            for motor, held in zip(self.watch.joints, left, strict=True):
                 if motor.power is Power.UNSURE and motor.is_heard and abs(held) <= 2.0 * POWER.torque:
                     motor.change(PowerChange.SHOWN_ON)
-
-    def _watch_stalls(self) -> None:
-        """Damp an arm whose loop has just stood still: its motors may have let go, and take up their torque again."""
-        self._guard = max(0.0, self._guard - DESCENT.damping_rate * self._dt)
-        if self.state not in CARRIED:
-            self.watch.reset_stall()
-            return
-        has_stood_still, fault = self.watch.step_stall(self._now, self._sent.effort)
-        if has_stood_still:
-            self._guard = DAMPING
-        self._trip(fault)
 
     def _carried_fault(self, efforts: Efforts) -> Fault | None:
         """Return the fault of an arm that is about to be carried, or is: of readings, delivery, or efforts."""
@@ -278,7 +267,7 @@ class SafetyMachine:
         """Return a drive of motors that may be on, within the barrier."""
         watch, torque = self.watch, tuple(effort)
         bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
-        return Drive(torque, bounded, tuple(send), self._may_be_powered)
+        return Drive(torque, bounded, tuple(send), any([motor.may_be_on for motor in watch.joints]))
 
     def _check(self, efforts: Efforts) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.
@@ -290,7 +279,7 @@ class SafetyMachine:
         missing = missing_for_a_start(limits, watch.samples, watch.fault, watch.trusted)
         if isinstance(missing, Fault):
             if not any(motor.is_clearing for motor in watch.joints):
-                self._trip(missing)
+                self._latch(missing, self._now)
                 return
             missing = Reason(missing.code, missing.reason)
         missing = missing or missing_of_trunk(limits, self.motion.trunk_tilt)
@@ -312,7 +301,7 @@ class SafetyMachine:
         if is_calm and effort is not None and not ride.is_riding:
             fault = None if watch.trusted else torque_while_hanging(limits, effort)
             if fault:
-                self._trip(fault)
+                self._latch(fault, self._now)
                 return
             self.waiting_for = NO_REASON
             largest = 0.0 if watch.trusted else limits.sign_check_torque
@@ -337,7 +326,7 @@ class SafetyMachine:
         else:
             fault = self._signs.step(self._dt, joints, asked)
         self.waiting_for = self._signs.hint
-        self._trip(fault)
+        self._latch(fault, self._now)
         if not fault and self._signs.done and (self._switch_on.done or self._signs.pushes):
             self.watch.trusted = True
             self.motion.reset()
@@ -360,7 +349,7 @@ class SafetyMachine:
             self.watch.reset_delivery()
         boards = zip(again, self._replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
-        rise = DESCENT.damping_rate * self._dt
+        rise = DAMPING_RATE * self._dt
         drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
         return drive._replace(damping=tuple(map(operator.mul, damped, drive.damping)))
 
@@ -375,7 +364,9 @@ class SafetyMachine:
         guided = [guide_damping(joint.velocity) if is_guided else 0.0 for joint in joints]
         late = DAMPING if self.ride.is_riding else 0.0
         sent = self._sent.effort
-        torque, damping = self.shaper.shape(self._dt, joints, effort, share, sent, guided, late, self._guard)
+        torque, damping = self.shaper.shape(
+            self._dt, joints, effort, share, sent, guided, late, self.watch.pause_damping
+        )
         self.acted.update(dict.fromkeys(self.shaper.acted, self._now))
         return self._powered(torque, damping, self._commands)
 
@@ -439,19 +430,13 @@ class SafetyMachine:
     def _all_off(self) -> bool:
         return all(motor.power is Power.OFF for motor in self.watch.joints)
 
-    @property
-    def _may_be_powered(self) -> bool:
-        return any(motor.may_be_on for motor in self.watch.joints)
-
     def _refuse(self, reason: Reason) -> None:
         self.refusal = reason
         self._on(StateEvent.REFUSED)
 
-    def _trip(self, fault: Fault | None) -> None:
-        if fault:
-            self._latch(fault, self._now)
-
-    def _latch(self, fault: Fault, now: float) -> None:
+    def _latch(self, fault: Fault | None, now: float) -> None:
+        if not fault:
+            return
         if fault.code.needs_recheck:
             self.watch.require_sign_check()
         if self.state is State.FAULT or (self.state is State.DISABLED and fault.code is not FaultCode.FOREIGN_COMMAND):

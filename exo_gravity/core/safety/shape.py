@@ -40,8 +40,7 @@ from dataclasses import dataclass
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import JointSample
 from exo_gravity.core.numbers import limited
-from exo_gravity.core.safety.descent import DESCENT
-from exo_gravity.core.safety.limits import DAMPING, HEAT, MAX_EFFORT_RATE, WALL, Limits
+from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, MAX_EFFORT_RATE, WALL, Limits
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class JointShaper:
         # The compensator may have clamped it already: all that is permitted counts as clamped.
         missing = given if abs(given) >= permitted else wanted - given
         withheld = DAMPING if missing * sample.velocity < 0.0 else 0.0
-        self._slowly = limited(max(guided, late, withheld), self._slowly, DESCENT.damping_rate * dt)
+        self._slowly = limited(max(guided, late, withheld), self._slowly, DAMPING_RATE * dt)
         limiting = {
             "soft wall": wall > 0.0,
             "derating": permitted < limit,
@@ -219,9 +218,7 @@ class Shaper:
         damping: what is asked for, (n,) Nm s/rad. is_late: whether a motor is late with its replies.
         """
         columns = zip(self._joints, samples, silent, effort, damping, strict=True)
-        return tuple(
-            [joint.bound(dt, sample, mute, tau, asked, is_late) for joint, sample, mute, tau, asked in columns]
-        )
+        return tuple([joint.bound(dt, sample, mute, tau, own, is_late) for joint, sample, mute, tau, own in columns])
 
 
 def _rising(torque: float, speed: float, first: float, last: float) -> float:

@@ -50,7 +50,7 @@ from enum import Enum
 
 from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.safety.drive import Fault, FaultCode, Send
-from exo_gravity.core.safety.limits import HEAT, READING, Limits
+from exo_gravity.core.safety.limits import DAMPING, DAMPING_RATE, HEAT, READING, Limits
 
 
 @dataclass(frozen=True)
@@ -278,10 +278,12 @@ class JointWatch:
         found: list[Fault] = []
         if is_new := sample.time > self._newest:
             self._newest, self.missed = sample.time, 0
-            faults = self._faults(sample, restart, is_known)
+            period = sample.time - self.sample.time
+            expected = 0.5 * (self.sample.velocity + sample.velocity) * period
+            faults = self._faults(sample, expected, restart, is_known)
             is_confirmed, self._is_suspect = self._is_suspect, bool(faults)
             if not faults or is_confirmed or self.sample is UNKNOWN:
-                found = [*(faults if is_confirmed else ()), *self._follow(sample, not faults)]
+                found = [*(faults if is_confirmed else ()), *self._follow(sample, expected, not faults)]
                 self.sample, self._asked = sample, asked
         else:
             self.missed += not held_back
@@ -289,8 +291,11 @@ class JointWatch:
         self.note_power(dt, sample, is_new)
         return found
 
-    def _faults(self, sample: JointSample, restart: float, is_known: bool) -> list[Fault]:
-        """Return what a new reading shows by itself, and compared with the last one that counts."""
+    def _faults(self, sample: JointSample, expected: float, restart: float, is_known: bool) -> list[Fault]:
+        """Return what a new reading shows by itself, and compared with the last one that counts.
+
+        expected: rad by which the velocities say that the joint has turned since.
+        """
         limits, last = self._limits, self.sample
         low, high, fastest = limits.position_min[self._i], limits.position_max[self._i], limits.max_velocity[self._i]
         found: dict[FaultCode, str] = {}
@@ -302,7 +307,7 @@ class JointWatch:
             found[FaultCode.OVER_SPEED] = f"{sample.velocity:.2f} rad/s, the limit is {fastest:g}"
         turned, silence = sample.position - last.position, sample.time - last.time
         is_jump = abs(turned) > CONTINUITY.jump + fastest * (sample.time - self._asked)
-        is_turn = abs(turned - self._expected(sample)) > limits.home_tolerance[self._i]
+        is_turn = abs(turned - expected) > limits.home_tolerance[self._i]
         if is_jump or (is_turn and limits.reply_timeout < silence and (is_known or silence <= restart)):
             what = f"from {last.position:.3f} to {sample.position:.3f} rad in {1000.0 * silence:.0f} ms"
             found[FaultCode.POSITION_JUMP] = what
@@ -310,16 +315,12 @@ class JointWatch:
             found[FaultCode.OUTSIDE_LIMITS] = f"{sample.position:.3f} rad, the limits are {low:g} to {high:g}"
         return [Fault.of_joint(code, self.name, reason) for code, reason in found.items()]
 
-    def _expected(self, sample: JointSample) -> float:
-        """Return the angle in rad by which the velocities say that the joint has turned until `sample`."""
-        return 0.5 * (self.sample.velocity + sample.velocity) * (sample.time - self.sample.time)
-
-    def _follow(self, sample: JointSample, is_sound: bool) -> list[Fault]:
+    def _follow(self, sample: JointSample, expected: float, is_sound: bool) -> list[Fault]:
         """Compare the angle with the integrated velocity; return the fault if no ordinary motor differs so much."""
         if not is_sound or not sample.time - self.sample.time <= self._limits.reply_timeout:
             self._turned = self._slip = self._way = 0.0
             return []
-        turned, expected = sample.position - self.sample.position, self._expected(sample)
+        turned = sample.position - self.sample.position
         kept = math.exp((self.sample.time - sample.time) / CONTINUITY.memory)
         self._turned = kept * self._turned + turned
         self._slip = kept * self._slip + turned - expected
@@ -396,7 +397,11 @@ class JointWatch:
         nearest = max(least, min(most, sample.effort))
         added = min(DELIVERY.evidence / 2, excess_torque(sample.effort, nearest) * dt)
         self.undelivered = max(0.0, min(DELIVERY.evidence, self.undelivered + added))
-        return f"{nearest:.2f} Nm commanded, {sample.effort:.2f} Nm replied" if self.is_missing else ""
+        return (
+            f"{nearest:.2f} Nm commanded, {sample.effort:.2f} Nm replied"
+            if self.undelivered >= DELIVERY.evidence
+            else ""
+        )
 
     def is_found_off(self, effort: float, damping: float) -> bool:
         """Return whether the motor is off, by its replies to this command (Nm, Nm s/rad)."""
@@ -410,8 +415,9 @@ class ArmWatch:
     period: s of the loop.
 
     joints: of each (n,) what is known. samples: (n,) the newest readings that count. silent: (n,) whether a motor is.
-    fault: what the newest readings show, or None.
+    fault: what the newest readings show, or None. is_late: whether a motor has not replied to some commands.
     trusted: whether zeros and signs were proven, and the angles have been continuous since.
+    pause_damping: Nm s/rad, after a pause of the loop; it falls to 0.
     is_being_proven: whether the arm was seen to hang and its signs are being proven, set from outside: the angles must
     be continuous from then on.
     """
@@ -425,15 +431,15 @@ class ArmWatch:
         self.silent: Sequence[bool] = (True,) * count
         self.fault: Fault | None = None
         self.trusted = self.is_being_proven = False
+        self.is_late = True
         self.rest = RestTracker(count)
         self._timeout, self._longest = limits.reply_timeout, period + STALL.late
         self._now, self._ran = -math.inf, 0.0  # s, of the last cycle, and for which the loop has run
-        self.reset_stall()
-
-    @property
-    def is_late(self) -> bool:
-        """Whether a motor has not replied to some commands."""
-        return max([joint.missed for joint in self.joints]) >= READING.late
+        self.pause_damping = 0.0
+        self._last = self._resumed = math.inf  # s, of the last command, and of the first one after a pause
+        self._before: Sequence[JointSample] = ()  # the readings before a pause, until the ones after it are judged
+        self._held: Sequence[float] = ()  # Nm
+        self._gap = 0.0  # s
 
     def require_sign_check(self) -> None:
         """Note that the angles may no longer be continuous, for a reason that no reading shows."""
@@ -463,6 +469,7 @@ class ArmWatch:
         self.trusted &= not any(fault.code in BREAKS for fault in found)
         self.samples = tuple([joint.sample for joint in self.joints])
         self.silent = [joint.is_silent for joint in self.joints]
+        self.is_late = max([joint.missed for joint in self.joints]) >= READING.late
         self.fault = self._silence() if any(self.silent) else next(iter(found), None)
         self.rest.step(now, self.samples, self.silent)
         self._now = now
@@ -495,24 +502,21 @@ class ArmWatch:
                 fault = Fault.of_joint(FaultCode.TORQUE_NOT_DELIVERED, joint.name, reason)
         return fault
 
-    def reset_stall(self) -> None:
-        """Begin anew, as an arm that is not carried does."""
-        self._last = self._resumed = math.inf  # s, of the last command, and of the first one after a pause
-        self._before: Sequence[JointSample] = ()  # the readings before a pause, until the ones after it are judged
-        self._held: Sequence[float] = ()  # Nm
-        self._gap = 0.0  # s
-
-    def step_stall(self, now: float, effort: Sequence[float]) -> tuple[bool, Fault | None]:
-        """Return whether the loop has just stood still, and the fault that the readings after a pause show.
+    def step_pause(self, now: float, dt: float, effort: Sequence[float], is_carried: bool) -> Fault | None:
+        """Damp a carried arm whose loop has stood still; return the fault that the readings after a pause show.
 
         effort: (n,) Nm, of the last command.
         """
-        gap, self._last = now - self._last, now
-        if gap > self._longest:
+        self.pause_damping = max(0.0, self.pause_damping - DAMPING_RATE * dt)
+        gap, self._last = now - self._last, now if is_carried else math.inf
+        if not is_carried:
+            self._before = ()
+        elif gap > self._longest:
             self._before, self._held, self._resumed, self._gap = self.samples, effort, now, gap
-            return True, None
+            self.pause_damping = DAMPING
+            return None
         if not self._before or not all(sample.time >= self._resumed for sample in self.samples):
-            return False, None
+            return None
         before, self._before = self._before, ()
         for joint, old, torque in zip(self.joints, before, self._held, strict=True):
             gained = (joint.sample.velocity - old.velocity) * math.copysign(1.0, torque)
@@ -521,8 +525,8 @@ class ArmWatch:
                     f"{joint.name} fell while the loop stood still for {1000.0 * self._gap:.0f} ms: "
                     "its motor's own time-out is shorter; set it to 0.15 to 0.5 s"
                 )
-                return False, Fault(FaultCode.TORQUE_DIPPED, reason, joint.name)
-        return False, None
+                return Fault(FaultCode.TORQUE_DIPPED, reason, joint.name)
+        return None
 
 
 class RestTracker:

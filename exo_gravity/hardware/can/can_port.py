@@ -117,7 +117,7 @@ class CanPort:
         """
         for _ in range(MAX_STALE_FRAMES):
             while (message := self.receive(0.0)) is None:
-                if not self._has_lines():
+                if not hasattr(self._bus, "serialPortOrig") or not self._has_lines():
                     return
             yield message
 
@@ -160,11 +160,10 @@ class CanPort:
         return BusError(f"CAN bus {self.name}: {self._error}")
 
     def _has_lines(self) -> bool:
-        """Return whether the serial port of an slcan adapter has received more; False for every other bus."""
+        """Return whether the serial port of an slcan adapter has received more."""
         bus = self._bus or self._reopening()
-        serial_port = getattr(bus, "serialPortOrig", None)
         try:
-            return serial_port is not None and serial_port.in_waiting > 0
+            return bool(bus.serialPortOrig.in_waiting)  # type: ignore[attr-defined]
         except Exception as error:
             raise self._failed(bus, error) from error
 

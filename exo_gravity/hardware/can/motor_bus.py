@@ -188,7 +188,8 @@ class MotorBus:
         if count < len(self.samples):
             missing = AT_REST._replace(time=max(self.samples[joint].time for joint in self._joints))
             self.samples[:] = (self.samples[i] if i in self._joints else missing for i in range(len(self.samples)))
-        self._raise_failure()
+        if self._failed:
+            self._raise_failure()
         return len(self._answered) == count
 
     def receive_until(self, deadline: float, is_done: Callable[[], bool] = lambda: False) -> None:
@@ -292,7 +293,8 @@ class MotorBus:
         asked = self._requests[joint].replied(now) if self.replies[joint] else now
         sample = self._motors[joint].sample(message.data, asked)
         self.boards.take(joint, sample)
-        self._follow_temperature(joint, sample)
+        if self._motors[joint].scale_slope and sample.temperature is not None:
+            self._follow_temperature(joint, sample)
         self._answered.add(joint)
         if sample.time - self._contested[joint] < CONTEST_TIME:
             self._follow(joint, sample)
@@ -302,10 +304,9 @@ class MotorBus:
 
     def _follow_temperature(self, joint: int, sample: JointSample) -> None:
         """Let the temperature that a motor's commands count with follow its reading, without a step."""
-        if self._motors[joint].scale_slope and sample.temperature is not None:
-            last, most = self._warmth[joint], WARMING * max(0.0, sample.time - self.samples[joint].time)
-            reading = float(sample.temperature)
-            self._warmth[joint] = reading if last is None else limited(reading, last, most)
+        last, most = self._warmth[joint], WARMING * max(0.0, sample.time - self.samples[joint].time)
+        reading = float(sample.temperature or 0.0)
+        self._warmth[joint] = reading if last is None else limited(reading, last, most)
 
     def _commanded(self, port: CanPort, can_id: int) -> list[int]:
         """Return the joints of the motors that obey a command to this ID."""
