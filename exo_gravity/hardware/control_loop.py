@@ -26,7 +26,7 @@ from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import RestTracker
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.motor_bus import MotorBus
 
 EFFORT_WAIT = 0.5  # share of a cycle's idle time for which the loop may wait for late efforts
 WORK_SMOOTHING = 0.02  # per cycle, of the measured work time

@@ -29,11 +29,11 @@ from exo_gravity.core.safety.drive import Efforts, State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.vocabulary import Source
-from exo_gravity.hardware.can.can_port import ArmOnBus
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.bus_lock import BusLock
+from exo_gravity.hardware.can_port import ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.tours import model_of
 from exo_gravity.lab.inputs.arms import ConfiguredArm

@@ -6,8 +6,8 @@ from importlib import import_module, metadata
 from can.interfaces import BACKENDS
 
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware.can.can_port import ArmOnBus
-from exo_gravity.hardware.ownership.bus_lock import borrowed
+from exo_gravity.hardware.bus_lock import borrowed
+from exo_gravity.hardware.can_port import ArmOnBus
 from exo_gravity.lab.findings import Finding, Level
 
 

@@ -23,8 +23,7 @@ import numpy as np
 from exo_gravity.core.errors import named
 from exo_gravity.core.motors.joint_motor import REPLY_SHARE, SIMULATED_BUSES, Traffic, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
-from exo_gravity.hardware.can.adapter import serials_of
-from exo_gravity.hardware.can.can_port import ArmOnBus
+from exo_gravity.hardware.can_port import ArmOnBus, serials_of
 from exo_gravity.hardware.clock import favour, request_real_time
 from exo_gravity.hardware.network import MIDDLEWARE, check_environment, keep_to_this_machine, open_to_others
 from exo_gravity.lab.adapters import of_opening

@@ -22,7 +22,7 @@ import can
 
 from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.frames import EXTENDED, Frame
-from exo_gravity.hardware.can.can_port import POLL_TIME, message_of
+from exo_gravity.hardware.can_port import POLL_TIME, message_of
 from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.script import IDLE

@@ -18,7 +18,7 @@ from exo_gravity.core.motors.frames import Frame
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.hardware.can_port import message_of
 from exo_gravity.sim.controllers import DirectController, UnreliableController
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.judge import Driven, driven

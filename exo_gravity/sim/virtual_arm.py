@@ -19,9 +19,9 @@ from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.safety.drive import Drive
 from exo_gravity.core.safety.limits import HANGING, Limits
 from exo_gravity.core.safety.machine import SafetyMachine
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.control_loop import Controller, ControlLoop
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim.device import SimulatedDevice
 from exo_gravity.sim.trunk_motion import TrunkState
 from exo_gravity.sim.virtual_time import Played, Wire

@@ -20,7 +20,7 @@ import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 
 from exo_gravity.core.motors.frames import Frame
-from exo_gravity.hardware.can.can_port import message_of
+from exo_gravity.hardware.can_port import message_of
 from exo_gravity.sim.arbitration import Arbitration
 from exo_gravity.sim.device import SimulatedDevice
 

@@ -23,8 +23,8 @@ from exo_gravity.core.motors.frames import WireFormat
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import Address, ArmOnBus, open_bus
-from exo_gravity.hardware.ownership.bus_lock import DriveNotes
+from exo_gravity.hardware.bus_lock import DriveNotes
+from exo_gravity.hardware.can_port import Address, ArmOnBus, open_bus
 from exo_gravity.sim import ArmConfig, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS, SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice

@@ -13,8 +13,8 @@ import time
 from functools import partial
 from pathlib import Path
 
-from exo_gravity.hardware.can.motor_bus import MotorBus
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus
+from exo_gravity.hardware.motor_bus import MotorBus
+from exo_gravity.hardware.owned_bus import OwnedBus
 
 from ..support.simulated_device import drive_of
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from exo_gravity.hardware.ownership import bus_lock, owned_bus
+from exo_gravity.hardware import bus_lock, owned_bus
 
 from .arms import NoWatchdog
 

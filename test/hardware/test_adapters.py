@@ -30,10 +30,9 @@ from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.frames import MotorReply
 from exo_gravity.core.motors.joint_motor import BITRATE, NEED_BITRATE
 from exo_gravity.core.safety.drive import Send
-from exo_gravity.hardware.can.adapter import check_serial, serial_of, serials_of
-from exo_gravity.hardware.can.can_port import CanPort, message_of, open_bus
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import CanPort, check_serial, message_of, open_bus, serial_of, serials_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedDevice
 
 from ..support.simulated_device import OFF, drive_of, joints_of, make_device, sending

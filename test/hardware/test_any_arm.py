@@ -27,7 +27,7 @@ from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import Drive, FaultCode, Send
 from exo_gravity.core.safety.explain import GRAVITY, MotionMonitor
 from exo_gravity.core.safety.limits import DAMPING, Limits
-from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes
+from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes
 from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.sim.arm import SimulatedArm
 from exo_gravity.sim.device import SimulatedDevice

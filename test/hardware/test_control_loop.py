@@ -22,10 +22,10 @@ from exo_gravity.core.safety.limits import DAMPING
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import Power
 from exo_gravity.hardware import control_loop
-from exo_gravity.hardware.can.can_port import CanPort, message_of
-from exo_gravity.hardware.can.motor_bus import FOREIGN_COMMAND, MotorBus
+from exo_gravity.hardware.can_port import CanPort, message_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.control_loop import HAND_OVER_TIME, LOWERING, ControlLoop, NoController
+from exo_gravity.hardware.motor_bus import FOREIGN_COMMAND, MotorBus
 from exo_gravity.sim.events import ACTS
 
 from ..support.simulated_device import drive_of

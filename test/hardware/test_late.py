@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.safety.drive import FaultCode, State
-from exo_gravity.hardware.can.request_age import AGE, Requests
+from exo_gravity.hardware.request_age import AGE, Requests
 from exo_gravity.sim.virtual_time import VirtualBus
 
 from .arms import REAL_RATE, raised_usual_arm

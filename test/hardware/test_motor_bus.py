@@ -29,8 +29,8 @@ from exo_gravity.core.motors.joint_motor import LARGEST_WARMING, JointMotor
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.drive import Drive, Send, State
 from exo_gravity.core.safety.limits import DAMPING
-from exo_gravity.hardware.can.can_port import CanPort, message_of
-from exo_gravity.hardware.can.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, WARMING, MotorBus
+from exo_gravity.hardware.can_port import CanPort, message_of
+from exo_gravity.hardware.motor_bus import CONTEST_TIME, HOLD_STIFFNESS, WARMING, MotorBus
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.virtual_time import VirtualBus, Wire
 

@@ -23,9 +23,8 @@ from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS, MotorCommand, WireFormat, unpack_command
 from exo_gravity.core.safety.limits import MAX_EFFORT_RATE
-from exo_gravity.hardware.can.can_port import Address
-from exo_gravity.hardware.ownership import bus_lock, owned_bus
-from exo_gravity.hardware.ownership.bus_lock import (
+from exo_gravity.hardware import bus_lock, owned_bus
+from exo_gravity.hardware.bus_lock import (
     ATTEMPT_TIME,
     UNKNOWN_DRIVE,
     ArmLock,
@@ -36,7 +35,8 @@ from exo_gravity.hardware.ownership.bus_lock import (
     is_asked_for,
     notes_file,
 )
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, let_down, take_over
+from exo_gravity.hardware.can_port import Address
+from exo_gravity.hardware.owned_bus import OwnedBus, let_down, take_over
 from exo_gravity.sim.events import ACTS
 from exo_gravity.sim.virtual_time import VirtualBus, VirtualClock
 
@@ -57,7 +57,7 @@ OTHER_SESSION = """
 import sys
 from pathlib import Path
 from exo_gravity.core.errors import BusError
-from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.hardware import bus_lock
 bus_lock.FOLDERS = (Path(sys.argv[2]),)
 try:
     bus_lock.BusLock(("socketcan", sys.argv[1], {}), "another", 0.0)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import can
 
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import CanPort
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim.virtual_time import Wire
 
 

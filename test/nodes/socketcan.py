@@ -22,9 +22,9 @@ from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import NO_TORQUE
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import ArmOnBus, open_bus
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import ArmOnBus, open_bus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab import processes
 
 from ..support.launched_nodes import CALM, NO_IMU, LaunchedNodes

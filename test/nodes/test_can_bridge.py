@@ -38,9 +38,9 @@ from exo_gravity.core.safety.lease import LEASE_TIME, Lease
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.vocabulary import NO_REASON
-from exo_gravity.hardware.can.can_port import ArmOnBus
-from exo_gravity.hardware.ownership import owned_bus
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware import owned_bus
+from exo_gravity.hardware.bus_lock import BusLock
+from exo_gravity.hardware.can_port import ArmOnBus
 from exo_gravity.nodes.can_bridge import node as can_bridge
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import EffortExchange

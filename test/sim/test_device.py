@@ -21,9 +21,9 @@ from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS, SET_ZERO
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.hardware.can.can_port import CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import FIRMWARES, Firmware, SimulatedArm, SimulatedDevice, VirtualWearer
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits

@@ -16,7 +16,7 @@ from typing import Any
 
 import yaml
 
-from exo_gravity.hardware.ownership.bus_lock import notes_file
+from exo_gravity.hardware.bus_lock import notes_file
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import Launcher, wearers
 
@@ -161,7 +161,7 @@ class LaunchedNodes:
         names = [f"{self.bus['channel']}_{port}.bus" for port in ports]
         for process in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
-                if b"ownership.watchdog" in (process / "cmdline").read_bytes() and any(
+                if b"hardware.watchdog" in (process / "cmdline").read_bytes() and any(
                     name in os.readlink(descriptor) for descriptor in (process / "fd").iterdir() for name in names
                 ):
                     os.kill(int(process.name), signal.SIGKILL)

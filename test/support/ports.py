@@ -9,7 +9,7 @@ import os
 import socket
 from collections.abc import Iterator
 
-from exo_gravity.hardware.ownership.bus_lock import notes_file
+from exo_gravity.hardware.bus_lock import notes_file
 
 FIRST_PORT = 20_000  # of a bus; those of other programs begin at 32,768
 BLOCKS, BLOCK = 25, 500  # blocks, and ports in each

@@ -28,7 +28,7 @@ from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import BusError, DataError, ParameterError
-from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.hardware import bus_lock
 from exo_gravity.lab.calibration import identification, live
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.new import turning_joints

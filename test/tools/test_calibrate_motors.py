@@ -20,7 +20,7 @@ import yaml
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.ak import MIT, MIT_V3
 from exo_gravity.core.motors.joint_motor import JointMotor, channels_of
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.lab.calibration import motors
 from exo_gravity.lab.calibration.bus_scan import BusScan, MotorAnswer
 from exo_gravity.lab.calibration.live import Person

@@ -12,7 +12,7 @@ import pytest
 from can.interfaces import BACKENDS
 
 from exo_gravity.core.motors.joint_motor import Traffic
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.lab import computer as settings
 from exo_gravity.lab.computer import Level, Wakeups
 from exo_gravity.tools import doctor

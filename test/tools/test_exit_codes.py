@@ -20,7 +20,7 @@ import yaml
 
 import exo_gravity
 from exo_gravity import with_extra
-from exo_gravity.hardware.ownership import bus_lock
+from exo_gravity.hardware import bus_lock
 from exo_gravity.lab import packages
 from exo_gravity.lab.processes import node_modules
 from exo_gravity.tools.cli import exit_code

@@ -29,10 +29,10 @@ from exo_gravity.core.motors.ak import FAMILY, MIT
 from exo_gravity.core.motors.families import FAMILIES, MOTORS, every_family
 from exo_gravity.core.motors.frames import COMMAND, EXTENDED, OTHER, REPLY, Frame, WireFormat
 from exo_gravity.core.motors.joint_motor import MAX_CAN_ID, MAX_STATUS_RATE, is_fd
-from exo_gravity.hardware.can.can_port import Address, CanPort, open_bus
-from exo_gravity.hardware.can.motor_bus import LISTEN_TIME
+from exo_gravity.hardware.bus_lock import BusLock
+from exo_gravity.hardware.can_port import Address, CanPort, open_bus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware.motor_bus import LISTEN_TIME
 
 SPEC = MOTORS["AK60-6"]  # it scales positions alone, with the usual range
 ALL_IDS = range(1, MAX_CAN_ID + 1)

@@ -7,8 +7,8 @@ from exo_gravity.core.errors import BusError, named
 from exo_gravity.core.motors.joint_motor import buses_of, motors_of, traffic_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.trunk.params import IMU
+from exo_gravity.hardware.bus_lock import bridge_of
 from exo_gravity.hardware.network import check_environment
-from exo_gravity.hardware.ownership.bus_lock import bridge_of
 from exo_gravity.hardware.trunk_estimator import TrunkEstimator
 from exo_gravity.lab.inputs.arms import node_values, settings_from
 from exo_gravity.lab.inputs.parameter_file import Nodes, can_options, stages

@@ -32,13 +32,12 @@ from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.trunk.inputs import TiltInput
 from exo_gravity.core.vocabulary import NO_REASON, Reason, Wait
-from exo_gravity.hardware.can.adapter import serials_of
-from exo_gravity.hardware.can.can_port import ArmOnBus
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.can_port import ArmOnBus, serials_of
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.hardware.control_loop import ControlLoop
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.network import keep_to_this_machine
-from exo_gravity.hardware.ownership.owned_bus import OwnedBus, Watchdog, take_over
+from exo_gravity.hardware.owned_bus import OwnedBus, Watchdog, take_over
 from exo_gravity.nodes.can_bridge import operation
 from exo_gravity.nodes.can_bridge.effort_exchange import Answer, EffortExchange
 from exo_gravity.nodes.ros.inner import Until, age_of_request, prepare_transitions

@@ -36,8 +36,7 @@ from exo_gravity.core.safety.lease import Lease
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.start import at_least, turns_back
 from exo_gravity.core.vocabulary import INACTIVE, NO_REASON, NONE, UNKNOWN, Answer, BridgeWarning, Reason, words
-from exo_gravity.hardware.can.adapter import serial_of
-from exo_gravity.hardware.can.can_port import ArmOnBus
+from exo_gravity.hardware.can_port import ArmOnBus, serial_of
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop
 from exo_gravity.hardware.network import open_to_others

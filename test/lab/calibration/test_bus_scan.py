@@ -15,8 +15,8 @@ from exo_gravity.core.motors.damiao import DAMIAO_MIT, LAST_ID, REFRESH, REGISTE
 from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import DAMPED, ENTER, SET_ZERO, WireFormat, unpack_command
 from exo_gravity.core.motors.joint_motor import JointMotor
-from exo_gravity.hardware.ownership import bus_lock
-from exo_gravity.hardware.ownership.bus_lock import BusLock
+from exo_gravity.hardware import bus_lock
+from exo_gravity.hardware.bus_lock import BusLock
 from exo_gravity.lab.calibration.bus_scan import BusScan
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.motors import simulated

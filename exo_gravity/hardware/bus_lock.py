@@ -26,7 +26,7 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.numbers import MAX_JOINTS
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING, MAX_EFFORT
-from exo_gravity.hardware.can.can_port import Address, ArmOnBus
+from exo_gravity.hardware.can_port import Address, ArmOnBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 
 ATTEMPT_TIME = 1.0  # s; a watchdog with nothing to do may take that long to end after its bridge

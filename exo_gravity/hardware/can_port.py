@@ -9,6 +9,11 @@ again is a new device, which only a newly opened bus can reach. Opening may bloc
 Most buses return no echoes of our own frames. Some return them and mark them (`is_rx` is false). udp_multicast returns
 them unmarked, in order. SocketCAN sets the same mark on every frame from this computer, also on those of another
 process (Documentation/networking/can.rst of Linux, MSG_DONTROUTE): there it does not show an echo.
+
+Names such as can0 are given in the order in which adapters are found. Of two exchanged adapters, motors with the same
+IDs would receive each other's torques: so an adapter may be named by its serial number. Linux shows that of a USB
+adapter in sysfs; of others python-can may know it. An adapter with several channels has one number for all: their
+cables can still be exchanged.
 """
 
 import contextlib
@@ -18,17 +23,17 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, NoReturn
 
 import can
 from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 
-from exo_gravity.core.errors import BusError
+from exo_gravity.core.errors import BusError, ParameterError
 from exo_gravity.core.motors.frames import EXTENDED, ID_BITS, Frame
 from exo_gravity.core.motors.joint_motor import JointMotor, buses_of, channels_of, is_fd
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.adapter import check_serial
 from exo_gravity.hardware.clock import Clock
 
 LOST_SENDS = 0.005  # s of failures in a row that are lost frames
@@ -37,6 +42,8 @@ REOPEN_PERIOD = 0.1  # s between two attempts
 MOST_AWAITED = 512  # echoes; twice the frames that a udp_multicast socket keeps unread
 POLL_TIME = 0.0005  # s for which one of several buses is awaited that cannot be awaited together
 MAX_STALE_FRAMES = 256  # the capacity of udp_multicast, more than any cycle produces
+SYSFS = Path("/sys")
+CLASSES = {"socketcan": "net", "slcan": "tty"}  # in sysfs, of the channels of an interface
 Address = tuple[str, str, Mapping[str, Any]]  # interface, channel and options of a python-can bus
 
 
@@ -270,3 +277,44 @@ def message_of(frame: Frame, is_fd: bool = False) -> can.Message:
 def _close(bus: can.BusABC) -> None:
     with contextlib.suppress(Exception):
         bus.shutdown()
+
+
+def serial_of(interface: str, channel: str, sysfs: Path = SYSFS) -> str:
+    """Return the serial number of a bus's adapter, '' if it has none or it is not known."""
+    if interface in CLASSES:
+        name = Path(channel.partition("@")[0]).resolve().name  # slcan's may end with the serial port's speed
+        device = (sysfs / "class" / CLASSES[interface] / name / "device").resolve()
+        for folder in (device, *device.parents):
+            if (folder / "idVendor").is_file():  # the adapter; above it are hubs, which have numbers, too
+                with contextlib.suppress(OSError):
+                    return (folder / "serial").read_text().strip()
+                return ""
+        return ""
+    with contextlib.suppress(Exception):  # a backend without its driver raises errors of every type
+        for config in can.detect_available_configs([interface]):
+            if str(config["channel"]) == channel:
+                return str(config.get("serial", ""))
+    return ""
+
+
+def check_serial(interface: str, channel: str, expected: str, sysfs: Path = SYSFS) -> None:
+    """Raise BusError unless the adapter of a bus has the number `expected`; '' for any."""
+    if expected and (found := serial_of(interface, channel, sysfs)) != expected:
+        shown = f"the serial number {found}" if found else "no known serial number"
+        raise BusError(
+            f"CAN bus {interface} {channel}: its adapter has {shown}, must be can.serial = {expected}: "
+            "are two adapters exchanged?"
+        )
+
+
+def serials_of(serial: str, channel: str, count: int) -> tuple[str, ...]:
+    """Return the number of the adapter of each of `count` motors that the value of `can.serial` names.
+
+    channel: the value of `can.channel`. Raises ParameterError.
+    """
+    names, channels = [name.strip() for name in serial.split(",")], channels_of(channel, count)
+    if len(names) == 1:
+        names *= count
+    if len(names) != len(channels) or len(set(zip(channels, names, strict=True))) != len(set(channels)):
+        raise ParameterError("can.serial", serial, f"one number, or one for each motor, as can.channel = {channel}")
+    return tuple(names)

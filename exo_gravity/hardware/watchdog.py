@@ -29,10 +29,10 @@ from queue import SimpleQueue
 import can
 
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.hardware.can.can_port import ArmOnBus
+from exo_gravity.hardware.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
+from exo_gravity.hardware.can_port import ArmOnBus
 from exo_gravity.hardware.clock import favour
-from exo_gravity.hardware.ownership.bus_lock import ArmNotes, DriveNotes, is_asked_for, remove_notes
-from exo_gravity.hardware.ownership.owned_bus import Silence, let_down
+from exo_gravity.hardware.owned_bus import Silence, let_down
 
 POLL = 0.01  # s
 LOG_TIME = 1.0  # s for the last lines of the log

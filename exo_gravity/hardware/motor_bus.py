@@ -45,9 +45,9 @@ from exo_gravity.core.motors.joint_motor import UNKNOWN, JointMotor, JointSample
 from exo_gravity.core.numbers import limited
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.limits import DAMPING
-from exo_gravity.hardware.can.can_port import CanPort, awaited
-from exo_gravity.hardware.can.request_age import Requests
+from exo_gravity.hardware.can_port import CanPort, awaited
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
+from exo_gravity.hardware.request_age import Requests
 
 LAST_REPLIES = 0.02  # s for which replies to the last frames are awaited
 LISTEN_TIME = 0.12  # s before the first frame

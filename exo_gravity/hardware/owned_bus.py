@@ -20,11 +20,11 @@ from exo_gravity.core.errors import BusError
 from exo_gravity.core.safety.drive import Send
 from exo_gravity.core.safety.machine import SafetyMachine
 from exo_gravity.core.safety.watch import excess_torque, expected_torque
-from exo_gravity.hardware.can.can_port import ArmOnBus, CanPort
-from exo_gravity.hardware.can.motor_bus import MotorBus
+from exo_gravity.hardware.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
+from exo_gravity.hardware.can_port import ArmOnBus, CanPort
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop, NoController
-from exo_gravity.hardware.ownership.bus_lock import ATTEMPT_TIME, ArmLock, ArmNotes
+from exo_gravity.hardware.motor_bus import MotorBus
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Watchdog:
         shared = (receiver.fileno(), *pages, *locks)
         arguments = map(str, (os.getpid(), len(pages), *shared))
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "exo_gravity.hardware.ownership.watchdog", *arguments],
+            [sys.executable, "-m", "exo_gravity.hardware.watchdog", *arguments],
             pass_fds=shared,
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # keeps Ctrl-C and Ctrl-Z in the terminal away from it
