@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -40,17 +40,11 @@ def measure_recordings(quick: bool) -> Iterator[Row]:
             peers: dict[str, Callable[[], object]] = {"rosbags": partial(_read_by_rosbags, bag)}
             if plugin is StoragePlugin.MCAP:
                 peers["mcap's own reader"] = partial(_read_by_mcap, bag)
-            yield from _speeds(f"reading, {form}", _size(bag), partial(read_bag, bag), peers, repeats)
-
-
-def _speeds(
-    name: str, size: float, ours: Callable[[], object], peers: Mapping[str, Callable[[], object]], repeats: int
-) -> Iterator[Row]:
-    """Yield a row for each peer: MB of messages in a second, of which there are `size` MB."""
-    first, *others = seconds_in_turns((ours, *peers.values()), repeats)
-    for peer, seconds in zip(peers, others, strict=True):
-        fast, other = ([size / taken for taken in column] for column in (first, seconds))
-        yield Row.of_values(f"{name}: {peer}", fast, other, "MB/s", more_is_better=True)
+            size = _size(bag)
+            first, *others = seconds_in_turns((partial(read_bag, bag), *peers.values()), repeats)
+            for peer, taken in zip(peers, others, strict=True):
+                fast, other = ([size / spent for spent in column] for column in (first, taken))
+                yield Row.of_values(f"reading, {form}: {peer}", fast, other, "MB/s", more_is_better=True)
 
 
 def _size(bag: Path) -> float:

@@ -158,7 +158,6 @@ def test_topics_are_recorded_as_they_are_published_and_others_are_not(session):
     topics = [entry["topic_metadata"] for entry in metadata["topics_with_message_count"]]
     (states,) = (topic for topic in topics if topic["name"] == "/right/joint_states")
     assert states["type_description_hash"] == str(session[3])  # which its publisher announces
-    assert metadata["custom_data"] == {"source.right": "unknown"}  # there is no can_bridge
 
 
 def test_parameters_their_changes_session_and_markers_are_recorded_and_shown_live(session):

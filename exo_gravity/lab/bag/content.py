@@ -50,11 +50,6 @@ def arm_of(name: str) -> str:
     return name.rpartition("/")[0].strip("/") or "arm"
 
 
-def source_key(arm: str) -> str:
-    """Return the key of an arm's source in `custom_data` of metadata.yaml: 'source.right'."""
-    return f"source.{arm}"
-
-
 def is_wanted(topic: str, msgtype: str) -> bool:
     """Return whether the reader decodes this topic."""
     return msgtype in (READ.get(topic), READ.get(leaf(topic)))

@@ -67,12 +67,10 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
     contents.read(storage)
     arms = contents.arms()
     if not arms and not contents.problems:
-        listed = ", ".join(
+        found = ", ".join(
             f"{topic} ({kind or 'of no type'})" for topic, kind in sorted(storage.topics.items())[:LISTED]
         )
-        problem = f"the recording has no topic {STATES} of type {JOINT_STATE}; among its topics are {listed}"
-        if not storage.topics or any(leaf(t) == STATES and kind == JOINT_STATE for t, kind in storage.topics.items()):
-            problem = "the recording is empty: it has no messages"
+        problem = f"it has no message on a topic {STATES} of type {JOINT_STATE}; of its topics: {found or 'none'}"
         contents.problems.append("; ".join((problem, *contents.notes)))
     series = {topic: contents.series(topic) for topic in arms}
     if series:
@@ -116,11 +114,10 @@ class _Few:
         self._msgtype, self._take = msgtype, take
 
     def add(self, batch: Batch) -> None:
-        for ordinal, arrival, data in zip(
-            batch.ordinal.tolist(), batch.arrival.tolist(), batch.messages(), strict=True
-        ):
+        rows = zip(batch.ordinal.tolist(), batch.arrival.tolist(), strict=True)
+        for row, data in zip(rows, batch.messages(), strict=True):
             try:
-                self._take((ordinal, arrival), TYPES.deserialize_cdr(data, self._msgtype))
+                self._take(row, TYPES.deserialize_cdr(data, self._msgtype))
             except Exception as error:  # rosbags raises whatever its generated code raises
                 self.damaged, self.problem = self.damaged + 1, f"a message is invalid ({type(error).__name__}: {error})"
 

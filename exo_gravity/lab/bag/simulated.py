@@ -42,8 +42,6 @@ def write_recordings(
     ]
     messages.sort(key=lambda message: message[1])
     writer = BagWriter(path)
-    for arm in arms:
-        writer.describe(content.source_key(arm.name), Source.SIMULATED.value)
     for topic, kind in {topic: kind for topic, _, kind, _ in messages}.items():
         writer.add_topic(topic, kind, offered_qos(True, topic in (content.PARAMETERS, content.SESSION), 1))
     writer.write([_serialised(start, *message) for message in messages])

@@ -104,7 +104,7 @@ class Storage:
         if missing := [name for name in named if name not in {part for f in kept for part in (f.name, f.stem)}]:
             self.notes.append(f"metadata.yaml names {', '.join(missing)}, which is not there")
         if not kept:
-            series = {re.sub(r"_\d+$", "", file.name.partition(".")[0]): file.name for file in self.files}
+            series = {re.sub(r"_\d+(?=(\.\w+){1,2}$)", "", file.name): file.name for file in self.files}
             if len(series) > 1:
                 raise DataError(
                     f"{self.path}: {' and '.join(series.values())} are of different recordings, and no metadata.yaml "

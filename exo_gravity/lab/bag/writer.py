@@ -87,10 +87,6 @@ class BagWriter:
         elif messages:
             self._waiting.put(partial(self._take, list(messages)))
 
-    def describe(self, key: str, value: str) -> None:
-        """State something about the recording, for `custom_data` in metadata.yaml."""
-        self._writer.set_custom_data(key, value)
-
     def close(self) -> None:
         """Write the queued messages, the index and metadata.yaml. A failure is in `error`."""
         self._waiting.put(self._finish)

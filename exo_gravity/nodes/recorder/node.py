@@ -4,9 +4,8 @@
 Twice a second it looks for new topics, and records those of all arms, the IMU, diagnostics and parameter changes, each
 with the quality of service that its publisher offers and its time of arrival. Three topics exist in the recording only,
 all std_msgs/String: `/recorder/session`, JSON of subject, protocol, note and version; `/recorder/parameters`, ROS 2
-parameter YAML of each node at the start; and `/recorder/losses`, how many messages were lost, if any were. The
-recording's metadata say of each arm whether it is simulated (`source.right`). A topic that fails is reported, and the
-others are recorded.
+parameter YAML of each node at the start; and `/recorder/losses`, how many messages were lost, if any were. A
+topic that fails is reported, and the others are recorded.
 """
 
 import contextlib
@@ -34,7 +33,6 @@ from exo_gravity.core.safety.descent import DESCENT_TIMEOUT
 from exo_gravity.lab.bag import content
 from exo_gravity.lab.bag.content import PARAMETERS, STATES, arm_of, leaf
 from exo_gravity.lab.packages import extras
-from exo_gravity.lab.source import source_of
 from exo_gravity.lab.trial.session import Session
 from exo_gravity.nodes.ros.messages import status_values
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
@@ -87,7 +85,6 @@ class Recorder(Node):
         self._failed: set[str] = set()  # topics and nodes whose failure was reported
         self._last_states, self._orphaned = -math.inf, math.inf  # monotonic s
         self._losses = ""  # what was reported of them
-        self._given: dict[str, dict[str, Any]] = {}  # parameters of each node
         self._topics: dict[str, PolledSubscription] = {}
         self._counted: list[Publishers] = []  # of joints and IMU; other topics have several
         self._taken: list[tuple[str, int, bytes]] = []  # topic, time of arrival in ns since 1970, serialised
@@ -112,7 +109,6 @@ class Recorder(Node):
         try:
             self._drain()
             self._report_losses()
-            self._describe_sources()
             if self._losses:
                 self._writer.add_topic(content.LOSSES, content.STRING, offered_qos(True, True, 1))
                 self._write_text(content.LOSSES, self._losses)
@@ -197,17 +193,9 @@ class Recorder(Node):
 
     def _write_parameters(self, node: str, values: dict[str, Any]) -> None:
         # ROS's parameter files have no empty lists.
-        self._given[node] = given = {name: value for name, value in values.items() if value != []}
+        given = {name: value for name, value in values.items() if value != []}
         text = yaml.safe_dump({node: {"ros__parameters": given}}, default_flow_style=None, width=120)
         self._write_text(PARAMETERS, text)
-
-    def _describe_sources(self) -> None:
-        """State in the recording's metadata which arms are simulated."""
-        for topic in self._topics:
-            if leaf(topic) == STATES:
-                of_arm = topic.removesuffix(STATES)
-                source = source_of(self._given.get(f"{of_arm}can_bridge", {}), f"{of_arm}simulator" in self._given)
-                self._writer.describe(content.source_key(arm_of(topic)), source.value)
 
     def _write_text(self, topic: str, text: str) -> None:
         now = self.get_clock().now().nanoseconds

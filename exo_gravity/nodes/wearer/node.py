@@ -15,6 +15,7 @@ An arm from a URDF (`law: urdf`) is read from the compensator's own file or topi
 import math
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -23,25 +24,26 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Arm
 from exo_gravity.core.arm.rotation import ZERO, Floats3
+from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt, turning_in_base
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import Settings, settings_of
 from exo_gravity.core.compensation.support import NAME, TOPIC
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.trunk.inputs import FELT, TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, NONE, Reason
+from exo_gravity.core.vocabulary import NO_REASON, NONE, UNKNOWN, Reason
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
+from exo_gravity.lab.budget import USUAL_TILT, budget, largest_support, motor_torques, overload, workspace
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.lab.observer.share import PERIOD
 from exo_gravity.lab.observer.watch import WearerWatch, values_of
-from exo_gravity.lab.vocabulary import Adapts, NoEstimate, WearerState
+from exo_gravity.lab.vocabulary import Adapts, Budget, NoEstimate, WearerState
 from exo_gravity.nodes.ros.messages import OK, STALE, WARN, Diagnostics, Statuses, by_name
 from exo_gravity.nodes.ros.parameters import NodeParameters, declare
 from exo_gravity.nodes.ros.run import run
 from exo_gravity.nodes.ros.subscriptions import LATCHED, PeriodicThread, PolledSubscription, TiltSubscription
-from exo_gravity.nodes.wearer.budget_watch import BudgetWatch
 
 COMPENSATOR = "compensator"
 PARAMETER_PERIOD = 0.1  # s between two looks whether the compensator's parameters are to be read
@@ -51,6 +53,67 @@ SILENCE = 0.5  # s without joint states, after which they are waited for
 # s without the compensator's diagnostics, which come twice a second: the middleware lists a killed node for 20 s
 COMPENSATOR_SILENCE = 2.0
 FRESH = 0.1  # s, age of the trunk's motion that is used
+WITHIN = "within rated torque everywhere"
+BRIDGE_PARAMETERS = {
+    "motor", "torque_scale", "torque_scale_slope", "torque_scale_temperature", "position_min", "position_max",
+}  # fmt: skip
+# robot, the same with the wearer's whole arm, springs of device and wearer, support 0..1, largest tilt in rad
+Request = tuple[Arm, Arm, tuple[Springs, Springs], float, float]
+
+
+class BudgetWatch:
+    """The torque budget of what an arm carries at present: whether its motors can hold it in every pose.
+
+    It takes about 0.2 s of arithmetic on the executor's thread; the estimate has its own. Motors and joint limits are
+    parameters of `can_bridge`, which are read once.
+    """
+
+    def __init__(self, node: Node) -> None:
+        #: the result for the settings checked last
+        self.result = Reason(Budget.UNKNOWN, "unknown: waiting for can_bridge's parameters")
+        #: share 0..1 of the wearer's arm within rated torque everywhere, 0 if none is, 'none' without a wearer
+        self.largest_support = UNKNOWN
+        self._logger = node.get_logger()
+        self._bridge = NodeParameters(node, "can_bridge", once=True, fitting=fitting)
+        self._request: Request | None = None
+
+    def update(self, names: Sequence[str], settings: Settings) -> None:
+        """Check `settings` if they are new; names: of the joints (n,)."""
+        if settings.law == URDF_LAW:
+            self.result = Reason(Budget.UNKNOWN, "unknown: it is watched for the paper's arm alone")
+            return
+        self._bridge.update()
+        request = request_of(settings)
+        if self._bridge.values.keys() >= BRIDGE_PARAMETERS and request != self._request:
+            self._request = request
+            self.result, self.largest_support = compute(names, request, self._bridge.values)
+            if self.result.word != Budget.WITHIN_RATED:
+                self._logger.warning(f"{self.result}; efforts stay clamped to max_effort")
+
+
+def request_of(s: Settings) -> Request:
+    """Return what the motors must be able to hold with these settings."""
+    support = (1.0 if s.support_adapts else s.support) if s.mode == "zero_g" else 0.0
+    tilt = math.radians(USUAL_TILT) if s.use_imu else 0.0
+    return s.loaded, s.worn(s.loaded), (s.joint_spring, s.tissue), support, tilt
+
+
+def compute(names: Sequence[str], request: Request, bridge: Mapping[str, Any]) -> tuple[Reason, str]:
+    """Return `result` and `largest_support` of `BudgetWatch`.
+
+    names: of the joints (n,).
+    bridge: its parameter values.
+    """
+    robot, full, springs, support, tilt = request
+    try:
+        bounds = workspace(bridge["position_min"], bridge["position_max"], tilt)
+        rated, peak = motor_torques(bridge)
+        joints = budget(robot, full, springs, support, bounds, rated, peak)
+    except ParameterError as error:
+        return Reason(Budget.UNKNOWN, f"unknown: can_bridge has {error}"), UNKNOWN
+    overloaded = overload(names, joints)
+    result = Reason(Budget.ABOVE_RATED, overloaded) if overloaded else Reason(Budget.WITHIN_RATED, WITHIN)
+    return result, f"{largest_support(joints) or 0.0:g}" if full != robot else NONE
 
 
 class Trunk:

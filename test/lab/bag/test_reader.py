@@ -449,9 +449,9 @@ def test_of_a_driver_with_seven_joints_those_that_are_commanded_are_reported(tmp
 
 
 REFUSED: dict[str, tuple[Entries, str]] = {
-    "empty": ((), "is empty"),
+    "empty": ((), "has no message"),
     "other topics": ([made.text_entry("/chatter", 0.0, "hello")], "joint_states .* /chatter"),
-    "another type": ([made.text_entry(STATES, 0.0, "hello")], f"no topic .* are {STATES}"),
+    "another type": ([made.text_entry(STATES, 0.0, "hello")], f"no message .*: {STATES}"),
     "damaged messages": (
         [(*rest, data[:40]) for *rest, data in CONTENT if rest[1] == made.JOINT_STATE],
         f"{STATES}: .*damaged",
