@@ -64,8 +64,7 @@ def _located(path: str) -> Path:
     if name == "exo_gravity" and (own := packaged(rest.removeprefix("config/"))):
         return own
     shares = [Path(prefix, "share", name) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if prefix]
-    found = (file for share in shares if (file := share / rest).exists())
-    return next(found, Path(path))
+    return next((file for share in shares if (file := share / rest).exists()), Path(path))
 
 
 def arm_from(values: Mapping[str, Any], text: str) -> UrdfArm:
@@ -180,6 +179,8 @@ class UrdfArm(UrdfShape):
         self._identity = text, names
         self._by_mass = self._model  # with the wearer's points of mass, for the inertia
         self._data = self._model.createData()
+        # Pinocchio's configuration is the angles of the arm's joints: no other one moves, and none is continuous.
+        self._is_chain = self._model.nq == len(names) and np.array_equal(self.moves.own, np.eye(len(names)))
         self._own_mass = sum(link.mass for link in self.moves.moved)
         self.notes = checked("arm", self)
         unused = {name for name, *_ in unused_efforts(self)}
@@ -485,7 +486,8 @@ class UrdfArm(UrdfShape):
 
         turning: (3,) rad/s^2, less the root link's angular acceleration.
         """
-        model = self._model
-        model.gravity.linear, model.gravity.angular = np.array(gravity), np.array(turning)
-        torque = self._pin.computeGeneralizedGravity(model, self._data, self.moves.configuration(theta))
-        return tuple((self.gain * (self.moves.own.T @ torque)).tolist())
+        felt = self._model.gravity
+        felt.linear[:], felt.angular[:] = gravity, turning  # in place, which takes a fifth of the time of assigning
+        at = np.array(theta, dtype=float) if self._is_chain else self.moves.configuration(theta)
+        torque = self._pin.computeGeneralizedGravity(self._model, self._data, at)
+        return tuple((self.gain * (torque if self._is_chain else self.moves.own.T @ torque)).tolist())
