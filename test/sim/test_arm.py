@@ -82,42 +82,15 @@ def test_the_exact_torque_holds_the_arm_and_an_imbalance_beyond_friction_moves_i
     assert least <= moved(arm, torque, 1.0 if least else 10.0) < most
 
 
-def test_a_frictionless_fall_conserves_energy():
-    arm = SimulatedArm(ArmConfig(**FRICTIONLESS))
-    arm.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    arm.reset((0.0, 0.3, 0.8, 0.6))
-    start = arm.data.energy.sum()
-    moved(arm, (0.0,) * 4, 0.25)
-    potential, kinetic = arm.data.energy
-    assert kinetic > 0.5
-    assert potential + kinetic == pytest.approx(start, abs=0.01 * kinetic)
-
-
-@pytest.mark.parametrize("rotor", [0.0, 0.01])
-def test_the_elbow_has_the_inertia_of_its_tube_and_of_the_rotor(rotor):
-    arm = SimulatedArm(ArmConfig(rotor_inertia=(0.0, 0.0, 0.0, rotor)))
-    column = np.zeros(4)
-    mujoco.mj_mulM(arm.model, arm.data, column, np.array((0.0, 0.0, 0.0, 1.0)))
-    links, radius = arm.config.links, 0.03
-    length, mass, cog = links.length[3], links.mass[3], links.cog[3]
-    assert column[3] == pytest.approx(mass * (length**2 / 12 + radius**2 / 2 + cog**2) + rotor)
-
-
 @pytest.mark.parametrize("joint", range(4))
-@pytest.mark.parametrize("side", ["position_min", "position_max"])
-def test_joint_stops_hold_against_the_motors_peak_torque(joint, side):
-    arm = SimulatedArm()
+@pytest.mark.parametrize(("side", "way"), [("position_min", -1.0), ("position_max", 1.0)])
+def test_joint_stops_hold_against_the_motors_peak_torque(joint, side, way):
+    arm, chosen = SimulatedArm(), np.arange(4) == joint
     stop = getattr(arm.config, side)[joint]
-    theta = np.clip(np.zeros(4), arm.config.position_min, arm.config.position_max)
-    theta[joint] = stop
     arm.move_base((0.0, 0.0, 0.0))
-    arm.reset(theta)
-    torque = np.zeros(4)
-    torque[joint] = (9.0, 18.0, 9.0, 9.0)[joint] * (-1 if side == "position_min" else 1)
-    moved(arm, torque, 1.0)
+    arm.reset(np.where(chosen, stop, np.clip(np.zeros(4), arm.config.position_min, arm.config.position_max)))
+    moved(arm, np.where(chosen, np.multiply(way, (9.0, 18.0, 9.0, 9.0)), 0.0), 1.0)
     assert abs(np.degrees(arm.positions[joint] - stop)) < 1.0
-    arm.reset(RAISED)
-    assert (arm.positions, arm.velocities) == (list(RAISED), [0.0] * 4)  # at rest
 
 
 WORN = {"wearer_mass": (0.0, 0.0, 2.0, 1.7), "wearer_cog": (0.0, 0.0, 0.16, 0.2)}
@@ -169,15 +142,6 @@ def test_an_arm_on_a_moving_base_accelerates_as_one_on_a_trunk_with_joints(on_tr
         np.testing.assert_allclose(on_trunk(state, theta, velocity, acceleration), torque, atol=1e-8)
 
 
-def test_a_base_that_stops_turning_leaves_no_forces_behind(on_trunk):
-    arm = SimulatedArm(ArmConfig(**FRICTIONLESS, **WORN))
-    moving = TrunkState(pitch_rate=2.0, roll_acceleration=5.0, acceleration=(1.0, 2.0, 3.0))
-    theta, still = (0.3, 0.8, 0.7, 0.6), (0.0,) * 4
-    accelerate(arm, moving, theta, still, still)
-    acceleration = accelerate(arm, TrunkState(), theta, still, still)
-    np.testing.assert_allclose(on_trunk(TrunkState(), theta, still, acceleration), still, atol=1e-8)
-
-
 def test_the_right_arm_feels_the_mirror_image():
     x, y, z = 0.3, -0.5, 0.8
     assert in_base("right", (x, y, z)) == in_base("left", (x, -y, z))
@@ -191,7 +155,7 @@ def test_the_right_arm_feels_the_mirror_image():
 STUCK = {"coulomb_friction": (10.0,) * 4, "viscous_friction": (0.0,) * 4}
 
 
-@pytest.mark.parametrize(("count", "stiffness"), [(1, 1000.0), (3, 150.0), (3, 1000.0)])
+@pytest.mark.parametrize(("count", "stiffness"), [(1, 1000.0), (3, 150.0)])
 def test_an_elastic_arm_moves_as_pinocchio_and_scipy_compute_it(count: int, stiffness: float) -> None:
     text, names = random_chain(count, count)
     rotor, play, k = np.full(count, 2e-3), np.full(count, 0.01), np.full(count, stiffness)
@@ -225,19 +189,6 @@ def test_an_elastic_arm_moves_as_pinocchio_and_scipy_compute_it(count: int, stif
     assert np.abs(link - start).max() > 0.05
     np.testing.assert_allclose(arm.positions, link, atol=3e-3)
     np.testing.assert_allclose(arm.motor_positions, motor, atol=3e-3)
-
-
-@pytest.mark.parametrize(("stiffness", "play"), [(150.0, 0.0), (1000.0, 0.02)])
-def test_behind_a_motor_that_stands_the_link_sags_by_its_torque_and_the_play(stiffness: float, play: float) -> None:
-    arm = SimulatedArm(ArmConfig(joint_stiffness=(stiffness,) * 4, backlash=(play,) * 4, **STUCK))
-    arm.reset(RAISED)
-    for _ in range(3000):
-        arm.step(np.multiply(arm.velocities, -0.5), of_motors=(0.0,) * 4)  # a hand stills the links
-    np.testing.assert_allclose(arm.motor_positions, RAISED, atol=1e-3)
-    torque = gravity_torque(arm.config.links, arm.positions)
-    sag = np.subtract(arm.motor_positions, arm.positions)
-    carrying = np.abs(torque) > 0.3
-    np.testing.assert_allclose(sag[carrying], (torque / stiffness + np.sign(torque) * play / 2.0)[carrying], atol=2e-4)
 
 
 def test_one_elastic_joint_leaves_the_others_rigid_and_a_motor_reports_its_own_angle() -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import socket
 import threading
 import time
@@ -12,19 +11,18 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import can
-import numpy as np
 import pytest
 
-from exo_gravity.core.errors import BusError, ParameterError
-from exo_gravity.core.motors.ak import MIT, MIT_V3, unpack_reply
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.motors.ak import unpack_reply
 from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS, SET_ZERO
+from exo_gravity.core.motors.frames import ENTER, EXIT
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware.can_port import CanPort
-from exo_gravity.hardware.clock import COMPUTER_CLOCK
 from exo_gravity.hardware.motor_bus import MotorBus
-from exo_gravity.sim import FIRMWARES, Firmware, SimulatedArm, SimulatedDevice, VirtualWearer
+from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.sim import FIRMWARES, SimulatedArm, SimulatedDevice, VirtualWearer
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
 from exo_gravity.sim.motors import simulated
@@ -33,7 +31,7 @@ from exo_gravity.sim.virtual_time import VirtualBus, Wire
 
 from ..core.test_bus_load import stuffed_bits
 from ..support.ports import own_ports
-from ..support.simulated_device import OFF, RAISED, SPECS, command, frame, make_device
+from ..support.simulated_device import OFF, SPECS, command, frame, make_device
 
 PORTS = own_ports()
 
@@ -47,37 +45,6 @@ def perform(device, *steps):
     device.start(VirtualWearer(TrialScript.parse({"name": "test", "steps": list(steps)})))
 
 
-def test_a_reply_has_the_present_position_and_velocity_and_the_error_of_the_encoder(device):
-    device.encoder_error = (0.0, 0.698, 0.0, 0.0)
-    device.arm.reset(RAISED)
-    device.advance(0.2)
-    for joint, error in enumerate(device.encoder_error):
-        reply = unpack_reply(SPECS[joint], device.exchange(joint + 1, command(joint))[1])
-        assert reply.position == pytest.approx(device.arm.positions[joint] + error, abs=2e-4)
-        assert reply.velocity == pytest.approx(device.arm.velocities[joint], abs=0.013)
-
-
-def test_time_advances_in_whole_steps_and_the_remainder_is_kept(device):
-    device.advance(0.0104)
-    assert device.time == pytest.approx(0.010)
-    device.advance(0.0006)
-    assert device.time == pytest.approx(0.011)
-
-
-def test_a_hand_that_leads_a_light_arm_against_damping_does_not_shake_it(device):
-    device.arm.reset(RAISED)
-    for joint in range(len(SPECS)):
-        device.exchange(joint + 1, ENTER)
-        device.exchange(joint + 1, command(joint, kd=5.0))
-    perform(device, *({"move": pose, "over": 0.8} for pose in ([0.3, 1.2, 0.8, 1.2], [0.0, 0.9, 0.3, 0.6])))
-    velocities = []
-    for _ in range(1600):
-        device.advance(0.001)
-        velocities.append(device.arm.velocities)
-    changes = np.diff(velocities, axis=0)
-    assert np.abs(changes[1:] - changes[:-1]).max() < 0.5
-
-
 @pytest.mark.parametrize(("fault", "of_joint_1"), [("bus_silent", True), ("cut_off", (True, False, False, False))])
 def test_a_motor_that_no_frame_reaches_keeps_its_last_command(device, fault, of_joint_1):
     device.exchange(1, ENTER)
@@ -88,56 +55,26 @@ def test_a_motor_that_no_frame_reaches_keeps_its_last_command(device, fault, of_
     assert (device.exchange(3, ENTER) is None) is (fault == "bus_silent")
 
 
-def test_after_set_zero_a_motor_does_not_reply_for_a_while_of_simulated_time():
-    device = make_device(Firmware(zero_silence=0.7))
-    assert device.exchange(1, SET_ZERO) is None
-    device.advance(0.699)
-    assert device.exchange(1, command(0)) is None
-    device.advance(0.002)
-    assert device.exchange(1, command(0)) is not None
-
-
-@pytest.mark.parametrize("ids", [(1, 2, 3, 3), (1, 1, 1, 1)])
-def test_two_motors_with_the_same_id_are_rejected(ids):
+def test_two_motors_with_the_same_id_are_rejected():
     with pytest.raises(ParameterError, match="can_id"):
-        make_device(ids=ids)
+        make_device(ids=(1, 2, 3, 3))
 
 
-def test_the_trunk_bows_and_stays_bowed(device):
+def test_the_trunk_bows_and_stays_bowed_and_a_new_script_ends_the_motion_of_the_old_one(device):
     device.pitch, device.roll = 0.1, -0.06
     perform(device, {"hold": 0.5}, {"bow": 0.5, "over": 1.0}, {"hold": 0.5})
-    device.advance(0.4)
-    assert (device.pitch, device.trunk_motion) == (0.1, None)
-    device.advance(0.6)
-    assert device.trunk_motion
+    device.advance(1.0)
     assert device.trunk.pitch == device.pitch == pytest.approx(0.3, abs=0.001)
     assert device.trunk.pitch_rate == pytest.approx(0.4 * 1.875, rel=0.01)
     device.advance(1.0)
     assert (device.pitch, device.roll) == pytest.approx((0.5, -0.06), abs=1e-6)
     assert not device.trunk_motion and device.trunk[2:] == (0.0,) * 4 + ((0.0,) * 3,)
-
-
-def test_a_walking_trunk_stays_where_it_was_and_a_new_script_ends_the_motion_of_the_old_one(device):
-    device.pitch = 0.1
-    perform(device, {"walk": 4.0}, {"hold": 1.0})
-    pitches = []
-    for _ in range(450):
-        device.advance(0.01)
-        pitches.append(device.pitch)
-    assert np.ptp(pitches) == pytest.approx(math.radians(2.0), rel=0.02)
-    assert pitches[-1] == pytest.approx(0.1, abs=1e-6)
     perform(device, {"walk": 10.0})
     device.advance(2.3)
     assert any(device.trunk.acceleration)
     perform(device, {"hold": 1.0})
     device.advance(0.01)
     assert device.trunk == (device.pitch, device.roll, 0.0, 0.0, 0.0, 0.0, (0.0,) * 3)
-
-
-def test_the_arm_feels_the_shock_of_sitting_down(device):
-    perform(device, {"sit": 2.0})
-    device.advance(0.551)  # at the peak of the shock, 1.28 g
-    np.testing.assert_allclose(device.arm.model.opt.gravity, (0.0, 0.0, 2.28 * 9.80665), atol=0.1)
 
 
 # On a bus of python-can
@@ -181,8 +118,6 @@ def test_every_command_gets_one_reply_and_an_echo_of_a_reply_or_another_frame_is
     with running(device, options) as host:
         for message in (
             *(frame(can_id, ENTER) for can_id in (0, 5)),
-            frame(0x7FF, b""),
-            frame(1, b""),
             frame(1, ENTER[:7]),
             frame(1, ENTER, is_extended_id=True),
             frame(1, None, is_remote_frame=True, dlc=8),
@@ -199,25 +134,15 @@ def test_every_command_gets_one_reply_and_an_echo_of_a_reply_or_another_frame_is
         assert next_reply(host).arbitration_id == 1
         assert device.motors[0].torque(0.0, 0.0) == 0.0  # none of them switched it on
         for joint in [0, 1, 2, 3] * 10:
-            sent = time.monotonic()
             host.send(frame(joint + 1, command(joint)))
             reply = next_reply(host)
             assert (reply.arbitration_id, reply.data[0]) == (joint + 1, joint + 1)
-            assert time.monotonic() - sent >= 200e-6  # no real motor replies faster
-        host.send(frame(1, ENTER))
-        next_reply(host)
-        for _ in range(50):
-            host.send(frame(1, command(0, 1.0)))
-            assert unpack_reply(SPECS[0], next_reply(host).data).torque == pytest.approx(1.0, abs=0.01)
+        for data in (ENTER, command(0, 1.0)):
+            host.send(frame(1, data))
+            reply = next_reply(host)
+        assert unpack_reply(SPECS[0], reply.data).torque == pytest.approx(1.0, abs=0.01)
         assert next_reply(host, timeout=0.05) is None
     assert device.motors[0].torque(0.0, 0.0) == pytest.approx(1.0, abs=0.01)
-
-
-def test_a_failing_bus_ends_the_run_with_a_bus_error(device):
-    bus = can.Bus(interface="virtual", channel=f"device-{next(PORTS)}")
-    bus.shutdown()
-    with pytest.raises(BusError, match="receiving"):
-        device.run(bus, lambda: False)
 
 
 class ScriptedBus:
@@ -282,16 +207,6 @@ def test_stalls_and_silence_are_measured_while_the_motors_are_on(device, monkeyp
     assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))
 
 
-def test_status_frames_come_at_their_rate_and_missed_ones_are_not_made_up(monkeypatch):
-    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
-    bus = ScriptedBus([*[(0.001, None)] * 5000, (1.0, None), *[(0.001, None)] * 4000])
-    bus.run(device, monkeypatch)
-    times, ids, _ = zip(*bus.sent, strict=True)
-    assert set(ids) == {MIT_V3.reply_id(2) & ID_BITS}
-    assert len(times) == pytest.approx(900, abs=5)
-    assert np.diff(times).min() > 0.009 and np.diff(times).max() == pytest.approx(1.0, abs=0.02)
-
-
 @pytest.mark.parametrize("is_fd", [False, True], ids=["classic", "fd"])
 def test_damiao_motors_tell_their_state_and_settings_on_the_buses_of_python_can(options, is_fd):
     joints = [JointMotor(MOTORS["DM-J4310"], can_id, wire_format=DAMIAO_MIT, timeout=0.2) for can_id in (1, 2, 3, 4)]
@@ -313,7 +228,6 @@ def test_damiao_motors_tell_their_state_and_settings_on_the_buses_of_python_can(
 
 
 BITRATE = 1_000_000
-IDS = (1, 2, 3, 4)
 HIGH, LOW = b"\x80" + bytes(7), bytes(8)  # data of two frames that differ in their first bit
 
 
@@ -397,7 +311,7 @@ def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
     """
     before = wire.arbitration.collisions
     for data in (lambda can_id: command(can_id - 1), lambda can_id: ENTER, lambda can_id: command(can_id - 1, 1.0)):
-        for can_id in IDS:
+        for can_id in (1, 2, 3, 4):
             host.send(frame(can_id, data(can_id)))
             assert not is_awaiting or host.recv(0.01)
     wire.clock.sleep(0.01)

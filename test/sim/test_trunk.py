@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.sim import ImuConfig, SimulatedImu
-from exo_gravity.sim.imu import measured_tilt
 from exo_gravity.sim.script import Step
 from exo_gravity.sim.trunk_motion import HIP_TO_SHOULDER, SitDown, TrunkState, Turn, Walk, motion_of
 
@@ -76,14 +75,6 @@ def test_walking_accelerates_the_trunk_as_much_as_measured_and_goes_nowhere_but_
     np.testing.assert_allclose(orientation(bent) @ bent.acceleration, there, atol=1e-9)
 
 
-def test_the_shock_of_sitting_down_stops_the_fall():
-    motion, step = SitDown((0.0, 0.0)), 1e-4
-    up = np.array([motion.at(t).acceleration[2] for t in np.arange(0.0, 1.0, step)])
-    speed = np.cumsum(up) * step
-    assert (speed.min(), speed[-1]) == pytest.approx((-0.8, 0.0), abs=1e-3)
-    assert up.max() == pytest.approx(1.28 * G, rel=0.01)
-
-
 @pytest.mark.parametrize(
     ("step", "motion"),
     [
@@ -140,23 +131,17 @@ def test_noise_has_the_configured_density_and_the_same_seed_gives_the_same_sampl
     ids=["constant", "walking at random"],
 )
 def test_biases_have_the_configured_size_after_4_s(changes, seeds, expected):
-    ends = []
-    for seed in range(seeds):
-        imu = SimulatedImu(ImuConfig(**{**changes, "seed": seed}))
-        samples = [imu.sample(UPRIGHT) for _ in range(40)]
-        ends.append(np.subtract(samples[-1], ((0, 0, 0), (0, 0, G))))
-        assert np.array_equal(samples[0], samples[-1]) is (changes is QUIET)
-    np.testing.assert_allclose(np.std(ends, axis=(0, 2)), expected, rtol=0.1)
+    imus = [SimulatedImu(ImuConfig(**{**changes, "seed": seed})) for seed in range(seeds)]
+    samples = np.array([[imu.sample(UPRIGHT) for _ in range(40)][-1] for imu in imus])
+    np.testing.assert_allclose(np.std(samples - ((0, 0, 0), (0, 0, G)), axis=(0, 2)), expected, rtol=0.1)
 
 
 def test_the_accelerometer_measures_the_acceleration_of_its_own_place_less_gravity():
-    walk = Walk((0.3, -0.2), 10.0)
-    for t in (2.1, 3.3, 4.7):
-        state = walk.at(t)
-        gyroscope, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(state)
-        force = orientation(state) @ state.acceleration + (0.0, 0.0, G)
-        np.testing.assert_allclose(orientation(state) @ accelerometer, force, atol=1e-9)
-        np.testing.assert_allclose(gyroscope, state.angular_velocity)
+    state = Walk((0.3, -0.2), 10.0).at(3.3)
+    gyroscope, accelerometer = SimulatedImu(ImuConfig(**EXACT)).sample(state)
+    force = orientation(state) @ state.acceleration + (0.0, 0.0, G)
+    np.testing.assert_allclose(orientation(state) @ accelerometer, force, atol=1e-9)
+    np.testing.assert_allclose(gyroscope, state.angular_velocity)
     # At the hips, about which a bow turns, there is none.
     bow = Turn((0.0, 0.0), (0.7, 0.2), 1.0).at(0.4)
     at_hips = SimulatedImu(ImuConfig(**EXACT, position=(0.0, 0.0, -HIP_TO_SHOULDER[2]))).sample(bow)[1]
@@ -171,12 +156,6 @@ def test_readings_lag_by_the_delay(delay):
     times = np.arange(100) / 100.0
     rates = [imu.sample(TrunkState(0.0, 0.0, roll_rate=t))[0][0] for t in times]
     np.testing.assert_allclose(rates[10:], times[10:] - delay, atol=1e-12)
-
-
-def test_the_tilt_of_the_trunk_follows_from_a_second_of_samples():
-    mounted = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
-    tilt = measured_tilt(0.1, -0.06, SimulatedImu(ImuConfig(mounted)), mounted)
-    np.testing.assert_allclose(tilt, (0.1, -0.06), atol=0.01)
 
 
 @pytest.mark.parametrize(
