@@ -22,9 +22,12 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import can
+
+if TYPE_CHECKING:
+    from exo_gravity.sim.virtual_time import VirtualClock
 
 ERROR_STEP = 8  # of a TEC at an error
 PASSIVE_FROM, BUS_OFF_FROM = 128, 256  # values of a TEC
@@ -36,18 +39,6 @@ _RUN = 5  # equal bits, after which a stuff bit follows
 _CRC_POLYNOMIAL = 0x4599
 
 
-class Later(Protocol):
-    """The clock of the wire."""
-
-    def monotonic(self) -> float:
-        """Return the time in s."""
-        ...
-
-    def later(self, delay: float, function: Callable[[], None]) -> None:
-        """Call `function` in `delay` s."""
-        ...
-
-
 @dataclass
 class CanController:
     """One CAN controller. pending: senders, frames and their bits, first in, first out."""
@@ -55,7 +46,6 @@ class CanController:
     retransmits: bool  #: It sends a frame again after an error, as all do unless they are told not to.
     pending: deque[tuple[object, can.Message, list[int]]] = field(default_factory=deque)
     tec: int = 0  #: Transmit error counter.
-    highest_tec: int = 0
     ready: float = -math.inf  #: s from which it may begin.
     off_until: float = -math.inf  #: s until which it is off the bus.
 
@@ -63,18 +53,6 @@ class CanController:
         """Wait after a frame that it sent and that ended at `end` s, if it is error passive."""
         if self.tec >= PASSIVE_FROM:
             self.ready = end + SUSPENDED_BITS / bitrate
-
-    def fail(self, now: float) -> bool:
-        """Count an error of its frame; return whether it leaves the bus for that."""
-        self.tec += ERROR_STEP
-        self.highest_tec = max(self.highest_tec, self.tec)
-        if not self.retransmits:
-            self.pending.popleft()
-        if self.tec < BUS_OFF_FROM:
-            return False
-        self.pending.clear()
-        self.tec, self.off_until = 0, now + RESTART_TIME
-        return True
 
 
 class Arbitration:
@@ -86,18 +64,14 @@ class Arbitration:
 
     collisions: how often two frames with one ID met.
     bus_offs: how often a controller left the bus.
+    tec: the highest transmit error counter that a controller has had.
     """
 
-    def __init__(self, clock: Later, bitrate: int, deliver: Callable[[object, can.Message], None]) -> None:
-        self.collisions = self.bus_offs = 0
+    def __init__(self, clock: VirtualClock, bitrate: int, deliver: Callable[[object, can.Message], None]) -> None:
+        self.collisions = self.bus_offs = self.tec = 0
         self._clock, self._bitrate, self._deliver = clock, bitrate, deliver
         self._controllers: dict[Hashable, CanController] = {}
         self._is_busy = False
-
-    @property
-    def tec(self) -> int:
-        """The highest transmit error counter that a controller has had."""
-        return max((controller.highest_tec for controller in self._controllers.values()), default=0)
 
     def send(self, name: Hashable, sender: object, message: can.Message, retransmits: bool) -> None:
         """Let the controller `name` send a frame of `sender` when it can."""
@@ -126,22 +100,30 @@ class Arbitration:
             failing = [controller for controller in lost if _arbitration_id(controller) in ids]
             self.collisions += bool(failing)
             if any(controller.tec < PASSIVE_FROM for controller in failing):
-                self._fail([*failing, *(controller for _, controller in kept)], at + 1)
+                failing += [controller for _, controller in kept]
+                self._fail(failing, now)
+                duration = (at + 1 + ERROR_FRAME_BITS) / self._bitrate  # an error frame ends theirs
+                for controller in failing:
+                    controller.suspend(now + duration, self._bitrate)
+                self._clock.later(duration, self._become_idle)
                 return
-            for controller in failing:
-                self.bus_offs += controller.fail(now)
+            self._fail(failing, now)
             failed += failing
             streams = kept
         bits, senders = streams[0][0], [controller for _, controller in streams]
         self._clock.later((len(bits) + TAIL_BITS) / self._bitrate, partial(self._finish, senders, failed))
 
-    def _fail(self, controllers: Sequence[CanController], bits: int) -> None:
-        """Let an error frame end the frames of `controllers` after `bits`."""
-        end = self._clock.monotonic() + (bits + ERROR_FRAME_BITS) / self._bitrate
+    def _fail(self, controllers: Sequence[CanController], now: float) -> None:
+        """Count an error of each one's frame; some leave the bus for that."""
         for controller in controllers:
-            self.bus_offs += controller.fail(self._clock.monotonic())
-            controller.suspend(end, self._bitrate)
-        self._clock.later((bits + ERROR_FRAME_BITS) / self._bitrate, self._become_idle)
+            controller.tec += ERROR_STEP
+            self.tec = max(self.tec, controller.tec)
+            if not controller.retransmits:
+                controller.pending.popleft()
+            if controller.tec >= BUS_OFF_FROM:
+                controller.pending.clear()
+                controller.tec, controller.off_until = 0, now + RESTART_TIME
+                self.bus_offs += 1
 
     def _finish(self, senders: Sequence[CanController], failed: Sequence[CanController]) -> None:
         """Deliver the frame that `senders` have sent, all the same bits, and whose ID those that failed have too."""

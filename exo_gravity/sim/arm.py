@@ -53,7 +53,6 @@ JOINT_LOSS = 2e-4
 
 _ALPHA = (-math.pi / 2, math.pi / 2, 0.0, 0.0)
 _OFFSET = (0.0, -math.pi / 2, 0.0, 0.0)
-_JOINTS = tuple(f"joint {n + 1}" for n in range(JOINT_COUNT))
 _TUBE_RADIUS = 0.03  # m; each link has the inertia of a thin carbon tube
 _MIN_MASS = 0.001  # kg; MuJoCo cannot simulate a massless link
 _MIN_ROTOR = 1e-5  # kg m^2, added to the rotor's own: MuJoCo needs bodies with inertia
@@ -65,7 +64,7 @@ _ZEROS = (0.0,) * JOINT_COUNT
 # published motor tables) and 0.1 to 0.25 kg of carbon tube, bracket and cuff.
 DEFAULT_LINKS = ArmModel((0.05, 0.13, 0.30, 0.30), (0.045, 0.115, 0.235, 0.13), (0.60, 0.46, 0.61, 0.20))
 
-_BALL = '<joint type="ball"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+POINT = (1e-7, 1e-7, 1e-7)  # kg m^2, the inertia of a point of mass
 
 
 class Stiffness(NamedTuple):
@@ -129,8 +128,8 @@ class JointConfig:
         """The elastic joints, from 0 on: the motor of each is a separate body."""
         return [n for n, stiffness in enumerate(self.joint_stiffness) if stiffness]
 
-    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-        """Return the arm, and the same on a base that can turn about its origin.
+    def bodies(self, payload: Payload) -> mujoco.MjSpec:
+        """Return base, links and joints, and what is on the links.
 
         payload: its place is in the frame of the hand.
         """
@@ -140,27 +139,19 @@ class JointConfig:
         """Return what the base of the `side` arm feels, in its own axes, as for `SimulatedArm.move_base`."""
         raise NotImplementedError
 
-    def with_tissue(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Add the springs of the wearer's joints to those of `model`; return it."""
-        joints, angles, _ = self.places(model)
-        own, worn = model.jnt_stiffness[joints].copy(), np.array(self.wearer_stiffness)
-        pull = own * model.qpos_spring[angles] + worn * self.wearer_rest
-        model.jnt_stiffness[joints] = both = own + worn
-        model.qpos_spring[angles] = np.divide(pull, both, out=np.zeros(len(both)), where=both > 0.0)
-        return model
+    def motors_among(self, count: int) -> np.ndarray:
+        """Return the place (n,) of each motor among `count` velocities: with its link, or at the end."""
+        motors = np.arange(len(self.joint_stiffness))
+        motors[self.elastic] = range(len(motors), count)
+        return motors
 
-    def places(self, model: mujoco.MjModel) -> tuple[slice, slice, slice]:
-        """Return where the arm's joints stand among the joints, angles and velocities of `model`.
+    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+        """Return the arm, and its bodies alone on a base that can turn about its origin.
 
-        They follow the base's, if it can turn. The motors of elastic joints come last.
+        payload: as for `bodies`.
         """
-        count = len(self.wearer_stiffness)
-        base = model.jnt_type[0] == mujoco.mjtJoint.mjJNT_BALL
-        joint, angle, velocity = (1, 4, 3) if base else (0, 0, 0)
-        return slice(joint, joint + count), slice(angle, angle + count), slice(velocity, velocity + count)
-
-    def add_motors(self, spec: mujoco.MjSpec, names: Sequence[str]) -> None:
-        """Give each elastic joint a motor with a spring to its link. names: of the joints (n,) in `spec`."""
+        spec = self.bodies(payload)
+        turning, names = spec.copy(), [joint.name for joint in spec.joints]
         for n in self.elastic:
             stiffness, half = self.joint_stiffness[n], self.backlash[n] / 2.0
             motor = spec.worldbody.add_body(mass=_MIN_MASS, inertia=(_MIN_ROTOR,) * 3, explicitinertial=True)
@@ -169,17 +160,30 @@ class JointConfig:
             shaft = spec.add_tendon(stiffness=stiffness, damping=damping, springlength=(-half, half))
             shaft.wrap_joint(f"motor of {names[n]}", 1.0)
             shaft.wrap_joint(names[n], -1.0)
+        base = turning.worldbody.first_body()
+        base.add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
+        # In place of its own inertia, which does not matter; a full one, with products, would count beside this one.
+        base.fullinertia = (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
+        base.mass, base.inertia, base.explicitinertial = 1.0, (1.0, 1.0, 1.0), True
+        return self._with_mechanics(spec.compile()), turning.compile()
 
-    def motors_apart(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Move rotor and friction of each elastic joint of `model` to its motor; return it."""
-        if not self.elastic:
-            return model
-        link, motor = self.elastic, list(range(len(self.joint_stiffness), model.nv))
-        for column in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
-            column[motor], column[link] = column[link], 0.0
-        model.dof_solref[motor], model.dof_solimp[motor, : len(FRICTION.impedance)] = FRICTION
-        model.opt.timestep = STEP / ELASTIC_STEPS
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+    def _with_mechanics(self, model: mujoco.MjModel) -> mujoco.MjModel:
+        """Return the arm's model with the mechanics of joints and motors."""
+        joints, motors = slice(len(self.joint_stiffness)), self.motors_among(model.nv)
+        model.opt.timestep = STEP / ELASTIC_STEPS if self.elastic else STEP
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+        model.dof_armature[motors] = self.rotor_inertia
+        model.dof_damping[motors] = self.viscous_friction
+        model.dof_frictionloss[motors] = self.coulomb_friction
+        model.dof_solref[motors], model.dof_solimp[motors, : len(FRICTION.impedance)] = FRICTION
+        spring, worn = np.array(self.spring_stiffness), np.array(self.wearer_stiffness)
+        model.jnt_stiffness[joints] = both = spring + worn
+        pull = spring * self.spring_rest + worn * self.wearer_rest
+        model.qpos_spring[joints] = np.divide(pull, both, out=np.zeros(len(both)), where=both > 0.0)
+        model.jnt_limited[joints] = True
+        model.jnt_range[joints] = np.transpose((self.position_min, self.position_max))
+        model.jnt_solref[joints], model.jnt_solimp[joints, : len(STOP.impedance)] = STOP
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # what depends on the rotors
         return model
 
 
@@ -202,13 +206,23 @@ class ArmConfig(JointConfig):
         if np.any(np.greater(self.wearer_cog, self.links.length)):
             raise ParameterError("wearer_cog", self.wearer_cog, f"at most length = {self.links.length.tolist()} m")
 
-    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-        """Return the arm, and the same on a base that can turn about its origin."""
-        xml = _mjcf(self, payload)
-        on_ball = xml.replace("<worldbody>", f"<worldbody><body>{_BALL}").replace("</worldbody>", "</body></worldbody>")
-        spec, turning = mujoco.MjSpec.from_string(xml), mujoco.MjModel.from_xml_string(on_ball)
-        self.add_motors(spec, _JOINTS)
-        return self.motors_apart(self.with_tissue(spec.compile())), self.with_tissue(turning)
+    def bodies(self, payload: Payload) -> mujoco.MjSpec:
+        """Return base, links and joints, and what is on the links. They have no geometry, so they cannot collide."""
+        spec = mujoco.MjSpec()
+        spec.compiler.degree, spec.compiler.fusestatic = False, True
+        body, links = spec.worldbody.add_body(), self.links
+        for n, (length, mass, cog) in enumerate(zip(links.length, links.mass, links.cog, strict=True)):
+            # The frame of joint n on link n - 1: shifted along x by the length, turned about x by alpha, then about z.
+            place, alpha = ((links.length[n - 1], 0.0, 0.0), _ALPHA[n - 1]) if n else (ZERO, 0.0)
+            own = _tube(length, mass, n, (cog, self.cog_y[n], self.cog_z[n]))
+            body = body.add_body(pos=place, euler=(alpha, 0.0, _OFFSET[n]), **own)
+            body.add_joint(name=f"joint {n + 1}", axis=(0.0, 0.0, 1.0))
+            if worn := self.wearer_mass[n]:
+                at = self.wearer_cog[n], self.wearer_cog_y[n], self.wearer_cog_z[n]
+                body.add_body(**_tube(length, worn, n, at))
+        if payload.mass:
+            add_point(body, payload.mass, np.add(payload.cog, (length, 0.0, 0.0)))
+        return spec
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the base of the `side` arm feels, in its own axes."""
@@ -284,16 +298,10 @@ class SimulatedArm:
         # Views of `data`, whose arrays stay in place: each lookup of an attribute costs as much as its use.
         count = len(self.config.joint_stiffness)
         self._theta, self._velocity = self.data.qpos[:count], self.data.qvel[:count]
-        self._torque = self.data.qfrc_applied
-        self._damping, self._viscous = self.model.dof_damping, self.model.dof_damping.copy()
-        self._applied: list[float] = []  # Nm of the last step, where they alone are in `data`; [] for none
-        self._damped: list[float] = []  # Nm s/rad of the motors, which `model` has; [] for none
-        # Where the motor of each joint stands in `data`: with its link, or at the end.
-        self._motors: slice | np.ndarray = slice(count)
+        self._torque, self._damping = self.data.qfrc_applied, self.model.dof_damping
+        self._viscous, self._is_damped = self._damping.copy(), False
+        self._motors = self.config.motors_among(self.model.nv)
         self.is_elastic = bool(self.config.elastic)  #: whether motors move apart from their links
-        if self.is_elastic:
-            self._motors = np.arange(count)
-            self._motors[self.config.elastic] = range(count, self.model.nv)
         self._substeps = round(STEP / self.model.opt.timestep)
 
     @property
@@ -332,7 +340,6 @@ class SimulatedArm:
     def reset(self, theta: Vector) -> None:
         """Put the arm at rest at `theta`, (n,) rad, with no torque in elastic joints."""
         mujoco.mj_resetData(self.model, self.data)
-        self._applied = []
         self._theta[:] = floats("theta", theta, len(self._theta), -math.pi, math.pi, "rad")
         self.data.qpos[self._motors] = self._theta
         mujoco.mj_forward(self.model, self.data)
@@ -364,10 +371,21 @@ class SimulatedArm:
         of_motors: (n,) Nm, the part that gears carry; None: all of it.
         damping: (n,) Nm s/rad, of the motors, whose part of `torque` follows the velocity within a step; () for none.
         """
+        own, motors = torque if of_motors is None else of_motors, self._motors
+        drive = own if self.is_elastic else torque
+        if any(damping):
+            # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
+            self._damping[:] = self._viscous
+            self._damping[motors] += damping
+            self._is_damped, drive = True, drive + self.data.qvel[motors] * damping
+        elif self._is_damped:
+            self._damping[:], self._is_damped = self._viscous, False
         if self.is_elastic:
-            self._load_motors_and_links(torque, of_motors, damping)
+            self._torque[:] = 0.0
+            self._torque[motors] = drive
+            self._torque[: len(self._theta)] += np.subtract(torque, own)
         else:
-            self._load_joints(torque, damping)
+            self._torque[:] = drive
         constant, count = self._coulomb, count * self._substeps
         if self._has_load_friction:
             constant = self._coulomb + self._load_share * np.abs(torque if of_motors is None else of_motors)
@@ -384,36 +402,6 @@ class SimulatedArm:
                 self._torque[links] = given[links] + self.data.qfrc_bias[links] - self._turning_bias()
             mujoco.mj_step2(self.model, self.data)
 
-    def _load_joints(self, torque: Sequence[float], damping: Sequence[float]) -> None:
-        """Set the torques of a step of a rigid arm, as `step` gets them; most steps repeat those of the one before."""
-        if any(damping):
-            # MuJoCo applies it implicitly: a step of constant torque would shake a light arm
-            if list(damping) != self._damped:
-                self._damped = list(damping)
-                self._damping[:] = self._viscous + damping
-            moving = zip(torque, self._velocity.tolist(), damping, strict=True)
-            self._torque[:] = [pull + speed * own for pull, speed, own in moving]
-            self._applied = []
-        elif self._applied != (applied := list(torque)):
-            self._damping[:], self._torque[:], self._damped = self._viscous, applied, []
-            self._applied = [] if self._turns else applied  # where the base turns, `step` changes them
-
-    def _load_motors_and_links(
-        self, torque: Sequence[float], of_motors: Sequence[float] | None, damping: Sequence[float]
-    ) -> None:
-        """Set the torques of a step of an arm with elastic joints, as `step` gets them."""
-        force = np.zeros(self.model.nv)
-        self._damping[:] = self._viscous
-        if any(damping):
-            self._damping[self._motors] += damping
-            force[self._motors] += self.data.qvel[self._motors] * damping
-        if of_motors is None:
-            force[self._motors] += torque
-        else:
-            force[self._motors] += of_motors
-            force[: len(self._theta)] += np.subtract(torque, of_motors)
-        self._torque[:] = force
-
     def _turning_bias(self) -> np.ndarray:
         """Return the torque (n,) in Nm of gravity and inertia at constant joint velocities, on a base that turns."""
         model, data = self._turning_model, self._turning_data
@@ -425,55 +413,19 @@ class SimulatedArm:
         return bias[3:]
 
 
-def _mjcf(config: ArmConfig, payload: Payload = NO_LOAD) -> str:
-    """Return the arm as MuJoCo XML. The bodies have no geometry, so they cannot collide."""
-    links, body = config.links, ""
-    mass, (x, y, z) = payload
-    if mass > 0.0:
-        place = f'pos="{links.length[3] + x} {y} {z}" mass="{mass}"'
-        body = f'<body><inertial {place} diaginertia="1e-7 1e-7 1e-7"/></body>'
-    for n in reversed(range(JOINT_COUNT)):
-        # The frame of joint n on link n - 1: shifted along x by the length, turned about x by alpha, then about z.
-        position, alpha = (links.length[n - 1], _ALPHA[n - 1]) if n else (0.0, 0.0)
-        worn = ""
-        if config.wearer_mass[n] > 0:
-            at = _in_joint(n, config.wearer_cog[n], config.wearer_cog_y[n], config.wearer_cog_z[n])
-            worn = f"<body>{_tube(links.length[n], at, config.wearer_mass[n])}</body>"
-        body = f"""
-            <body pos="{position} 0 0" euler="{alpha} 0 {_OFFSET[n]}">
-              <joint name="{_JOINTS[n]}" axis="0 0 1" armature="{config.rotor_inertia[n]}"
-                damping="{config.viscous_friction[n]}"
-                stiffness="{config.spring_stiffness[n]}" springref="{config.spring_rest[n]}"
-                frictionloss="{config.coulomb_friction[n]}" {_attributes(FRICTION, "friction")}
-                range="{config.position_min[n]} {config.position_max[n]}" {_attributes(STOP, "limit")}/>
-              {_tube(links.length[n], _centre(config, n), links.mass[n])}{worn}{body}
-            </body>"""
-    return f"""
-        <mujoco>
-          <compiler angle="radian" autolimits="true" fusestatic="true"/>
-          <option timestep="{STEP}"><flag contact="disable"/></option>
-          <worldbody>{body}</worldbody>
-        </mujoco>"""
+def _tube(length: float, mass: float, n: int, centre: Sequence[float]) -> dict[str, Any]:
+    """Return the inertia of a thin tube on link n + 1; centre: of gravity, (3,) m along x_n, y_n and z_n.
 
-
-def _attributes(stiffness: Stiffness, of: str) -> str:
-    reference, impedance = (" ".join(map(str, values)) for values in stiffness)
-    return f'solref{of}="{reference}" solimp{of}="{impedance}"'
-
-
-def _centre(config: ArmConfig, n: int) -> str:
-    """Return the centre of gravity of link n + 1 in the axes of its joint."""
-    return _in_joint(n, float(config.links.cog[n]), config.cog_y[n], config.cog_z[n])
-
-
-def _in_joint(n: int, x: float, y: float, z: float) -> str:
-    """Return a place on link n + 1, in m along x_n, y_n and z_n, in the axes of its joint: x_n, and z_{n-1} as z."""
+    The axes of its joint are x_n, and z_{n-1} as z.
+    """
+    x, y, z = centre
     cosine, sine = math.cos(_ALPHA[n]), math.sin(_ALPHA[n])
-    return f"{x} {cosine * y - sine * z} {sine * y + cosine * z}"
-
-
-def _tube(length: float, centre: str, mass: float) -> str:
-    """Return the inertial element of a thin tube along x with its centre of gravity at `centre`, 'x y z' in m."""
     along = mass * _TUBE_RADIUS**2
     across = along / 2 + mass * length**2 / 12
-    return f'<inertial pos="{centre}" mass="{mass}" diaginertia="{along} {across} {across}"/>'
+    place = x, cosine * y - sine * z, sine * y + cosine * z
+    return {"mass": mass, "ipos": place, "inertia": (along, across, across), "explicitinertial": True}
+
+
+def add_point(body: mujoco.MjsBody, mass: float, place: Sequence[float] | np.ndarray) -> None:
+    """Add a point of `mass` kg to a body, at `place` (3,) m in its frame."""
+    body.add_body(mass=mass, ipos=place, inertia=POINT, explicitinertial=True)

@@ -27,7 +27,7 @@ from exo_gravity.sim.arm import STEP, SimulatedArm
 from exo_gravity.sim.motors.ak import SimulatedMotor
 from exo_gravity.sim.script import IDLE
 from exo_gravity.sim.trunk_motion import TrunkMotion, TrunkState, motion_of
-from exo_gravity.sim.truth import Truth
+from exo_gravity.sim.truth import TruthLog, TruthRecords
 from exo_gravity.sim.virtual_wearer import VirtualWearer
 
 MAX_CATCH_UP = 0.05  # s of physics simulated at once; after a longer stall the rest of the time is lost
@@ -52,7 +52,7 @@ class SimulatedDevice:
         self.cut_off: Sequence[bool] = (False,) * count  #: the same for each motor
         self.mute: Sequence[bool] = (False,) * count  #: whether a motor's replies are lost, while it obeys
         self.encoder_error: Sequence[float] = (0.0,) * count  #: rad, added to the angle that a motor reads
-        self.truth: Truth | None = None  #: receives every physics step
+        self.truth: TruthRecords | TruthLog | None = None  #: receives every physics step
         self.slip = 0.0  #: s that `run` has lost against real time
         #: s since the motors were switched on, between two passes of `run`, and in which no command arrived
         self.longest_stall = self.longest_silence = 0.0

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from exo_gravity.core.arm.interface import Payload
 from exo_gravity.core.motors.frames import ID_BITS
@@ -38,11 +37,6 @@ def gradually(rig: Rig, duration: float, step: Callable[[float], None]) -> None:
     for number in range(1, RAMP_STEPS + 1):
         share = number / RAMP_STEPS
         rig.clock.later(share * duration, partial(step, share))
-
-
-def of_joint(values: Sequence[Any], joint: int, value: Any) -> list[Any]:
-    """Return `values` with another one for a joint."""
-    return [*values[:joint], value, *values[joint + 1 :]]
 
 
 def request(name: str, then: str = "") -> Act:
@@ -112,13 +106,17 @@ def motors_fail(name: str) -> Act:
 def encoder_slip(rig: Rig, joint: int, error: float) -> None:
     """Add `error` rad to what the encoder of a joint reads."""
     rig.catch_up()
-    errors = rig.device.encoder_error
-    rig.device.encoder_error = of_joint(list(errors), joint, errors[joint] + error)
+    rig.device.encoder_error = errors = list(rig.device.encoder_error)
+    errors[joint] += error
 
 
-def encoder_jump(rig: Rig, joint: int) -> None:
-    """Let the encoder of a joint lose a turn of the rotor."""
-    encoder_slip(rig, joint, rig.motors[joint].joint.spec.rotor_turn)
+def attribute(owner: str, name: str, value: object, normal: object) -> Act:
+    """Return the act that gives an attribute of the rig's device or controller a value for a time."""
+
+    def inject(rig: Rig, duration: float = math.inf) -> None:
+        setting(rig, getattr(rig, owner), name, value, normal, duration)
+
+    return inject
 
 
 def of_motor(name: str, normal: object) -> Act:
@@ -143,20 +141,6 @@ def foreign_torque(rig: Rig, joint: int, torque: float, rate: float = 500.0, dur
         rig.clock.later(number / rate, partial(rig.send, (motor.command_id, motor.command(torque, 0.0))))
 
 
-def stall(rig: Rig, duration: float) -> None:
-    """Stop the control loop for `duration` s."""
-    rig.controller.stall = duration
-
-
-def efforts(change: Callable[[Efforts], Efforts]) -> Act:
-    """Return the act that spoils the compensator's efforts for a time."""
-
-    def inject(rig: Rig, duration: float = math.inf) -> None:
-        setting(rig, rig.controller, "change", change, None, duration)
-
-    return inject
-
-
 def withdrawn(answer: Efforts) -> Efforts:
     """Return no efforts."""
     return answer._replace(effort=None)
@@ -172,11 +156,6 @@ def efforts_late(rig: Rig, duration: float, most: float = 0.3) -> None:
     setting(rig, rig.controller, "delay", min(most, duration), 0.0, duration)
 
 
-def wearer(rig: Rig, steps: Sequence[Mapping[str, Any]]) -> None:
-    """Let the wearer do these steps of a trial script."""
-    rig.act(*steps)
-
-
 def reach(rig: Rig, pose: Sequence[float], duration: float) -> None:
     """Let the wearer move their arm to a pose (n,) rad within `duration` s."""
     rig.act({"move": list(pose), "over": duration})
@@ -186,11 +165,6 @@ def resist(rig: Rig, duration: float) -> None:
     """Let the wearer hold their arm where it is for `duration` s."""
     rig.catch_up()
     reach(rig, rig.device.arm.positions, duration)
-
-
-def push(rig: Rig, torque: Sequence[float], duration: float) -> None:
-    """Push the joints with torques (n,) N m for `duration` s."""
-    rig.act({"push": list(torque), "over": duration})
 
 
 def trunk(action: str) -> Act:
@@ -233,16 +207,6 @@ def imu_frozen(rig: Rig, duration: float = math.inf) -> None:
     setting(rig, rig, "imu_frozen", rig.newest_reading, None, duration)
 
 
-def imu_silent(rig: Rig, duration: float = math.inf) -> None:
-    """Silence the IMU."""
-    setting(rig, rig, "imu_silent", True, False, duration)
-
-
-def bus_silent(rig: Rig, duration: float = math.inf) -> None:
-    """Lose every frame in both directions."""
-    setting(rig, rig.device, "bus_silent", True, False, duration)
-
-
 ACTS: Mapping[str, Act] = {
     # The operator. `toggle` and `rearm` enable the arm `duration` s later.
     "disable": request("disable"),
@@ -261,9 +225,9 @@ ACTS: Mapping[str, Act] = {
     "replies_lost": frames_lost("replies_lost", "reply_id"),
     "cut_off": motors_fail("cut_off"),
     "mute": motors_fail("mute"),
-    "bus_silent": bus_silent,
+    "bus_silent": attribute("device", "bus_silent", True, False),
     "encoder_slip": encoder_slip,
-    "encoder_jump": encoder_jump,
+    "encoder_jump": lambda rig, joint: encoder_slip(rig, joint, rig.motors[joint].joint.spec.rotor_turn),
     "wrong_speed": lambda rig, joint, factor, duration: of_motor("speed_factor", 1.0)(rig, joint, factor, duration),
     "torque_reversed": lambda rig, joint: of_motor("is_reversed", False)(rig, joint, True),
     "motor_error": lambda rig, joint, code: of_motor("error", 0)(rig, joint, code),
@@ -271,16 +235,16 @@ ACTS: Mapping[str, Act] = {
     "motor_warms": motor_warms,
     "foreign_torque": foreign_torque,
     # Computers.
-    "stall": stall,
+    "stall": lambda rig, duration: setattr(rig.controller, "stall", duration),
     "efforts_late": efforts_late,
-    "efforts_withdrawn": efforts(withdrawn),
-    "efforts_nan": efforts(not_a_number),
+    "efforts_withdrawn": attribute("controller", "change", withdrawn, None),
+    "efforts_nan": attribute("controller", "change", not_a_number, None),
     # The wearer.
-    "wearer": wearer,
+    "wearer": lambda rig, steps: rig.act(*steps),  # of a trial script
     "reach": reach,
     "limp": lambda rig: rig.act(),
     "resist": resist,
-    "push": push,
+    "push": lambda rig, torque, duration: rig.act({"push": list(torque), "over": duration}),  # (n,) Nm
     "payload_taken": payload_taken,
     "payload_dropped": payload_dropped,
     "out_of_cuff": out_of_cuff,
@@ -289,5 +253,5 @@ ACTS: Mapping[str, Act] = {
     # The IMU.
     "imu_wrong": imu_wrong,
     "imu_frozen": imu_frozen,
-    "imu_silent": imu_silent,
+    "imu_silent": lambda rig, duration=math.inf: setting(rig, rig, "imu_silent", True, False, duration),
 }

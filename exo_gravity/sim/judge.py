@@ -88,7 +88,8 @@ def driven(
     is_moved = (power > 0.0) & (gained > SLOW)
     time = records["time"][:, None]
     in_stretch = time - np.maximum.accumulate(np.where(is_moved, time, -np.inf), axis=0) <= COAST
-    lasting = _lasting(records)[:, None]
+    # A time in which the device did not run counts as MAX_GAP.
+    lasting = np.minimum(MAX_GAP, np.diff(records["time"], append=records["time"][-1:]))[:, None]
     beyond_weight = np.clip((torque - records["weight"]) * velocity, 0.0, power)
     counted = beyond_weight if turning else power
     energy = _sum_in(in_stretch, np.where(is_moved & (gained > slow), counted, 0.0) * lasting)
@@ -125,11 +126,6 @@ def _gained_in(in_stretch: np.ndarray, speed: np.ndarray) -> np.ndarray:
             least = np.minimum(np.minimum.accumulate(speed[first:end, joint]), before if before > 2.0 * SLOW else 0.0)
             gained[first:end, joint] = speed[first:end, joint] - least
     return gained
-
-
-def _lasting(records: np.ndarray) -> np.ndarray:
-    """Return how long each record lasted, (n,) s; a time in which the device did not run counts as MAX_GAP."""
-    return np.minimum(MAX_GAP, np.diff(records["time"], append=records["time"][-1:]))
 
 
 @dataclass

@@ -7,7 +7,7 @@ The file is a sequence of records, of which `record_of` is the only description.
 
 import time
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -39,18 +39,6 @@ def record_of(count: int) -> np.dtype:
 
 RECORD = record_of(JOINT_COUNT)  # of the paper's arm
 FLUSH_PERIOD = 0.02  # s
-
-
-class Truth(Protocol):
-    """Receives the true motion of an arm."""
-
-    def synchronise(self, now: float) -> None:
-        """Note that the simulated time `now` (s) is the present time."""
-        ...
-
-    def note(self, now: float, *state: Any) -> None:
-        """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
-        ...
 
 
 class TruthRecords:

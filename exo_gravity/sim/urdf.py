@@ -15,19 +15,18 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from exo_gravity.core.arm.interface import NO_LOAD, STANDARD_GRAVITY, Payload
+from exo_gravity.core.arm.interface import STANDARD_GRAVITY, Payload
 from exo_gravity.core.arm.rotation import Floats3
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import for_joints
 from exo_gravity.hardware.urdf_checks import SHAPES, robot_of
 from exo_gravity.hardware.urdf_model import LEAST_LENGTH
-from exo_gravity.sim.arm import FRICTION, STEP, STOP, JointConfig
+from exo_gravity.sim.arm import JointConfig, add_point
 from exo_gravity.sim.trunk_motion import TrunkState
 
 # Links without mass, which MuJoCo refuses to move, get the least; inertias that no body can have are corrected.
 COMPILER = {"fusestatic": "false", "balanceinertia": "true", "boundmass": "1e-14", "boundinertia": "1e-14"}
-POINT = (1e-7, 1e-7, 1e-7)  # kg m^2, the inertia of a point of mass
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,52 +56,23 @@ class UrdfConfig(JointConfig):
             if mass and not (cog <= length and length >= LEAST_LENGTH):
                 raise ParameterError("wearer_cog", self.wearer_cog, f"at most {length:.3f} m on link {n + 1}")
 
-    def models(self, payload: Payload = NO_LOAD) -> tuple[mujoco.MjModel, mujoco.MjModel]:
-        """Return the arm, and the same on a base that can turn about its origin.
-
-        payload: its place is in the frame of the link.
-        """
-        mass, place = payload
-        if mass and not self.hand:
-            raise ParameterError("load", mass, "0 without urdf.hand, which says where a load is held")
+    def bodies(self, payload: Payload) -> mujoco.MjSpec:
+        """Return the links and joints that move, and what is on the links."""
+        if payload.mass and not self.hand:
+            raise ParameterError("load", payload.mass, "0 without urdf.hand, which says where a load is held")
         spec = self._spec.copy()
         for (name, way), worn, cog in zip(self._links, self.wearer_mass, self.wearer_cog, strict=True):
             if worn:
-                _add_point(spec.body(name), worn, way * (cog / np.linalg.norm(way)))
-        if mass:
-            _add_point(spec.body(self.hand), mass, np.array(place))
-        elastic = spec.copy()
-        self.add_motors(elastic, self.joint_names)
-        arm = self.motors_apart(self._with_mechanics(elastic.compile()))
-        root = spec.worldbody.first_body()
-        root.add_joint(type=mujoco.mjtJoint.mjJNT_BALL)
-        # In place of its own inertia, which does not matter; a full one, with products, would count beside this one.
-        root.fullinertia = (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0)
-        root.mass, root.inertia, root.explicitinertial = 1.0, (1.0, 1.0, 1.0), True
-        return arm, self._with_mechanics(spec.compile())
+                add_point(spec.body(name), worn, way * (cog / np.linalg.norm(way)))
+        if payload.mass:
+            add_point(spec.body(self.hand), payload.mass, payload.cog)
+        return spec
 
     def felt(self, side: str, state: TrunkState) -> tuple[Floats3, Floats3, Floats3]:
         """Return what the root link feels, each (3,) in its axes: those of the trunk, whatever the side."""
         felt = self.gravity * gravity_in_trunk(state.pitch, state.roll) - state.acceleration
         x, y, z = felt.tolist()
         return (x, y, z), state.angular_velocity, state.angular_acceleration
-
-    def _with_mechanics(self, model: mujoco.MjModel) -> mujoco.MjModel:
-        """Return `model` with the mechanics of the joints."""
-        joints, angles, dofs = self.places(model)
-        model.opt.timestep = STEP
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-        model.dof_armature[dofs] = self.rotor_inertia
-        model.dof_damping[dofs] = self.viscous_friction
-        model.dof_frictionloss[dofs] = self.coulomb_friction
-        model.dof_solref[dofs], model.dof_solimp[dofs, : len(FRICTION.impedance)] = FRICTION
-        model.jnt_stiffness[joints] = self.spring_stiffness
-        model.qpos_spring[angles] = self.spring_rest
-        model.jnt_limited[joints] = True
-        model.jnt_range[joints] = np.transpose((self.position_min, self.position_max))
-        model.jnt_solref[joints], model.jnt_solimp[joints, : len(STOP.impedance)] = STOP
-        mujoco.mj_setConst(model, mujoco.MjData(model))  # what depends on the rotors
-        return self.with_tissue(model)
 
     @cached_property
     def _spec(self) -> mujoco.MjSpec:
@@ -151,8 +121,3 @@ class UrdfConfig(JointConfig):
         for body, end in zip(model.jnt_bodyid.tolist(), [*data.xanchor[1:], last], strict=True):
             links.append((model.body(body).name, data.xmat[body].reshape(3, 3).T @ (end - data.xpos[body])))
         return links
-
-
-def _add_point(body: mujoco.MjsBody, mass: float, place: Sequence[float] | np.ndarray) -> None:
-    """Add a point of `mass` kg to a body, at `place` (3,) m in its frame."""
-    body.add_body(mass=mass, ipos=place, inertia=POINT, explicitinertial=True)

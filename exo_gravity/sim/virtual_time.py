@@ -14,7 +14,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import can
 from can.interfaces.udp_multicast import UdpMulticastBus
@@ -58,9 +58,9 @@ class VirtualClock:
 
     def every(self, period: float, function: Callable[[], None]) -> Callable[[], None]:
         """Call `function` every `period` s; return a function that ends it."""
-        repetition = Repetition(self, period, function)
-        self.later(period, repetition)
-        return repetition.end
+        ended: list[bool] = []
+        self.later(period, partial(self._repeat, period, function, ended))
+        return partial(ended.append, True)
 
     def stall(self, duration: float) -> None:
         """Let `duration` s pass in which nothing happens: it is all late then."""
@@ -80,31 +80,10 @@ class VirtualClock:
     def _after(self, duration: float) -> int:
         return self._nanoseconds + max(0, math.ceil(duration * 1e9))
 
-
-class Repetition:
-    """A function that a clock calls every `period` s, until it is ended."""
-
-    def __init__(self, clock: VirtualClock, period: float, function: Callable[[], None]) -> None:
-        self._clock, self._period, self._function = clock, period, function
-        self._is_ended = False
-
-    def __call__(self) -> None:
-        """Call the function, and plan the next call."""
-        if not self._is_ended:
-            self._function()
-            self._clock.later(self._period, self)
-
-    def end(self) -> None:
-        """Call it no more."""
-        self._is_ended = True
-
-
-class End(Protocol):
-    """What is connected to a `Wire`."""
-
-    def deliver(self, message: can.Message) -> None:
-        """Receive a frame that another end has sent."""
-        ...
+    def _repeat(self, period: float, function: Callable[[], None], ended: Sequence[bool]) -> None:
+        if not ended:
+            function()
+            self.later(period, partial(self._repeat, period, function, ended))
 
 
 class VirtualBus(can.BusABC):
@@ -227,7 +206,7 @@ class Wire:
         self, clock: VirtualClock | None = None, echoes: bool = False, start: float = 100.0, bitrate: int = 0
     ) -> None:
         self.clock = clock or VirtualClock(start)
-        self.ends: list[End] = []
+        self.ends: list[Any] = []  # each with `deliver(message)`
         self.refusal: Exception | None = None
         self.opened = 0
         self.loss = self.batch = 0.0

@@ -7,27 +7,26 @@ import contextlib
 import socket
 import threading
 import time
-from dataclasses import replace
 from types import SimpleNamespace
 
 import can
 import pytest
 
-from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.motors.ak import unpack_reply
+from exo_gravity.core.errors import BusError, ParameterError
+from exo_gravity.core.motors.ak import MIT, MIT_V3, unpack_reply
 from exo_gravity.core.motors.damiao import DAMIAO_MIT
 from exo_gravity.core.motors.families import MOTORS
-from exo_gravity.core.motors.frames import ENTER, EXIT
+from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware.can_port import CanPort
 from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
-from exo_gravity.sim import FIRMWARES, SimulatedArm, SimulatedDevice, VirtualWearer
+from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, VirtualWearer
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
 from exo_gravity.sim.motors import simulated
 from exo_gravity.sim.script import TrialScript
-from exo_gravity.sim.virtual_time import VirtualBus, Wire
+from exo_gravity.sim.virtual_time import Wire
 
 from ..core.test_bus_load import stuffed_bits
 from ..support.ports import own_ports
@@ -207,6 +206,21 @@ def test_stalls_and_silence_are_measured_while_the_motors_are_on(device, monkeyp
     assert (device.longest_stall, device.longest_silence) == (pytest.approx(stall), pytest.approx(silence))
 
 
+def test_v3_boards_report_at_their_rate_and_missed_reports_are_not_made_up(monkeypatch):
+    device = make_device(Firmware(status_rate=100.0), formats=(MIT, MIT_V3, MIT, MIT))
+    bus = ScriptedBus([*[(0.001, None)] * 500, (1.0, None), *[(0.001, None)] * 400])
+    bus.run(device, monkeypatch)
+    assert {can_id for _, can_id, _ in bus.sent} == {MIT_V3.reply_id(2) & ID_BITS}
+    assert len(bus.sent) == pytest.approx(90, abs=3)
+
+
+def test_a_failing_bus_ends_the_run_with_a_bus_error(device):
+    bus = can.Bus(interface="virtual", channel=f"device-{next(PORTS)}")
+    bus.shutdown()
+    with pytest.raises(BusError, match="receiving"):
+        device.run(bus, lambda: False)
+
+
 @pytest.mark.parametrize("is_fd", [False, True], ids=["classic", "fd"])
 def test_damiao_motors_tell_their_state_and_settings_on_the_buses_of_python_can(options, is_fd):
     joints = [JointMotor(MOTORS["DM-J4310"], can_id, wire_format=DAMIAO_MIT, timeout=0.2) for can_id in (1, 2, 3, 4)]
@@ -302,37 +316,3 @@ def test_a_sender_that_fails_too_often_is_off_the_bus_for_a_while(wire):
         pass
     host.send(frame(1, HIGH))
     assert bytes(listener.recv(0.01).data) == HIGH
-
-
-def enable(wire: Wire, host: VirtualBus, is_awaiting: bool) -> int:
-    """Switch four motors on with three frames each, all at once or each after the reply to the last; return collisions.
-
-    All at once is what the motor bus did at a47959f4.
-    """
-    before = wire.arbitration.collisions
-    for data in (lambda can_id: command(can_id - 1), lambda can_id: ENTER, lambda can_id: command(can_id - 1, 1.0)):
-        for can_id in (1, 2, 3, 4):
-            host.send(frame(can_id, data(can_id)))
-            assert not is_awaiting or host.recv(0.01)
-    wire.clock.sleep(0.01)
-    while host.recv(0.0):
-        pass
-    return wire.arbitration.collisions - before
-
-
-LATE = replace(FIRMWARES["open_drive"], reply_delay=FIRMWARES["ak"].reply_delay)  # to the master's ID
-
-
-@pytest.mark.parametrize(
-    ("firmware", "at_once"),
-    [(FIRMWARES["ak"], (8, 24)), (FIRMWARES["vendor"], (8, 24)), (LATE, (1, 1000)), (FIRMWARES["open_drive"], (0, 0))],
-    ids=["ak", "vendor", "late to the master's ID", "at once to the master's ID: they follow each other"],
-)
-def test_frames_to_a_motor_that_owes_a_reply_collide_and_awaited_ones_never(wire, firmware, at_once):
-    device = make_device(firmware)
-    wire.play(device)
-    host = wire.open()
-    assert enable(wire, host, is_awaiting=True) == 0 and wire.arbitration.tec == 0
-    least, most = at_once
-    assert least <= enable(wire, host, is_awaiting=False) <= most and (wire.arbitration.tec >= 128) == (least == 8)
-    assert device.powered

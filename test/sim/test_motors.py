@@ -7,7 +7,6 @@ import struct
 from dataclasses import replace
 from typing import NamedTuple
 
-import can
 import pytest
 
 from exo_gravity.core.errors import ParameterError
@@ -22,7 +21,7 @@ from exo_gravity.sim.motors import class_of, simulated
 from exo_gravity.sim.motors.ak import Heat
 from exo_gravity.sim.motors.damiao import DamiaoMotor
 from exo_gravity.sim.params import SIMULATOR, device_of, set_faults
-from exo_gravity.sim.virtual_time import VirtualBus, Wire
+from exo_gravity.sim.virtual_time import Wire
 
 from ..support.simulated_device import make_device
 
@@ -234,6 +233,19 @@ def test_next_to_its_special_frames_the_vendors_motor_leaves_the_bus_until_it_lo
         assert motor.torque(0.0, 0.0) == SPEC.peak_torque  # a command with every field near its maximum
 
 
+@pytest.mark.parametrize(
+    ("name", "data", "is_command"),
+    [("ak", PUSH[:6], False), ("ak", PUSH + bytes(1), False), ("vendor", b"", True), ("open_drive", PUSH[:6], True),
+     ("open_drive", b"", False)],
+)  # fmt: skip
+def test_short_and_remote_frames_are_ignored_or_filled_with_what_is_left_of_the_frame_before(name, data, is_command):
+    motor = motor_of(name, {"timeout": 0.01})
+    play(motor, ENTER, PUSH)
+    motor.advance(0.0, 0.0, 0.02)
+    assert (play(motor, data)[0] is not None) is is_command
+    assert motor.torque(0.0, 0.0) == pytest.approx(2.0 * is_command, abs=STEP)
+
+
 # V3 boards
 
 
@@ -336,91 +348,6 @@ def test_each_motor_comes_back_from_a_dip_of_the_supply_switched_off_and_once(di
     set_faults(device, given, {"trunk.pitch"})
     assert None not in [device.exchange(can_id, ZERO) for can_id in (1, 2, 3, 4)]
     assert [motor.entered for motor in device.motors] == [True, False, False, True]
-
-
-# Public masters, written after their protocol: the truth is the device's
-
-
-LIMITS = {"position": 12.5, "velocity": SPEC.velocity_range, "torque": SPEC.torque_range}
-
-
-class PacedMaster:
-    """The way of TMotorCANControl: a command in every cycle, replies are read as they come.
-
-    Codes are truncated, 2^b of them to a range. No reply is awaited to ENTER, EXIT and SET_ZERO: a wait follows.
-    """
-
-    codes_less, per_command, after_a_special, after_a_command = 0, 0.0, 1.5, 0.005
-
-    def __init__(self, bus: VirtualBus, wire: Wire) -> None:
-        self.bus, self.wire = bus, wire
-        self.state: dict[str, float] = {}
-
-    def send(self, data: bytes) -> None:
-        self.bus.send(can.Message(arbitration_id=1, data=data, is_extended_id=False))
-        self.state.clear()
-        self.wait(self.per_command)
-
-    def special(self, code: int) -> None:
-        self.send(b"\xff" * 7 + bytes((code,)))
-        self.wait(self.after_a_special)
-
-    def code(self, value: float, low: float, high: float, bits: int) -> int:
-        ratio = ((1 << bits) - self.codes_less) / (high - low)
-        most = high if self.codes_less else high - 2.0 / ratio
-        return int((min(max(value, low), most) - low) * ratio)
-
-    def update(self, torque: float, kd: float = 0.0) -> None:
-        word = self.code(0.0, -LIMITS["position"], LIMITS["position"], 16) << 48
-        word |= self.code(0.0, -LIMITS["velocity"], LIMITS["velocity"], 12) << 36
-        word |= self.code(kd, 0.0, 5.0, 12) << 12 | self.code(torque, -LIMITS["torque"], LIMITS["torque"], 12)
-        self.send(word.to_bytes(8, "big"))
-        self.wait(self.after_a_command)
-
-    def wait(self, seconds: float) -> None:
-        self.wire.clock.sleep(seconds)
-        while message := self.bus.recv(0.0):
-            data = message.data
-            if data[0] != 1:
-                continue
-            codes = data[1] << 8 | data[2], data[3] << 4 | data[4] >> 4, (data[4] & 0xF) << 8 | data[5]
-            for (name, limit), code, bits in zip(LIMITS.items(), codes, (16, 12, 12), strict=True):
-                self.state[name] = code * 2.0 * limit / ((1 << bits) - 1) - limit
-
-
-class AwaitingMaster(PacedMaster):
-    """The way of the open drive's own master: each frame is followed by its reply, of which 6 bytes are read.
-
-    Codes are truncated too, 2^b - 1 of them to a range.
-    """
-
-    codes_less, per_command, after_a_special, after_a_command = 1, 0.0006, 0.0, 0.0044
-
-
-@pytest.mark.parametrize("firmware", MIT_BOARDS)
-@pytest.mark.parametrize("way", [PacedMaster, AwaitingMaster])
-def test_a_public_master_switches_on_reads_pushes_zeroes_and_switches_off(way, firmware) -> None:
-    wire, device = Wire(bitrate=1_000_000), make_device(FIRMWARES[firmware])
-    wire.play(device)
-    master, motor, start = way(wire.open(), wire), device.motors[0], device.arm.positions[0]
-    master.special(0xFC)
-    assert motor.entered
-    master.update(0.0)
-    assert master.state["position"] == pytest.approx(device.arm.positions[0], abs=0.02)
-    for _ in range(40):
-        master.update(1.5, kd=1.0)
-    assert device.arm.positions[0] > start + 0.1
-    assert motor.torque(0.0, 0.0) == pytest.approx(1.5, abs=0.03)
-    assert master.state["position"] == pytest.approx(device.arm.positions[0], abs=0.05)
-    for _ in range(200):
-        master.update(0.0, kd=2.0)
-    master.special(0xFD)
-    assert not motor.entered and motor.torque(0.0, 0.0) == 0.0
-    master.special(0xFE)
-    master.wait(1.5)
-    master.update(0.0)
-    assert master.state["position"] == pytest.approx(0.0, abs=0.02)
-    assert not motor.entered and wire.arbitration.collisions == 0
 
 
 # Damiao motors

@@ -26,15 +26,16 @@ from exo_gravity.core.motors.frames import BROADCAST_ID, EXTENDED, Frame, MotorC
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.params import check_owned, owned
 from exo_gravity.sim.motors.firmware import (
+    AK,
     BOOT_LOADER,
     CLEAR_FAULTS,
     ENCODER_ERROR,
     SHUT_OFF,
     SHUT_OFF_AT,
+    V3,
     WARM,
     WARM_ABOVE,
     Firmware,
-    usual_firmware,
 )
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
@@ -105,7 +106,7 @@ class SimulatedMotor:
     @staticmethod
     def usual_firmware(joint: JointMotor) -> Firmware:
         """Return the firmware of a motor of which only the wire format is known."""
-        return usual_firmware(joint.wire_format)
+        return {AK.wire_format: AK, V3.wire_format: V3}.get(joint.wire_format.name, Firmware())
 
     @property
     def unplugged(self) -> bool:
@@ -169,9 +170,14 @@ class SimulatedMotor:
         elif frame in joint.enter:
             self.entered = self.entered or not self._is_refused
         elif frame in joint.exit:
-            self._exit()
+            self.entered = False
+            if self.firmware.exit_clears:
+                self._clear_command()
         elif self._is_special(data):
-            self._act_on(data[-1])
+            # Most of them do nothing that a bus shows.
+            if data[-1] == BOOT_LOADER:
+                self.has_left, self.entered = True, False
+            self._is_shut_off &= data[-1] != CLEAR_FAULTS
         elif not (self._take_command(data) if own_id == joint.command_id else self._take_current(data)):
             return None
         return self._state(position, velocity) if joint.wire_format.replies and not self.has_left else None
@@ -191,11 +197,6 @@ class SimulatedMotor:
         self._silent_until = now + firmware.zero_silence
         return firmware.zero_silence > 0.0
 
-    def _exit(self) -> None:
-        self.entered = False
-        if self.firmware.exit_clears:
-            self._clear_command()
-
     def _clear_command(self) -> None:
         self._command, self._data = _NO_COMMAND, None
 
@@ -203,13 +204,6 @@ class SimulatedMotor:
         """Return whether the firmware takes the frame for a special one that the manual does not name."""
         head = data[:-1] == b"\xff" * (_FULL_LENGTH - 1) and bool(self.joint.enter)
         return head and self.firmware.first_special <= data[-1] < 0xFF
-
-    def _act_on(self, code: int) -> None:
-        """Do what a special frame that ends with `code` asks for; most do nothing that a bus shows."""
-        if code == BOOT_LOADER:
-            self.has_left, self.entered = True, False
-        elif code == CLEAR_FAULTS:
-            self._is_shut_off = False
 
     def _take_command(self, data: bytes) -> bool:
         """Take a command, which switches the motor on if no other frame does; return whether it is one."""
@@ -252,16 +246,20 @@ class SimulatedMotor:
     def advance(self, position: float, velocity: float, dt: float) -> float:
         """Let `dt` s pass for the motor on a joint at `position` rad and `velocity` rad/s; return its torque in Nm."""
         self._age += dt
-        if 0.0 < self.firmware.timeout < self._age and self.entered and self._command != _NO_COMMAND:
-            self._clear_command()
-            self.dips += 1
+        self._watch(0.0 < self.firmware.timeout < self._age)
         torque = self.torque(position, velocity)
         if self._heat.rise:
             load = torque / self.joint.spec.rated_torque
             self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
+        return -torque if self.is_reversed else torque
+
+    def _watch(self, is_lost: bool) -> None:
+        """Do what the firmware does by itself; is_lost: whether it has had no command for its time-out."""
+        if is_lost and self.entered and self._command != _NO_COMMAND:
+            self._clear_command()
+            self.dips += 1
         if self.firmware.error_is_mask and self.temperature >= SHUT_OFF_AT:
             self.entered, self._is_shut_off = False, True
-        return -torque if self.is_reversed else torque
 
     def torque(self, position: float, velocity: float) -> float:
         """Return the torque in Nm on the joint at `position` rad and `velocity` rad/s.

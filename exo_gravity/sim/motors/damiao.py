@@ -105,22 +105,13 @@ class DamiaoMotor(SimulatedMotor):
             self._command = MotorCommand(*fields)
         return self._state(position, velocity)
 
-    def advance(self, position: float, velocity: float, dt: float) -> float:
-        """Let `dt` s pass for the motor; return its torque in Nm; see `SimulatedMotor`."""
-        self._age += dt
-        is_lost = 0.0 < self.firmware.timeout < self._age
-        if self.entered and is_lost:
-            self.dips += 1
+    def _watch(self, is_lost: bool) -> None:
+        self.dips += self.entered and is_lost
         error = self.error or COIL_OVER_TEMPERATURE * (self.temperature > self.joint.spec.shuts_off_at)
         error = error or LOST * (self.entered and is_lost)
         if error:
             self.latched = error
             self._let_go()
-        torque = self.torque(position, velocity)
-        if self._heat.rise:
-            load = torque / self.joint.spec.rated_torque
-            self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
-        return -torque if self.is_reversed else torque
 
     def _let_go(self) -> None:
         self.entered = False

@@ -131,8 +131,3 @@ V3_2 = replace(
 )
 V3_QUERY = replace(V3_2, name="v3_query", reports=False, assumed=_V3_ASSUMED | {"reports"})
 FIRMWARES = {firmware.name: firmware for firmware in (AK, VENDOR, OPEN_DRIVE, V3, V3_2, V3_QUERY)}
-
-
-def usual_firmware(wire_format: WireFormat) -> Firmware:
-    """Return the firmware of boards of which only the wire format is known."""
-    return {AK.wire_format: AK, V3.wire_format: V3}.get(wire_format.name, Firmware())
