@@ -9,7 +9,9 @@ wearer moves to and fro, with the same law and rate. The arms are those of a fil
 from __future__ import annotations
 
 import contextlib
+import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -24,8 +26,7 @@ import yaml
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.processes import Launcher
 
-from .direct_arm import DirectArm
-from .node_log import NodeLog
+from .peers import DirectArm
 from .timing import LoopTiming, analyse, split_cycles
 
 ONE_ARM, BOTH_ARMS, SEVEN_JOINTS = "sim.yaml", "sim_both.yaml", "seven_joints.yaml"
@@ -39,7 +40,23 @@ MOVE = 2.0  # s from one pose to the other: slow enough that the safety machine 
 START_LIMIT = 60.0  # s until the wearer must move
 SETTLING = 0.5  # s of movement before the measurement
 OURS = ("nodes", "one process")  # the kinds that run the package's nodes
+PEERS = {"python": ("python",), "rclpy": ("compensator", "bridge")}  # the processes that take their place
 TICKS = os.sysconf("SC_CLK_TCK")
+
+
+class NodeLog:
+    """The log of all nodes as it grows; the launcher calls it with each line."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[float, str]] = []  #: monotonic s
+
+    def __call__(self, node: str, line: str) -> None:
+        """Take one line of the log of `node`."""
+        self.lines.append((time.monotonic(), f"{node}: {line}"))
+
+    def matching(self, expression: str) -> list[tuple[float, str]]:
+        """Return the lines in which a regular expression is found, each with its time in monotonic s."""
+        return [(when, line) for when, line in self.lines if re.search(expression, line)]
 
 
 @dataclass(frozen=True)
@@ -77,13 +94,18 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
         nodes = [node for node in load(launcher.params) if kind != "one process" or not node.endswith("/compensator")]
         pids = {node.lstrip("/"): launcher.process(node).pid for node in nodes}
         for namespace in namespaces:
-            for part, *command in _peer_commands(kind, params, namespace, rate):
-                pids[f"{namespace[1:]}/{part}"] = stack.enter_context(_process(*command)).pid
-        log.wait_for("wearer: move (0", len(namespaces), START_LIMIT, launcher.dead)
-        start = log.time_of_first("active") - begin
+            for part in PEERS.get(kind, ()):
+                peer = _process("bench.peers", part, str(params), namespace, str(rate))
+                pids[f"{namespace[1:]}/{part}"] = stack.enter_context(peer).pid
+        while len(log.matching(r"wearer: move \(0")) < len(namespaces):
+            time.sleep(0.05)
+            if launcher.dead() or time.monotonic() > begin + START_LIMIT:
+                raise RuntimeError(f"the arm was not carried: {log.lines[-10:]}")
+        start = min(when for when, _ in log.matching(r": (INFO|WARN) active\b")) - begin if kind in OURS else math.nan
         time.sleep(SETTLING)
         window, cpu = _measure(pids, seconds)
-        _check_run(launcher, log)
+        if wrong := launcher.dead() or log.matching("letting down"):
+            raise RuntimeError(f"the arm was not carried to the end: {wrong[0]}; {log.lines[-5:]}")
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
@@ -122,30 +144,12 @@ def write_parameters(folder: Path, rate: float, file: str, seconds: float) -> tu
     return all_nodes, simulators
 
 
-def _check_run(launcher: Launcher, log: NodeLog) -> None:
-    """Raise RuntimeError if a node has ended or the arm was let down."""
-    if dead := launcher.dead():
-        raise RuntimeError(f"{dead[0]} ended during the run: {log.last(5, of=dead[0])}")
-    if line := log.find("letting down"):
-        raise RuntimeError(f"the arm was let down during the run: {line}")
-
-
 def _measure(pids: dict[str, int], seconds: float) -> tuple[tuple[float, float], dict[str, float]]:
     """Let `seconds` pass; return when that was, and each process's share of a core."""
     before, begin = {name: cpu_time(pid) for name, pid in pids.items()}, time.time()
     time.sleep(seconds)
     end = time.time()
     return (begin, end), {name: (cpu_time(pid) - before[name]) / (end - begin) for name, pid in pids.items()}
-
-
-def _peer_commands(kind: str, params: Path, namespace: str, rate: float) -> list[tuple[str, ...]]:
-    """Return (name, module, arguments ...) of the processes that take the place of the nodes."""
-    if kind in OURS:
-        return []
-    arguments = (str(params), namespace, str(rate))
-    if kind == "python":
-        return [("python", "bench.bare_python", *arguments)]
-    return [(part, "bench.bare_rclpy", part, *arguments) for part in ("compensator", "bridge")]
 
 
 def _listener(arm: DirectArm, recording: Path) -> contextlib.AbstractContextManager[subprocess.Popen[bytes]]:

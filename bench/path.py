@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -21,7 +20,7 @@ from typing import Any
 import can
 
 import exo_gravity
-from exo_gravity.core.compensation.compensator import JOINTS, Compensator
+from exo_gravity.core.compensation.compensator import Compensator
 from exo_gravity.core.safety.drive import State
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import read_arm
@@ -29,7 +28,7 @@ from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.sim import SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.controllers import DirectController
 from exo_gravity.sim.virtual_arm import VirtualArm, resting
-from exo_gravity.sim.virtual_time import VirtualBus, Wire
+from exo_gravity.sim.virtual_time import VirtualBus
 
 RATE = 250.0  # Hz
 PACKAGE = Path(exo_gravity.__file__).parent
@@ -45,20 +44,11 @@ class Trace:
         self.calls: Counter[tuple[str, int, str]] = Counter()
         self.records: Counter[str] = Counter()
 
-    def start(self) -> None:
-        """Count from now on."""
-        sys.setprofile(self._note)
-
-    def stop(self) -> None:
-        """Stop counting."""
-        sys.setprofile(None)
-
-    def _note(self, frame: FrameType, event: str, _argument: Any) -> None:
-        if event != "call":
+    def note(self, frame: FrameType, event: str, _argument: Any) -> None:
+        """Count a call, unless the simulation makes it."""
+        if event != "call" or _is_simulation(frame):
             return
         code = frame.f_code
-        if _is_simulation(frame):
-            return
         if code.co_filename.startswith(PATH):
             if code.co_name not in INLINE:
                 self.calls[code.co_filename, code.co_firstlineno, code.co_name] += 1
@@ -77,58 +67,34 @@ def _is_simulation(frame: FrameType | None) -> bool:
     return False
 
 
-class TracedBus(VirtualBus):
-    """The loop's end of a wire: calls `on_reply` when the last motor's reply arrives, `on_command` at its command."""
-
-    def __init__(self, wire: Wire, last: int, on_reply: Callable[[], None], on_command: Callable[[], None]) -> None:
-        super().__init__(wire)
-        self._seen: set[int] = set()
-        self._last, self._on_reply, self._on_command = last, on_reply, on_command
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Return the next frame."""
-        message = super().recv(timeout)
-        if message:
-            self._seen.add(message.data[0])
-            if len(self._seen) == self._last:
-                self._seen.clear()
-                self._on_reply()
-        return message
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a frame."""
-        if msg.arbitration_id == self._last:
-            self._on_command()
-        super().send(msg, timeout)
-
-
-class TracedWire(Wire):
-    """A wire whose one bus is traced."""
-
-    on_reply: Callable[[], None] = staticmethod(lambda: None)
-    on_command: Callable[[], None] = staticmethod(lambda: None)
-
-    def open(self, *_: object) -> VirtualBus:
-        """Open the bus."""
-        bus = TracedBus(self, len(JOINTS), lambda: self.on_reply(), lambda: self.on_command())
-        self.ends.append(bus)
-        return bus
-
-
 def traced_cycle() -> Trace:
     """Return what runs in one cycle of a carried arm that hangs."""
-    arm = read_arm(load(packaged_config("sim.yaml")), "/right")
+    arm, trace = read_arm(load(packaged_config("sim.yaml")), "/right"), Trace()
     device = SimulatedDevice(SimulatedArm(), [SimulatedMotor(motor) for motor in arm.motors])
     limits = Limits(arm.joint_names, sign_check_torque=0.0)
-    controller, wire, trace = DirectController(Compensator(arm.settings), limits), TracedWire(), Trace()
-    virtual = VirtualArm(device, controller, arm.motors, limits, RATE, wire)
+    controller = DirectController(Compensator(arm.settings), limits)
+    virtual = VirtualArm(device, controller, arm.motors, limits, RATE)
     virtual.add_imu(resting(0.0, 0.0), controller.compensator, 1.0 / RATE)
     virtual.enable()
     assert virtual.run_until(lambda: virtual.safety.state is State.ACTIVE), virtual.safety.waiting_for
     virtual.run(0.5)
-    wire.on_reply, wire.on_command = trace.start, trace.stop
+    (bus,) = (end for end in virtual.wire.ends if isinstance(end, VirtualBus))
+    receive, send, last, seen = bus.recv, bus.send, arm.motors[-1].can_id, set[int]()
+
+    def traced_receive(timeout: float | None = None) -> can.Message | None:
+        if message := receive(timeout):
+            seen.add(message.data[0])
+            if len(seen) == len(arm.motors) and not trace.calls:
+                sys.setprofile(trace.note)
+        return message
+
+    def traced_send(message: can.Message, timeout: float | None = None) -> None:
+        if message.arbitration_id == last:
+            sys.setprofile(None)
+        send(message, timeout)
+
+    vars(bus).update(recv=traced_receive, send=traced_send)
     virtual.loop.cycle()
-    wire.on_reply = lambda: None
     virtual.loop.cycle()
     virtual.loop.stop()
     return trace

@@ -32,11 +32,6 @@ def even(rate: float = 100.0, duration: float = DURATION) -> np.ndarray:
     return np.arange(0.0, duration, 1.0 / rate)
 
 
-def delayed(taken: np.ndarray, delay: np.ndarray | float) -> np.ndarray:
-    """Return the arrivals of samples that are on their way for `delay` s."""
-    return in_order(taken + delay)
-
-
 def timer(taken: np.ndarray, period: float) -> np.ndarray:
     """Return the arrivals behind an adapter that passes on what it has every `period` s."""
     return in_order(np.ceil(taken / period + 0.37) * period)
@@ -62,7 +57,7 @@ def by_arrival(taken: np.ndarray, arrivals: np.ndarray) -> Timing:
 
 def true_stamps(taken: np.ndarray, arrivals: np.ndarray | None = None) -> Timing:
     """Return the timing of a driver that knows when its samples were taken."""
-    return Timing(taken, taken, delayed(taken, 0.001) if arrivals is None else arrivals)
+    return Timing(taken, taken, in_order(taken + 0.001) if arrivals is None else arrivals)
 
 
 def ordinary_drivers(duration: float = DURATION) -> dict[str, Timing]:
@@ -77,7 +72,7 @@ def ordinary_drivers(duration: float = DURATION) -> dict[str, Timing]:
     drivers = {
         "even stamps": true_stamps(taken),
         "even stamps, whole milliseconds": true_stamps(np.round(even(112.0, duration), 3)),
-        "arrival, exponential 2 ms": by_arrival(taken, delayed(taken, quick)),
+        "arrival, exponential 2 ms": by_arrival(taken, in_order(taken + quick)),
         "arrival, 4 ms USB timer": by_arrival(taken, timer(taken, 0.004)),
         "true stamps, 30 ms pause each 10 s": true_stamps(taken, paused(taken, 0.03, 10.0)),
         "arrival, 30 ms pause each 10 s": by_arrival(taken, paused(taken, 0.03, 10.0)),
@@ -87,12 +82,12 @@ def ordinary_drivers(duration: float = DURATION) -> dict[str, Timing]:
         "loop, work of 0.5 and 2 ms": true_stamps(loop(lambda k: 0.01, lambda k: (0.0005, 0.002)[k % 2], duration)),
         "loop, 5 % of the sleeps 5 ms longer": true_stamps(odd),
         "loop, work of 0 to 8 ms": true_stamps(heavy),
-        "loop, 5 % longer, delayed": true_stamps(odd, delayed(odd, random.exponential(0.003, len(odd)))),
-        "arrival, 10 % late by 20 ms": by_arrival(taken, delayed(taken, late)),
-        "true stamps, 10 % late by 20 ms": true_stamps(taken, delayed(taken, late)),
+        "loop, 5 % longer, delayed": true_stamps(odd, in_order(odd + random.exponential(0.003, len(odd)))),
+        "arrival, 10 % late by 20 ms": by_arrival(taken, in_order(taken + late)),
+        "true stamps, 10 % late by 20 ms": true_stamps(taken, in_order(taken + late)),
         "3 % of the samples lost": true_stamps(taken[kept]),
-        "a clock off by 500 ppm": Timing(taken, taken * 1.0005, delayed(taken, 0.001)),
-        "a clock that is set by 20 ms": Timing(taken, taken + 0.02 * (taken > 30.0), delayed(taken, 0.001)),
+        "a clock off by 500 ppm": Timing(taken, taken * 1.0005, in_order(taken + 0.001)),
+        "a clock that is set by 20 ms": Timing(taken, taken + 0.02 * (taken > 30.0), in_order(taken + 0.001)),
         "150 ms pauses that delay only the arrival": true_stamps(taken, paused(taken, 0.15, 20.0)),
     }
     for rate in (50.0, 84.0, 95.0, 120.0, 200.0, 500.0):

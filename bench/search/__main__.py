@@ -3,7 +3,7 @@
 
 Plays random cases in virtual time on every core, judges each by the truth, and prints those that come closest to what
 is permitted, or beyond. build/search_ARM.jsonl keeps every case by its seed: the next run goes on where this one ended.
-With --seed one case is replayed: a table of what happened, and a picture in build/. Exit code 1 if a case was beyond.
+With --seed one case is replayed: a table of what happened. Exit code 1 if a case was beyond.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from ..arms import ARMS
-from .case import Event, draw
-from .play import Played, play, play_case
+from .case import Event
+from .play import Played, play
 
 SHOWN = 20
 AHEAD = 2  # cases that wait for each process
@@ -112,8 +112,8 @@ def show(rows: dict[int, Row], console: Console) -> None:
 
 
 def replay(seed: int, arm: str, console: Console) -> float:
-    """Play one case, print what happened, and draw it; return its share of the bound."""
-    played, records = play_case(draw(seed, arm))
+    """Play one case, and print what happened; return its share of the bound."""
+    played = play(seed, arm)
     case = played.case
     console.print(
         f"seed {seed}: {case.rate:g} Hz, pose {case.pose}, friction {case.friction:g} Nm, payload {case.payload:g} kg"
@@ -126,33 +126,7 @@ def replay(seed: int, arm: str, console: Console) -> float:
         table.add_row(f"{when:.3f}", name, text)
     console.print(table)
     console.print(row_of(played))
-    console.print(picture(records, [when for when, _, _ in happened], Path(f"build/search_{seed}.png")))
     return played.share
-
-
-def picture(records: Any, events: list[float], path: Path) -> Path:
-    """Draw the joints' angles and speeds and the motors' torques; return the file."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    shown = records[::10]
-    figure, axes = pyplot.subplots(5, 1, sharex=True, figsize=(12, 12), layout="constrained")
-    for axis, (name, unit) in zip(
-        axes,
-        (("position", "rad"), ("velocity", "rad/s"), ("torque", "Nm"), ("damping", "Nm s/rad"), ("wearer", "Nm")),
-        strict=True,
-    ):
-        axis.plot(shown["time"], shown[name], linewidth=0.8)
-        axis.set_ylabel(f"{name} ({unit})")
-        for when in events:
-            axis.axvline(when, color="black", linewidth=0.5, linestyle=":")
-    axes[0].legend([f"joint {n + 1}" for n in range(shown["position"].shape[1])], ncols=4, loc="upper right")
-    axes[-1].set_xlabel("s")
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path)
-    return path
 
 
 def main() -> int:

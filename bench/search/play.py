@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from exo_gravity.core.safety.drive import State
 from exo_gravity.sim.judge import Driven, driven
 from exo_gravity.sim.rig import Change
@@ -39,25 +37,19 @@ class Played:
 
 def play(seed: int, arm: str) -> Played:
     """Return what becomes of the case of `seed` for the arm called `arm`."""
-    return play_case(draw(seed, arm))[0]
-
-
-def play_case(case: Case) -> tuple[Played, np.ndarray]:
-    """Return what becomes of `case`, and the records of the truth (sim/truth.py)."""
-    stage = Stage(case)
-    begin, error = 0.0, ""
+    case = draw(seed, arm)
+    stage, begin, error = Stage(case), 0.0, ""
     try:
         begin = _play(stage, case)
     except Exception as caught:
         error = f"{type(caught).__name__}: {caught}"
     stage.bus.close()
-    records = stage.truth.records
     bound = bound_of(case, stage.direct.was_clamped)
     config = stage.device.arm.config
     stops = config.position_min, config.position_max
     specs = [motor.joint.spec for motor in stage.motors]
-    done = driven(records, specs, stops, bound.slow, bound.turning)
-    return Played(case, done, bound, tuple(stage.changes), begin, error), records
+    done = driven(stage.truth.records, specs, stops, bound.slow, bound.turning)
+    return Played(case, done, bound, tuple(stage.changes), begin, error)
 
 
 def _play(stage: Stage, case: Case) -> float:

@@ -22,12 +22,9 @@ from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Any
 
 import can
-
-if TYPE_CHECKING:
-    from exo_gravity.sim.virtual_time import VirtualClock
 
 ERROR_STEP = 8  # of a TEC at an error
 PASSIVE_FROM, BUS_OFF_FROM = 128, 256  # values of a TEC
@@ -58,7 +55,7 @@ class CanController:
 class Arbitration:
     """Carries the frames of a wire's controllers, one at a time.
 
-    clock: of all times.
+    clock: a `VirtualClock`, of all times.
     bitrate: bit/s.
     deliver: called with a frame's sender and the frame when it has arrived.
 
@@ -67,7 +64,7 @@ class Arbitration:
     tec: the highest transmit error counter that a controller has had.
     """
 
-    def __init__(self, clock: VirtualClock, bitrate: int, deliver: Callable[[object, can.Message], None]) -> None:
+    def __init__(self, clock: Any, bitrate: int, deliver: Callable[[object, can.Message], None]) -> None:
         self.collisions = self.bus_offs = self.tec = 0
         self._clock, self._bitrate, self._deliver = clock, bitrate, deliver
         self._controllers: dict[Hashable, CanController] = {}
