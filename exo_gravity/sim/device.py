@@ -257,7 +257,7 @@ class SimulatedDevice:
         if self.truth:
             on = [motor.entered for motor in self.motors]
             step = -1 if self.wearer.step is None else self.wearer.step
-            self.truth.note(now, theta, velocity, torque, damping, arm.weight, given, self._frames, step, on)
+            self.truth.note(now, theta, velocity, torque, damping, arm.weight, given, tuple(self._frames), step, on)
         prompt: Sequence[float] = ()
         if any(damping):
             each = zip(damping, self.motors, torque, strict=True)

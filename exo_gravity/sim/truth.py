@@ -52,12 +52,15 @@ class TruthRecords:
 
     def note(self, now: float, *state: Any) -> None:
         """Append the `state` of the arm at the simulated time `now` (s): the fields of RECORD from position on."""
-        self._rows.append((now, *(tuple(part) if isinstance(part, list) else part for part in state)))
+        self._rows.append((now, *state))
 
     @property
     def records(self) -> np.ndarray:
         """All records so far, (n,) of RECORD."""
-        return np.array(self._rows, record_of(len(self._rows[0][1])) if self._rows else RECORD)
+        records = np.empty(len(self._rows), record_of(len(self._rows[0][1])) if self._rows else RECORD)
+        for name, column in zip(records.dtype.names or (), zip(*self._rows, strict=True), strict=False):
+            records[name] = column
+        return records
 
 
 class TruthLog:
