@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.imu_report import report
-from bench.imu_trials import read_trials
+from bench.imu_report import read_trials, report
 from bench.ordinary.__main__ import is_quiet
 from bench.ordinary.motors import Electronics, OrdinaryMotor
 from bench.ordinary.rows import EQUIPMENT, Row

@@ -144,6 +144,17 @@ def test_an_arm_on_a_moving_base_accelerates_as_one_on_a_trunk_with_joints(on_tr
         np.testing.assert_allclose(on_trunk(state, theta, velocity, acceleration), torque, atol=1e-8)
 
 
+def test_a_base_that_begins_or_stops_turning_under_a_constant_torque_leaves_no_forces_behind(on_trunk):
+    arm, torque, still = SimulatedArm(ArmConfig(**FRICTIONLESS, **WORN)), (0.3, 2.0, 1.0, 0.5), (0.0,) * 4
+    arm.reset(RAISED)
+    moving = TrunkState(pitch_rate=2.0, roll_acceleration=5.0, acceleration=(1.0, 2.0, 3.0))
+    for state in (TrunkState(), moving, moving, TrunkState()):
+        arm.data.qpos[:], arm.data.qvel[:] = RAISED, still
+        arm.move_base(*felt_in_base("left", state, STANDARD_GRAVITY))
+        arm.step(torque)
+        np.testing.assert_allclose(on_trunk(state, RAISED, still, arm.data.qacc), torque, atol=1e-8)
+
+
 def test_the_right_arm_feels_the_mirror_image():
     x, y, z = 0.3, -0.5, 0.8
     assert in_base("right", (x, y, z)) == in_base("left", (x, -y, z))
