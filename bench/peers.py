@@ -24,8 +24,8 @@ from exo_gravity.core.numbers import Torque
 from exo_gravity.core.safety.drive import Drive, Send
 from exo_gravity.core.safety.start import SwitchingOn
 from exo_gravity.hardware.can_port import ArmOnBus
-from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, favour
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 

@@ -19,8 +19,8 @@ from exo_gravity.core.motors.families import MOTORS
 from exo_gravity.core.motors.frames import ENTER, EXIT, ID_BITS
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.hardware.can_port import CanPort
-from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.hardware.clock import COMPUTER_CLOCK
+from exo_gravity.hardware.motor_bus import MotorBus
 from exo_gravity.sim import Firmware, SimulatedArm, SimulatedDevice, VirtualWearer
 from exo_gravity.sim import device as device_module
 from exo_gravity.sim.arbitration import TAIL_BITS, frame_bits
