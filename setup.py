@@ -131,5 +131,6 @@ setup(
             *(f"{name} = exo_gravity.tools.{name}:main" for name in tools),
         ],
         "exo_gravity.laws": ["anfis = exo_gravity.lab.anfis:law"],
+        "exo_gravity.clients": ["weigh = exo_gravity.lab.weighing:Weigher"],
     },
 )

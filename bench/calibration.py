@@ -28,7 +28,6 @@ from exo_gravity.core.arm.paper import ArmModel
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.motors.ak import USUAL_MOTORS
 from exo_gravity.core.motors.families import MOTORS
@@ -42,6 +41,7 @@ from exo_gravity.lab.calibration.poses import Itinerary, guess_for
 from exo_gravity.lab.calibration.result import CalibrationResult
 from exo_gravity.lab.calibration.tour import DURATION, Tour, TourController
 from exo_gravity.lab.calibration.tours import SCALE_POSES, moments_from
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice, SimulatedMotor

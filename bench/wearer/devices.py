@@ -20,11 +20,11 @@ from exo_gravity.core.arm.wearer import Wearer
 from exo_gravity.core.compensation.settings import Settings, robot_of, settings_of
 from exo_gravity.core.compensation.terms.catalogue import Friction
 from exo_gravity.core.compensation.terms.terms import TermSettings
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.motors.joint_motor import JointMotor
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.moment_model import PAPERS
 from exo_gravity.lab.calibration.poses import candidates, hanging, next_pose
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.sim import ArmConfig, Firmware, SimulatedArm, SimulatedDevice, SimulatedMotor
 from exo_gravity.sim.arm import DEFAULT_LINKS

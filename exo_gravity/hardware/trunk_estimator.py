@@ -31,9 +31,8 @@ from exo_gravity.core.arm.rotation import (
 from exo_gravity.core.arm.tilt import angle_between, pitch_roll, rotation_matrix
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import one_float
-from exo_gravity.core.trunk import imu_checks
-from exo_gravity.core.trunk.agreement import Agreement
-from exo_gravity.core.trunk.imu_checks import Contradiction, ImuSample, in_range, reported_orientation
+from exo_gravity.core.trunk import checks
+from exo_gravity.core.trunk.checks import Agreement, Contradiction, ImuSample, in_range, reported_orientation
 from exo_gravity.core.trunk.uncertainty import MODEL, TiltUncertainty
 
 try:
@@ -92,8 +91,8 @@ class TrunkEstimator:
         self,
         rotation_trunk_from_imu: Sequence[float],
         rate: float = 100.0,
-        gyroscope_range: float = imu_checks.GYROSCOPE_RANGE,
-        accelerometer_range: float = imu_checks.ACCELEROMETER_RANGE,
+        gyroscope_range: float = checks.GYROSCOPE_RANGE,
+        accelerometer_range: float = checks.ACCELEROMETER_RANGE,
     ) -> None:
         """Create an estimator for an IMU mounted at `rotation_trunk_from_imu`, (x, y, z, w), known from a calibration.
 
@@ -108,12 +107,12 @@ class TrunkEstimator:
         x, y, z, w = unit_quaternion("rotation_trunk_from_imu", rotation_trunk_from_imu)
         self._imu_from_trunk = (-x, -y, -z, w)
         self._period = 1.0 / one_float("rate", rate, 2.0 / TUNING.longest_gap, 10_000.0, "Hz")
-        self._fastest = one_float("gyroscope_range", gyroscope_range, *imu_checks.GYROSCOPE_RANGES, "rad/s")
-        ranges = imu_checks.ACCELEROMETER_RANGES
+        self._fastest = one_float("gyroscope_range", gyroscope_range, *checks.GYROSCOPE_RANGES, "rad/s")
+        ranges = checks.ACCELEROMETER_RANGES
         self._strongest = one_float("accelerometer_range", accelerometer_range, *ranges, "m/s^2")
         self._fusion = VqfFusion(self._period) if VQF else None
-        self._equal, self._clock = imu_checks.EqualValues(), imu_checks.ClockCheck()
-        self._seldom, self._agreement = imu_checks.RateCheck(), Agreement()
+        self._equal, self._clock = checks.EqualValues(), checks.ClockCheck()
+        self._seldom, self._agreement = checks.RateCheck(), Agreement()
         self._has_turned = False  # whether the gyroscope has shown anything but zeros, which some drivers fill in
         self._is_fused: bool | None = None  # None before the first sample
         self._time = -math.inf
@@ -146,7 +145,7 @@ class TrunkEstimator:
             return f"until its measurements agree on a turn of the trunk; {self._why}"
         if self._uncertainty.sigma <= MODEL.limit:
             return ""
-        return "gyroscope and accelerometer show different turns" if self._agreement.contradiction else self._why
+        return "gyroscope and accelerometer show different turns" if self._agreement.turns.contradiction else self._why
 
     def update(self, sample: ImuSample, arrival: float | None = None) -> TrunkOrientation | None:
         """Process a sample; return the trunk's orientation, or None while it is not sure enough.
@@ -166,7 +165,7 @@ class TrunkEstimator:
             self._restart(f"{error.name} must be {error.expected}", is_suspect=True)
             raise
         sigma = self._uncertainty.sigma
-        is_sure = sigma <= MODEL.limit and self._agreement.has_seen_gravity and not self._agreement.is_suspect
+        is_sure = sigma <= MODEL.limit and self._agreement.mean.has_seen_gravity and not self._agreement.is_suspect
         return TrunkOrientation(product(quaternion, self._imu_from_trunk), sigma) if is_sure else None
 
     def _reported(self, sample: ImuSample) -> Quaternion:
@@ -176,7 +175,7 @@ class TrunkEstimator:
             expected = "reported, with gravity in it: an orientation is used only while the accelerometer confirms it"
             raise ParameterError("linear_acceleration", None, expected)
         force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
-        imu_checks.check_unit(force, self._force)
+        checks.check_unit(force, self._force)
         rate = ZERO
         if sample.angular_velocity is not None:
             rate, _ = in_range("angular_velocity", sample.angular_velocity, self._fastest)
@@ -207,7 +206,7 @@ class TrunkEstimator:
             raise ParameterError("orientation", None, "reported by the IMU, or install vqf to fuse it")
         rate, is_saturated = in_range("angular_velocity", sample.angular_velocity, self._fastest)
         force, is_cut = in_range("linear_acceleration", sample.acceleration, self._strongest)
-        imu_checks.check_unit(force, self._force)
+        checks.check_unit(force, self._force)
         dt = self._step(sample, rate + force, None if is_saturated or is_cut else self._quaternion)
         last = self._rates[-1] if self._rates else rate
         unknown = TUNING.overshoot * self._fastest if is_saturated else 0.0
@@ -231,8 +230,8 @@ class TrunkEstimator:
             unmeasured, swing = self._uncertainty.unmeasured, spin_up + speed * speed
             agreement.check(dt, quaternion, plus(ZERO, self._total, share), length, swing, unmeasured)
         self._speed = max(sum(map(abs, rate)), self._speed * (1.0 - dt))
-        contradiction = agreement.contradiction + self._speed * self._clock.offset
-        self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.square, contradiction)
+        contradiction = agreement.turns.contradiction + self._speed * self._clock.offset
+        self._uncertainty.advance(dt, len(rates) - 1, spin_up, bias_sigma, agreement.mean.square, contradiction)
         self._begin_judgement(rate)
 
     def _collect(self, rate: Floats3, force: Floats3, is_cut: bool) -> None:
@@ -262,7 +261,7 @@ class TrunkEstimator:
         if 0.0 < dt <= TUNING.longest_gap and is_fused is self._is_fused:
             return dt
         self._restart(f"gap of {dt:.2f} s" if is_fused is self._is_fused else "started")
-        self._is_fused, self._clock = is_fused, imu_checks.ClockCheck()
+        self._is_fused, self._clock = is_fused, checks.ClockCheck()
         return 0.0
 
 

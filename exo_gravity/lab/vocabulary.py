@@ -61,3 +61,39 @@ class SimulatorWarning(Word):
 
     STALLED = "stalled"
     DISCONNECTED = "disconnected"
+
+
+class WeighingPhase(Word):
+    """How far a weighing is."""
+
+    NONE = "none"
+    TAKING_OVER = "taking_over"
+    SWEEPING = "sweeping"
+    DONE = "done"
+    FAILED = "failed"
+
+
+class WeighingRefused(Word):
+    """Why a weighing does not begin."""
+
+    TERMS = "terms"
+    SUPPORT = "support"
+    SLOW = "slow"
+    UNDER_WAY = "under_way"
+    CHANGING_LOAD = "changing_load"
+    NO_HAND = "no_hand"
+
+
+class WeighingTrouble(Word):
+    """Why a weighing has no result."""
+
+    HANGS_DOWN = "hangs_down"
+    MOVES = "moves"
+    SETTINGS_CHANGED = "settings_changed"
+    NO_JOINT_STATES = "no_joint_states"
+    MOVED_AWAY = "moved_away"
+    HAND_ON_ARM = "hand_on_arm"
+    TOO_HEAVY = "too_heavy"
+    RESTLESS = "restless"
+    NOT_FOLLOWED = "not_followed"
+    NO_LOAD = "no_load"

@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import String
 
 from exo_gravity.core.motors.joint_motor import OPTIONS, buses_of, channels_of, is_fd
-from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.core.trunk.checks import ImuSample
 from exo_gravity.core.vocabulary import words
 from exo_gravity.hardware.can_port import open_bus
 from exo_gravity.lab.packages import extras

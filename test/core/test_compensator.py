@@ -27,12 +27,6 @@ from ..support import ROBOT
 from ..support.compensator_run import PERIOD, THETA, CompensatorRun, settings_with
 
 
-def test_every_answer_is_the_torque_of_the_law_from_the_first_one_on():
-    run = CompensatorRun()
-    run.cycle(0.1)
-    np.testing.assert_allclose(run.efforts, [gravity_torque(ROBOT, THETA)] * len(run.efforts), rtol=1e-12)
-
-
 def test_without_a_fresh_tilt_by_arrival_and_by_stamp_there_is_a_reason_instead_of_a_torque():
     run = CompensatorRun(use_imu=True)
     assert run.cycle()[:2] == (None, "no trunk tilt yet")

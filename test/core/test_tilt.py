@@ -20,17 +20,13 @@ from ..support import ROBOT
 from ..support.compensator_run import THETA, CompensatorRun
 
 
-def random_tilts(count=500):
-    rng = np.random.default_rng(3)
-    return rng.uniform((-math.pi / 2, -math.pi), (math.pi / 2, math.pi), (count, 2))
-
-
 def rotation(pitch, roll, heading=0.0):
     return Rotation.from_euler("xyz", (roll, pitch, heading))  # fixed axes: roll about x first, then pitch about y
 
 
 def test_gravity_in_the_trunk_agrees_with_a_roll_then_a_pitch_about_fixed_axes():
-    for pitch, roll in random_tilts():
+    tilts = np.random.default_rng(3).uniform((-math.pi / 2, -math.pi), (math.pi / 2, math.pi), (500, 2))
+    for pitch, roll in tilts:
         turn, gravity = rotation(pitch, roll), gravity_in_trunk(pitch, roll)
         assert gravity == pytest.approx(turn.inv().apply((0, 0, -1)), abs=1e-12)
         assert pitch_roll(gravity) == pytest.approx((pitch, roll), abs=1e-6)
@@ -55,8 +51,7 @@ def test_the_rotation_matrix_agrees_with_scipy_also_for_a_rounded_quaternion():
 @pytest.mark.parametrize("law", [ArmModel.torque, static_torque, mobile_torque])
 def test_the_laws_multiply_their_torque_by_the_magnitude_of_gravity(law):
     tilt = Tilt.of("left", 0.2, -0.1)
-    felt = law(ROBOT, THETA, tilt._replace(magnitude=1.5))
-    np.testing.assert_allclose(felt, 1.5 * np.array(law(ROBOT, THETA, tilt)))
+    np.testing.assert_allclose(law(ROBOT, THETA, tilt._replace(magnitude=1.5)), 1.5 * np.array(law(ROBOT, THETA, tilt)))
 
 
 UPRIGHT = (0.0, 0.0, -1.0)

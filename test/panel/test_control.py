@@ -25,6 +25,7 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.lease import LEASE_TIME
 from exo_gravity.lab import processes
+from exo_gravity.lab import vocabulary as beside
 from exo_gravity.lab.inputs import parameter_file
 from exo_gravity.lab.inputs.arms import fitting
 from exo_gravity.panel import recordings
@@ -481,8 +482,8 @@ TEXTS = CONTENT["texts"]
 WORDS = {  # of the nodes, that an operator must understand
     "fault": FaultCode, "do": FaultCode, "state": [state.value for state in State], "step": (*TIMED, *VALUED),
     "sentence": [state.value for state in State], "wait": vocabulary.Wait, "reason": vocabulary.Withdrawal,
-    "trouble": vocabulary.WeighingTrouble, "source": vocabulary.Source, "marker": MARKERS,
-    "weighing": set(vocabulary.WeighingPhase) - {vocabulary.WeighingPhase.NONE},
+    "trouble": beside.WeighingTrouble, "source": vocabulary.Source, "marker": MARKERS,
+    "weighing": set(beside.WeighingPhase) - {beside.WeighingPhase.NONE},
 }  # fmt: skip
 
 

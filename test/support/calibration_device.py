@@ -15,7 +15,6 @@ import numpy as np
 
 from exo_gravity.core import ArmModel
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import Observation, Station
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.motors.joint_motor import JointMotor, motors_of
 from exo_gravity.core.numbers import NO_TORQUE, Vector
@@ -26,6 +25,7 @@ from exo_gravity.lab.calibration.live import LiveTour
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.poses import Itinerary, guess_for, next_pose
 from exo_gravity.lab.calibration.tour import Tour, TourController, calibrator_table, line_of, side_of, tour_of
+from exo_gravity.lab.calibration.tracking import Observation, Station
 from exo_gravity.lab.inputs.arms import node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.inputs.ros_yaml import text_of

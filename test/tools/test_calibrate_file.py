@@ -26,13 +26,13 @@ from rich.console import Console
 
 from exo_gravity.core.arm.paper import ArmModel, gravity_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import BusError, DataError, ParameterError
 from exo_gravity.hardware import bus_lock
 from exo_gravity.lab.calibration import identification, live
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.new import turning_joints
 from exo_gravity.lab.calibration.result import CalibrationResult, Change, page_of, remainders, write_changes
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms, read_arm
 from exo_gravity.lab.inputs.parameter_file import can_options, load
 from exo_gravity.lab.trial.offline import simulated_trials

@@ -18,7 +18,6 @@ from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.springs import Springs
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.compensation.settings import robot_of, settings_of
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.core.params import values_of
@@ -27,6 +26,7 @@ from exo_gravity.lab.calibration.identification import identify
 from exo_gravity.lab.calibration.poses import Itinerary, friction_stations
 from exo_gravity.lab.calibration.tour import CALIBRATOR, observations_in, tour_of
 from exo_gravity.lab.calibration.tours import checked, friction_from, moments_from
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import wearer_from
 from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import configured_arm, read_arm

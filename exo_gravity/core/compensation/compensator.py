@@ -2,9 +2,9 @@
 """Joint angles and trunk tilt -> step-free torques that hold an arm of n joints, or the reason why there are none.
 
 `Compensator.step` is the whole way: it checks the input and the tilt, evaluates the law, adds the terms and what a
-weighing needs, clamps, guides whatever changes, and limits the rate. Where the chosen law does not apply, the exact law
-replaces it as a guided change, for at least FALLBACK_TIME. How the torque begins is for who applies it
-(core/safety/guidance.py).
+client beside the path asks for, clamps, guides whatever changes, and limits the rate. Where the chosen law does not
+apply, the exact law replaces it as a guided change, for at least FALLBACK_TIME. How the torque begins is for who
+applies it (core/safety/guidance.py).
 """
 
 import math
@@ -12,18 +12,17 @@ import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
-from exo_gravity.core.arm.interface import STANDARD_GRAVITY
+from exo_gravity.core.arm.interface import MAX_PAYLOAD, STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import AXES, Tilt
 from exo_gravity.core.compensation.guidance import DROP, PAUSE, DropWatch, GuidedChange
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import SupportRequest
 from exo_gravity.core.compensation.terms.terms import Terms, TermsInForce
-from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.numbers import Torque, limited
 from exo_gravity.core.trunk.inputs import TILT, FeltMotion, TiltInput
-from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingRefused, WeighingTrouble, Withdrawal
+from exo_gravity.core.vocabulary import NO_REASON, Reason, Withdrawal
 
 FALLBACK_TIME = 0.5  # s for which the chosen law must apply before it replaces the exact law again
 JOINTS = ("shoulder_rotation", "shoulder_abduction", "shoulder_flexion", "elbow_flexion")
@@ -31,6 +30,29 @@ MAX_ANGLE = 26.0  # rad, more than an AK motor can report with any zero
 LONGEST_STEP = (
     0.01  # s that the rate limit allows for after a shorter one, so that the torque does not catch up at once
 )
+
+
+CLIENTS = "exo_gravity.clients"  # entry points of what makes a client, by the name of the service that begins it
+CLIENT_EFFORT = 2.0  # Nm of any joint, that a client may ask for beyond what any load in the hand needs
+
+
+class Client(Protocol):
+    """What moves a carried arm a little from beside the path, as a weighing does (lab/weighing.py)."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it asks for nothing more."""
+        ...
+
+    def torque(
+        self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
+    ) -> Torque:
+        """Return what it asks for in place of `torque`, (n,) Nm each, `dt` s after the last call."""
+        ...
+
+    def interrupt(self, why: str) -> None:
+        """End it, because of what the sentence says."""
+        ...
 
 
 class Compensation(NamedTuple):
@@ -81,7 +103,8 @@ class Compensator:
         self.motion = FeltMotion()  #: of the trunk, used with `inertial` while the tilt is fresh
         self.applied: Sequence[float] | None = None  #: (n,) Nm, the motors' measured torque, set by who knows it
         self.dropped = 0.0  #: kg, the load that left the hand last; 0 for none
-        self.weighing: Weighing | None = None  #: the last one
+        self._client: Client | None = None  # the last one
+        self._most_asked: Sequence[float] = ()  # (n,) Nm, that it may ask for; () before its first call
         self._pending: Settings | None = None
         self._torque: Torque = (0.0,) * len(settings.max_effort)  # of the last step that had efforts, before the limit
         self._effort = self._torque  # of its rate,
@@ -101,14 +124,12 @@ class Compensator:
             settings = replace(settings, raised_support=last.raised_support)
         self._pending = settings
 
-    def weigh(self, weighing: Weighing) -> Reason:
-        """Let `weighing` carry the load in the hand from the next `step` on; return why it cannot, false if it can."""
-        if self._active_weighing:
-            return Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
-        if not self._change.is_over:
-            return Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
-        self.weighing = weighing
-        return NO_REASON
+    def lend(self, client: Client) -> bool:
+        """Let `client` move the arm a little from the next `step` on; return False if another one or a change does."""
+        if self._active_client or not self._change.is_over:
+            return False
+        self._client, self._most_asked = client, ()
+        return True
 
     def step(self, now: float, theta: Sequence[float], velocity: Sequence[float] | None = None) -> Compensation:
         """Return the torque for joint angles `theta` (n,) rad at `now` s on a monotonic clock.
@@ -138,16 +159,16 @@ class Compensator:
         torque = gravity
         if velocity:
             torque = tuple(map(operator.add, gravity, self.terms.torque(now, theta, velocity)))
-        weighing = self._active_weighing if velocity else None
-        if weighing and velocity:
-            torque = weighing.torque(dt, theta, velocity, self.tilt.at(now), torque)
+        at, client = Reading(now, theta, velocity), self._active_client if velocity else None
+        if client:
+            torque = self._asked_for(client, at, torque)
         torque = clamped(torque, s.max_effort)
-        needs = partial(self._torque_of, Reading(now, theta, velocity))
+        needs = partial(self._torque_of, at)
         change = self._change
         if not 0.0 <= dt <= PAUSE:
             change.stop()
             dt, self._effort = 0.0, torque
-        elif before or bool(self._fallback) != was_replaced or (weighing and weighing.is_over):
+        elif before or bool(self._fallback) != was_replaced or (client and client.is_over):
             change.begin(before, self._torque, needs, torque)
         if not change.is_over:
             torque = change.step(dt, velocity, needs, torque)
@@ -157,6 +178,16 @@ class Compensator:
         over = tuple([n for n, most in enumerate(s.max_effort) if not -most <= gravity[n] <= most])
         remainder = () if change.is_over else change.remainder
         return Compensation(self._effort, NO_REASON, over, self._fallback, remainder, change.is_large, held)
+
+    def _asked_for(self, client: Client, at: Reading, torque: Torque) -> Torque:
+        """Return `torque` (n,) in Nm with what `client` asks for, within CLIENT_EFFORT and what any load needs."""
+        tilt, velocity = self.tilt.at(at.time), at.velocity or ()
+        asked = client.torque(at.time - self._last_time, at.theta, velocity, tilt, torque)
+        if not self._most_asked:  # in the pose in which it began
+            heaviest = MAX_PAYLOAD * self.settings.arm.gravity
+            levers = self.settings.unit_load.torque(at.theta, tilt)
+            self._most_asked = [CLIENT_EFFORT + heaviest * abs(lever) for lever in levers]
+        return tuple(map(operator.add, torque, clamped(map(operator.sub, asked, torque), self._most_asked)))
 
     def _follow_request(self, now: float) -> None:
         """Carry as much of the wearer's arm as is asked for."""
@@ -178,14 +209,14 @@ class Compensator:
         if self._pending:
             self._use(self._pending)
             return before
-        return before if overtaken and not self._active_weighing else None
+        return before if overtaken and not self._active_client else None
 
     def _use(self, settings: Settings) -> None:
         if settings.law != self.settings.law:
             self._fallback, self._fallback_until = "", -math.inf
         self.settings, self._pending = settings, None
-        if weighing := self._active_weighing:
-            weighing.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, "the settings changed")
+        if client := self._active_client:
+            client.interrupt("the settings changed")
         self.tilt.timeout = settings.tilt_timeout
         self.terms.apply(settings.terms, settings.moving)
 
@@ -224,8 +255,8 @@ class Compensator:
         return tuple(map(operator.add, torque, turning)), reason
 
     @property
-    def _active_weighing(self) -> Weighing | None:
-        return self.weighing if self.weighing and not self.weighing.is_over else None
+    def _active_client(self) -> Client | None:
+        return self._client if self._client and not self._client.is_over else None
 
     def _torque_of(self, reading: Reading, load: Load) -> Torque:
         """Return the torque (n,) in Nm that `load` would need here, clamped as it was."""

@@ -2,7 +2,7 @@
 """The parameters of `imu`."""
 
 from exo_gravity.core.params import Param
-from exo_gravity.core.trunk import imu_checks
+from exo_gravity.core.trunk import checks
 
 # fmt: off
 IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox")
@@ -15,11 +15,11 @@ IMU = (
     # No rotation would be a safe default. Four zeros are not a rotation, so the node rejects them.
     Param("rotation_trunk_from_imu", [0.0] * 4, "its mounting, unit quaternion x, y, z, w; required",
           (-1.0, 1.0), fixed=True, vector=True),
-    Param("rate", 100.0, "nominal sample rate", (imu_checks.RateLimits.least, 2000.0), "Hz", fixed=True),
-    Param("gyroscope_range", imu_checks.GYROSCOPE_RANGE, "rate at which it saturates",
-          imu_checks.GYROSCOPE_RANGES, "rad/s", fixed=True),
-    Param("accelerometer_range", imu_checks.ACCELEROMETER_RANGE, "where it saturates",
-          imu_checks.ACCELEROMETER_RANGES, "m/s^2", fixed=True),
+    Param("rate", 100.0, "nominal sample rate", (checks.RateCheck.least, 2000.0), "Hz", fixed=True),
+    Param("gyroscope_range", checks.GYROSCOPE_RANGE, "rate at which it saturates",
+          checks.GYROSCOPE_RANGES, "rad/s", fixed=True),
+    Param("accelerometer_range", checks.ACCELEROMETER_RANGE, "where it saturates",
+          checks.ACCELEROMETER_RANGES, "m/s^2", fixed=True),
     Param("timeout", 0.1, "time without IMU data that is an error", (0.02, 1.0), "s", fixed=True),
 )
 # fmt: on

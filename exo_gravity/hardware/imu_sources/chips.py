@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.core.trunk.checks import ImuSample
 from exo_gravity.hardware.imu_sources.source import ImuSource, StampClock
 
 

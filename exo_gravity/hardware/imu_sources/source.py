@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from exo_gravity.core.errors import DeviceError
-from exo_gravity.core.trunk.imu_checks import ImuSample
+from exo_gravity.core.trunk.checks import ImuSample
 
 StampClock = Callable[[], float]  # s; the clock of the stamps
 Axes = tuple[float, float, float]

@@ -36,7 +36,6 @@ from typing import NamedTuple
 import numpy as np
 
 from exo_gravity.core.arm.springs import MAX_REST, MAX_STIFFNESS
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Vector
 from exo_gravity.lab.calibration.held import held
@@ -57,6 +56,7 @@ from exo_gravity.lab.calibration.pose_fit import (
     without_outliers,
 )
 from exo_gravity.lab.calibration.poses import missing_pose, shown_by
+from exo_gravity.lab.calibration.tracking import Observation
 
 
 @dataclass(frozen=True)

@@ -24,16 +24,16 @@ from scipy.spatial.transform import Rotation
 
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import angle_between, turning_in_base
-from exo_gravity.core.compensation.tracking import mean_direction
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.numbers import Vector
-from exo_gravity.core.trunk.imu_checks import reported_orientation, reported_vector
+from exo_gravity.core.trunk.checks import reported_orientation, reported_vector
 from exo_gravity.core.trunk.params import IMU
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.lab.calibration.identification import Identified
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.recorded import samples_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
+from exo_gravity.lab.calibration.tracking import mean_direction
 from exo_gravity.lab.inputs.arms import ConfiguredArm, node_values
 from exo_gravity.lab.inputs.parameter_file import load
 from exo_gravity.lab.processes import Launcher

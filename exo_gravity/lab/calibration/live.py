@@ -23,9 +23,9 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.lab.calibration.tour import BRIDGE, of_arm
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 from exo_gravity.lab.inputs.node_checks import check_start
 from exo_gravity.lab.inputs.parameter_file import load

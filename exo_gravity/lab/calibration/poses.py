@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import Torque, Vector
 from exo_gravity.core.safety.limits import WALL, Limits
 from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
 from exo_gravity.lab.calibration.pose_fit import layout_of, unmeasured
+from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from exo_gravity.core.arm.interface import MAX_MASS
 from exo_gravity.core.arm.paper import MAX_LENGTH
 from exo_gravity.core.arm.tilt import SIDES, Tilt, angle_between
 from exo_gravity.core.compensation.settings import compensator_table
-from exo_gravity.core.compensation.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.errors import DataError, ExoGravityError
 from exo_gravity.core.motors.joint_motor import MOTOR_PARAMETERS, JointSample
 from exo_gravity.core.numbers import Torque
@@ -29,6 +28,7 @@ from exo_gravity.core.safety.drive import Efforts
 from exo_gravity.core.safety.limits import CAN_BRIDGE, Limits
 from exo_gravity.lab.calibration.moment_model import model_of
 from exo_gravity.lab.calibration.poses import Itinerary, TorqueGuess, friction_stations, guess_for
+from exo_gravity.lab.calibration.tracking import MOTION, Line, Observation, Station, Sweep, Tracker, average, followed
 from exo_gravity.sim.controllers import SampleController
 
 # Share of the expected torque that a hanging arm gets until it is carried. With more torque than its weight needs, it

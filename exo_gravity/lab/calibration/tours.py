@@ -17,7 +17,6 @@ import numpy as np
 from exo_gravity.core.arm.springs import Springs, link_angles
 from exo_gravity.core.compensation.laws import URDF_LAW
 from exo_gravity.core.compensation.settings import ModelError, joint_spring_of
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import TORQUE_SCALE_BOUNDS, scale_at
 from exo_gravity.core.numbers import COVER, JOINT_COUNT, for_joints, one_float
@@ -31,6 +30,7 @@ from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.recorded import observations_of
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tour import observations_in
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import ConfiguredArm
 
 SCALE_POSES = 8  # of each tour of `calibrate scale`

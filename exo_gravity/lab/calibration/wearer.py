@@ -14,13 +14,13 @@ import numpy as np
 
 from exo_gravity.core.arm.wearer import MAX_TISSUE, TISSUE_REACH
 from exo_gravity.core.compensation.settings import joint_spring_of
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER, for_joints, one_float
 from exo_gravity.lab.calibration.live import Say
 from exo_gravity.lab.calibration.pose_fit import columns
 from exo_gravity.lab.calibration.result import CalibrationResult, Change
 from exo_gravity.lab.calibration.tours import at_links, row, torque_error, tour_observations
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer_fit import WearerFit, fit_wearer, unrest, visits
 from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import ConfiguredArm

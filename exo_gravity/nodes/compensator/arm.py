@@ -21,11 +21,10 @@ from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
 from exo_gravity.core.compensation.laws import GROUP, URDF_LAW, installed
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.weighing import Weighing
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.params import Param
 from exo_gravity.core.trunk.inputs import TILT
-from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, Reason, WeighingPhase, words
+from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, words
 from exo_gravity.hardware.model_file import read_model
 from exo_gravity.hardware.urdf_arm import UrdfArm, arm_from, read_urdf
 from exo_gravity.nodes.ros.messages import LATE_TILT, by_name, row, to_nanoseconds, velocity_of
@@ -103,32 +102,6 @@ def report(control: Compensator, answer: Compensation, names: Sequence[str]) -> 
         "assist reason": why_not.word,
         "assist text": why_not,
         "inertia tank (J)": f"{terms.tank.level:.2f}",
-    }
-
-
-def weighing_report(weighing: Weighing | None, number: int, refusal: Reason) -> dict[str, object]:
-    """Return the last weighing, for /diagnostics.
-
-    number: of weighings so far. refusal: why the last one that was asked for did not begin.
-    """
-    excess, payload = (weighing.excess, weighing.payload) if weighing else (None, None)
-    mass, band = excess or (None, None)
-    carried, carried_band = payload or (None, None)
-    figures = {
-        "weighing time (s)": (weighing.elapsed if weighing else None, 1),
-        "weighed mass (kg)": (mass, 3),
-        "weighed band (kg)": (band, 3),
-        "weighed payload (kg)": (carried, 3),
-        "weighed payload band (kg)": (carried_band, 3),
-    }
-    return {
-        "weighing": weighing.phase if weighing else WeighingPhase.NONE,
-        "weighing text": weighing.text if weighing else "",
-        "weighing number": number,
-        "weighing trouble": weighing.trouble.word if weighing else NONE,
-        "weigh refused": refusal.word,
-        "weigh refused text": refusal,
-        **{key: NONE if value is None else row([value], digits) for key, (value, digits) in figures.items()},
     }
 
 

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from rclpy.context import Context
@@ -19,11 +20,11 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from exo_gravity.core.compensation.compensator import Compensation, Compensator
+from exo_gravity.core.compensation.compensator import CLIENTS, Compensation, Compensator
+from exo_gravity.core.compensation.laws import installed, loaded
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import TOPIC as SUPPORT_REQUEST
 from exo_gravity.core.compensation.terms.terms import Terms
-from exo_gravity.core.compensation.weighing import Weighing, refusal
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
 from exo_gravity.core.vocabulary import NO_REASON, NONE, CompensatorState, Reason, Withdrawal, words
@@ -36,7 +37,6 @@ from exo_gravity.nodes.compensator.arm import (
     report,
     sentence,
     warnings_of,
-    weighing_report,
 )
 from exo_gravity.nodes.ros.messages import ERROR, OK, STALE, WARN, Diagnostics, milliseconds, row, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import accept_changes
@@ -72,8 +72,6 @@ class CompensatorNode(Node):
         self._names = values["joint_names"]
         settings = read(values)
         self._control = Compensator(settings, self._names)
-        self._weighing: Weighing | None = None
-        self._weighings, self._weighing_refusal = 0, NO_REASON
         self._threads: list[PeriodicThread] = []
         self._serve_wearer(self._control.terms)
         is_called = context is not None  # by can_bridge: then the topic is polled in `answer`
@@ -105,7 +103,7 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add assistance, support on request, and weighing."""
+        """Add assistance, support on request, and what clients beside the path do, as to weigh."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
         self._threads += [
@@ -114,7 +112,10 @@ class CompensatorNode(Node):
                 self, JointState, SUPPORT_REQUEST, self._on_support_request, SHORT_QUEUE, pause=REQUEST_PAUSE
             ),
         ]
-        self.create_service(Trigger, "~/weigh", self._weigh)
+        makers = {name: loaded(CLIENTS, name, "client") for name in installed(CLIENTS)}
+        self._movers = {name: make(self._control, self._names) for name, make in makers.items()}
+        for name, client in self._movers.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._begin, client))
 
     def _open_interface(self, values: Mapping[str, Any], is_called: bool) -> JointStateInterface | MultiArrayInterface:
         """Return the way in and out; is_called: by can_bridge in the same process. Raises ParameterError."""
@@ -213,21 +214,13 @@ class CompensatorNode(Node):
             self._control.apply(settings)
         self.get_logger().info(sentence(settings))
 
-    def _weigh(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        settings, terms, last = self._control.settings, self._control.terms, self._weighing
-        rate = self._rate.value
-        weighing = Weighing(settings, self._names, rate, last.empty if last else None)
+    def _begin(self, client: Any, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         with self._lock:
-            problem = refusal(settings, terms.active, rate) or self._control.weigh(weighing)
-        if not problem:
-            self._weighing, self._weighings = weighing, self._weighings + 1
-        self._weighing_refusal = problem
-        begun = "relax: the keys of /diagnostics have the result, docs/keys.md"
-        response.success, response.message = not problem, str(problem) or begun
+            problem = client.begin(self._rate.value)
+        response.success, response.message = not problem, str(problem) or client.help
         return response
 
     def _values(self, now: float, answer: Compensation) -> dict[str, object]:
-        weighing = weighing_report(self._weighing, self._weighings, self._weighing_refusal)
         return {
             "reason": answer.reason.word,
             "reason text": answer.reason,
@@ -243,7 +236,7 @@ class CompensatorNode(Node):
             "joint states missed": self._source.missed,
             "effort (Nm)": row(answer.effort) if answer.effort else NONE,
             **report(self._control, answer, self._names),
-            **weighing,
+            **{key: value for client in self._movers.values() for key, value in client.values.items()},
             "refused message": self._refused_topic,
             "refused message text": self._refusal,
         }

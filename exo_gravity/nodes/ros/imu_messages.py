@@ -5,7 +5,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Vector3
 from sensor_msgs.msg import Imu
 
-from exo_gravity.core.trunk.imu_checks import ImuSample, reported_orientation, reported_vector
+from exo_gravity.core.trunk.checks import ImuSample, reported_orientation, reported_vector
 from exo_gravity.core.trunk.inputs import NOT_REPORTED
 from exo_gravity.nodes.ros.messages import to_nanoseconds
 

@@ -8,7 +8,6 @@ import pytest
 
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.arm.tilt import SIDES, Tilt, gravity_in_trunk, rotation_matrix
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.numbers import COVER
 from exo_gravity.lab.calibration.identification import check_physical, identify
@@ -16,6 +15,7 @@ from exo_gravity.lab.calibration.imu import NO_HEADING, turn_in_trunk, turned, w
 from exo_gravity.lab.calibration.moment_model import MomentModel, along_axes
 from exo_gravity.lab.calibration.pose_fit import Places
 from exo_gravity.lab.calibration.tours import moments_from
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.lab.inputs.references import ALPHA, OFFSET, pinocchio_model

@@ -14,7 +14,6 @@ import pytest
 from exo_gravity.core import ArmModel, gravity_torque
 from exo_gravity.core.arm.springs import link_angles
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.compensation.tracking import MOTION, TRACKER, Line, Observation, Station, Sweep, Tracker
 from exo_gravity.core.errors import DataError
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.limits import Limits
@@ -22,6 +21,7 @@ from exo_gravity.lab.calibration.identification import fit_friction
 from exo_gravity.lab.calibration.moment_model import MomentModel
 from exo_gravity.lab.calibration.poses import CHOICE, Itinerary, TorqueGuess, candidates, guess_for, measurable
 from exo_gravity.lab.calibration.tour import Tour
+from exo_gravity.lab.calibration.tracking import MOTION, TRACKER, Line, Observation, Station, Sweep, Tracker
 from exo_gravity.sim import ArmConfig, SimulatedArm, SimulatedDevice
 from exo_gravity.sim.arm import DEFAULT_LINKS
 

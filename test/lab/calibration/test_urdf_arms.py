@@ -16,7 +16,6 @@ import pinocchio as pin
 import pytest
 
 from exo_gravity.core.arm.tilt import Tilt, gravity_in_trunk
-from exo_gravity.core.compensation.tracking import Observation
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.hardware.urdf_arm import MOMENT_NAMES, TURN_NAMES, UrdfArm
 from exo_gravity.lab.calibration.identification import identify
@@ -26,6 +25,7 @@ from exo_gravity.lab.calibration.moment_model import model_of as moments_of_valu
 from exo_gravity.lab.calibration.poses import candidates, next_pose
 from exo_gravity.lab.calibration.result import CalibrationResult, page_of, write_changes
 from exo_gravity.lab.calibration.tours import friction_from, model_of, moments_from
+from exo_gravity.lab.calibration.tracking import Observation
 from exo_gravity.lab.calibration.wearer import WEARER, wearer_from
 from exo_gravity.lab.calibration.worn_arm import WornArm
 from exo_gravity.lab.inputs.arms import ConfiguredArm, configured_arm, read_arm

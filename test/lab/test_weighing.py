@@ -7,18 +7,19 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.arm.wearer import Wearer
-from exo_gravity.core.compensation.compensator import JOINTS
+from exo_gravity.core.compensation.compensator import JOINTS, Compensator
 from exo_gravity.core.compensation.settings import ModelError, Settings
-from exo_gravity.core.compensation.weighing import Weighed, Weighing, refusal
 from exo_gravity.core.motors.ak import MIT
 from exo_gravity.core.safety.limits import Limits
-from exo_gravity.core.vocabulary import WeighingPhase
+from exo_gravity.lab.vocabulary import WeighingPhase
+from exo_gravity.lab.weighing import Weighed, Weigher, Weighing, refusal
 from exo_gravity.sim import ArmConfig
 from exo_gravity.sim.arm import DEFAULT_LINKS
 from exo_gravity.sim.rig import Rig
@@ -52,9 +53,9 @@ def weigh(mass: float, **wearer: Any) -> tuple[Weighing, Rig]:
     arm.carry()
     arm.act({"move": list(POSE), "over": MOVE}, wearer or {"hold": 20.0})
     arm.run(0.95 * MOVE)
-    weighing = Weighing(SETTINGS, JOINTS, RATE)
-    assert arm.compensator.weigh(weighing) == ""
-    assert arm.compensator.weigh(weighing) == "a weighing is under way"
+    weigher = Weigher(arm.compensator, JOINTS)
+    assert weigher.begin(RATE) == "" and weigher.begin(RATE) == "a weighing is under way"
+    weighing = weigher.weighing
     arm.forget()
     arm.run_until(lambda: weighing.is_over)
     return weighing, arm
@@ -76,13 +77,29 @@ def test_a_wearer_who_helps_with_one_joint_is_refused():
 
 
 def test_little_pushes_against_a_hand_that_moves_the_arm_and_not_for_long():
-    weighing, largest = Weighing(SETTINGS, JOINTS, RATE), 0.0
-    weighing.torque(0.01, POSE, STILL, TILT, STILL)
-    for _ in range(1000):
-        held = weighing.torque(0.01, (0.0, 0.5, 0.0, 0.8), STILL, TILT, STILL)
-        largest = max(largest, abs(held[1]))
-    assert "shoulder_abduction" in weighing.trouble and "a hand on the arm" in weighing.trouble
-    assert largest < 9.0 and held == STILL  # Nm, what 5 kg and 2 Nm more need; the motor has 18
+    compensator = Compensator(SETTINGS)
+    weigher, moved = Weigher(compensator, JOINTS), (0.0, 0.5, 0.0, 0.8)
+    compensator.step(0.0, POSE, STILL)
+    assert weigher.begin(RATE) == ""
+    efforts = [
+        compensator.step(0.01 * k, pose, STILL).effort[1] for k, pose in enumerate((POSE, *[moved] * 1000), start=1)
+    ]
+    assert "shoulder_abduction" in weigher.weighing.trouble and "a hand on the arm" in weigher.weighing.trouble
+    pushed = np.abs(np.subtract(efforts[100:], SETTINGS.torque(moved, TILT)[0][1]))
+    assert 4.0 < pushed.max() < 9.0 and pushed[-1] == pytest.approx(0.0)  # Nm; the motor has 18
+
+
+def test_a_client_gets_2_nm_and_what_5_kg_need_until_the_settings_change():
+    compensator = Compensator(replace(SETTINGS, max_effort=(90.0,) * 4, max_effort_rate=1000.0))
+    client = Mock(is_over=False, torque=Mock(return_value=(100.0,) * 4))
+    before = compensator.step(0.0, POSE, STILL).effort
+    assert compensator.lend(client) and not compensator.lend(client)
+    after = [compensator.step(0.01 * cycle, POSE, STILL).effort for cycle in range(1, 20)][-1]
+    lever = np.array(SETTINGS.unit_load.torque(POSE, TILT))
+    assert np.subtract(after, before) == pytest.approx(2.0 + 5.0 * 9.80665 * np.abs(lever))
+    compensator.apply(SETTINGS)
+    compensator.step(0.2, POSE, STILL)
+    client.interrupt.assert_called_once_with("the settings changed")
 
 
 TROUBLE = {  # the arm's poses, its velocity, and what is said of it

@@ -18,10 +18,12 @@ import numpy as np
 
 from exo_gravity.core.arm.interface import MAX_PAYLOAD
 from exo_gravity.core.arm.tilt import AXES, Tilt
+from exo_gravity.core.compensation.compensator import CLIENT_EFFORT, Compensator
 from exo_gravity.core.compensation.settings import Settings
-from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
 from exo_gravity.core.numbers import COVER, Torque
-from exo_gravity.core.vocabulary import NO_REASON, Reason, WeighingPhase, WeighingRefused, WeighingTrouble
+from exo_gravity.core.vocabulary import NO_REASON, NONE, Reason
+from exo_gravity.lab.calibration.tracking import MOTION, Line, Station, Sweep, Tracker, average, followed
+from exo_gravity.lab.vocabulary import WeighingPhase, WeighingRefused, WeighingTrouble
 
 CARRIERS = ("spring", "coupling", "limits", "assist")  # terms that would carry a part
 
@@ -38,7 +40,7 @@ class WeighingTuning:
     largest_error: float = 0.4  #: rad of a joint from its path
     persistence: float = 0.3  #: s for which a joint may want more than it may have, or a hand may push
     lifted: float = 0.5  #: kg less than nothing, that a wearer may lift
-    foreign: float = 2.0  #: Nm of any joint that is no load's: more is a hand on the arm, and a joint gets no more
+    foreign: float = CLIENT_EFFORT  #: Nm of any joint that is no load's: more is a hand on the arm
     unrest: tuple[float, float] = (0.08, 0.05)  #: kg, and share of the mass, between two turns
     #: Nm, and share of the torque, that is no load's, beyond the 95 % band
     unlike: tuple[float, float] = (0.3, 0.1)
@@ -158,7 +160,10 @@ class Weighing:
     def torque(
         self, dt: float, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt, torque: Torque
     ) -> Torque:
-        """Return `torque` (n,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over."""
+        """Return `torque` (n,) in Nm with what carries the load, `dt` s later; `torque` alone once this is over.
+
+        The compensator bounds the difference.
+        """
         if self._matrix is None:
             self._matrix, dt = self._settings.moving.links.matrix(theta), 0.0
             self._begin(theta, velocity, tilt)
@@ -166,10 +171,11 @@ class Weighing:
             return torque
         self.elapsed += dt
         effort = self._tracker.step(dt, theta, velocity, torque, tilt.direction, self._matrix)
-        if self.is_over or self._is_wrong(dt):
-            return torque
-        most = WEIGHING.foreign + MAX_PAYLOAD * self._settings.arm.gravity * np.abs(self._lever)  # what a load may need
-        return tuple((np.array(torque) + np.clip(np.subtract(effort, torque), -most, most)).tolist())
+        return torque if self.is_over or self._is_wrong(dt) else effort
+
+    def interrupt(self, why: str) -> None:
+        """End it without a result."""
+        self.trouble = Reason(WeighingTrouble.SETTINGS_CHANGED, why)
 
     def _begin(self, theta: Sequence[float], velocity: Sequence[float], tilt: Tilt) -> None:
         """Refuse a pose that shows no load, and an arm that moves; compute what depends on the pose alone.
@@ -264,3 +270,53 @@ class Weighing:
                 self.trouble = Reason(WeighingTrouble.NO_LOAD, unlike_load)
         if not self.trouble:
             self.result = Weighed(mass, math.hypot(*(weight * seen.spread)) / gravity, self._lever)
+
+
+class Weigher:
+    """The service `~/weigh` of a compensator, an entry point of exo_gravity.clients.
+
+    weighing: the last one. names: of the joints (n,).
+    """
+
+    help = "relax: the keys of /diagnostics have the result, docs/keys.md"  #: the answer once one has begun
+
+    def __init__(self, control: Compensator, names: Sequence[str]) -> None:
+        self.weighing: Weighing | None = None
+        self._control, self._names = control, names
+        self._count, self._refusal = 0, NO_REASON
+
+    def begin(self, rate: float) -> Reason:
+        """Begin a weighing with joint states at `rate` Hz; return why it does not begin, false if it does."""
+        control, last = self._control, self.weighing
+        self._refusal = refusal(control.settings, control.terms.active, rate)
+        if not self._refusal and last and not last.is_over:
+            self._refusal = Reason(WeighingRefused.UNDER_WAY, "a weighing is under way")
+        weighing = Weighing(control.settings, self._names, rate, last.empty if last else None)
+        if not self._refusal and not control.lend(weighing):
+            self._refusal = Reason(WeighingRefused.CHANGING_LOAD, "the load is changing: wait for it")
+        if not self._refusal:
+            self.weighing, self._count = weighing, self._count + 1
+        return self._refusal
+
+    @property
+    def values(self) -> dict[str, object]:
+        """The last weighing, for /diagnostics."""
+        weighing = self.weighing
+        mass, band = (weighing.excess if weighing else None) or (None, None)
+        carried, carried_band = (weighing.payload if weighing else None) or (None, None)
+        figures: dict[str, tuple[float | None, int]] = {
+            "weighing time (s)": (weighing.elapsed if weighing else None, 1),
+            "weighed mass (kg)": (mass, 3),
+            "weighed band (kg)": (band, 3),
+            "weighed payload (kg)": (carried, 3),
+            "weighed payload band (kg)": (carried_band, 3),
+        }
+        return {
+            "weighing": weighing.phase if weighing else WeighingPhase.NONE,
+            "weighing text": weighing.text if weighing else "",
+            "weighing number": self._count,
+            "weighing trouble": weighing.trouble.word if weighing else NONE,
+            "weigh refused": self._refusal.word,
+            "weigh refused text": self._refusal,
+            **{key: NONE if one is None else f"{round(one, digits):.12g}" for key, (one, digits) in figures.items()},
+        }

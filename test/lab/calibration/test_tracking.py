@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from exo_gravity.core.compensation.tracking import MOTION, Line, Station, Sweep, Tracker, Vibration, followed
+from exo_gravity.lab.calibration.tracking import MOTION, Line, Station, Sweep, Tracker, Vibration, followed
 
 LIGHT = 0.005  # kg m^2
 COULOMB, STRIBECK, STRIBECK_SPEED = 0.3, 0.1, 0.05  # Nm, Nm, rad/s
