@@ -329,6 +329,10 @@ VERDICTS = {  # the recording, what happened, why the trial ended early, the sen
         UNSCRIPTED, (mode_set(7.5, "one_g"),), "",
         r"Right: moved at 8.0 s after mode = one_g: joint 2 moved 2[12]\.\d\d degrees", False,
     ),
+    "the last of two changes": (
+        UNSCRIPTED, (Event(7.0, "", ("/right/compensator", "support", 0.5)), mode_set(7.5, "one_g")), "",
+        "Right: moved at 8.0 s after mode = one_g", False,
+    ),
     "no change of load": (UNSCRIPTED, (mode_set(7.5, "zero_g"),), "", "It held. Worst", True),
     "ended early": (PLANNED, (), TROUBLE, f"It held until the trial ended early: {TROUBLE}. Worst: right: ", True),
     "ended before a hold": (
@@ -489,7 +493,7 @@ def trials(tmp_path_factory):
 def test_a_folder_becomes_one_table_and_page_and_what_fails_is_named(trials, tmp_path, run_tool):
     ended, out = run_tool("report", trials, "--output", tmp_path / "out"), tmp_path / "out"
     text, page = " ".join(ended.out.split()), (out / "cohort.html").read_text(encoding="utf-8")
-    assert ended.code == 2 and "Not reported: " in text and "text.mcap: not an MCAP file" in text
+    assert ended.code == 2 and "SPARC % Verdict" in text and "text.mcap: not an MCAP file" in text
     assert "4 of 4 trials held; recordings not read, or not completely: 1; 0 recordings had not changed" in text
     changes = r"P01, right, unknown mode: change from one of 3 sessions to the next: drift (\S+) ± \S+ deg"
     trend = re.search(changes, text)

@@ -153,6 +153,7 @@ def test_ctrl_c_lets_the_arm_down_and_reports_what_was_recorded(run, monkeypatch
     ended, folder = run("--offline", script={"name": "long", "steps": [SHORT["steps"][0], {"hold": 3000.0}]})
     assert ended.code == 1 and (folder / "report.html").exists()
     assert "stopped by the operator" in ended.out and "slipped" not in ended.out
+    assert "right/can_bridge: stopped by the operator" in (folder / "report.html").read_text(encoding="utf-8")
 
 
 BOW, HOLD = {"bow": math.radians(30.0), "over": 3.0}, {"hold": 1.0}
