@@ -11,7 +11,7 @@ from exo_gravity.core.compensation.settings import COMPENSATOR, URDF, WORN_MOMEN
 from exo_gravity.core.errors import ExoGravityError
 from exo_gravity.core.params import Param
 from exo_gravity.lab.source import source_of
-from exo_gravity.lab.view.urdf import described, urdf
+from exo_gravity.lab.view import described, urdf
 
 # fmt: off
 PANEL = (

@@ -14,7 +14,7 @@ from pathlib import Path
 from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.errors import named
 from exo_gravity.lab.inputs.arms import configured_arm, configured_arms
-from exo_gravity.lab.view.urdf import described, urdf
+from exo_gravity.lab.view import described, urdf
 from exo_gravity.tools.cli import exit_code
 
 

@@ -12,7 +12,7 @@ from exo_gravity.core import ArmModel
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import configured_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
-from exo_gravity.lab.view.scene import (
+from exo_gravity.lab.view import (
     AMBER,
     GREEN,
     GREY,
@@ -20,11 +20,14 @@ from exo_gravity.lab.view.scene import (
     RED,
     SIZES,
     ArmView,
+    Described,
+    PapersPicture,
     arm_shapes,
+    described,
     gravity_shapes,
     state_of,
+    urdf,
 )  # fmt: skip
-from exo_gravity.lab.view.urdf import Described, PapersPicture, described, urdf
 from exo_gravity.sim.urdf import UrdfConfig
 
 NAMES = ("rotation", "abduction", "flexion", "elbow")

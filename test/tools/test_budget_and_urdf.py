@@ -20,7 +20,7 @@ from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.inputs.arms import configured_arms
-from exo_gravity.lab.view.urdf import Described, PapersPicture, urdf
+from exo_gravity.lab.view import Described, PapersPicture, urdf
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG

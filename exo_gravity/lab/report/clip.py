@@ -27,8 +27,7 @@ from exo_gravity.lab.inputs.parameter_file import node_of
 from exo_gravity.lab.report.table import shown
 from exo_gravity.lab.source import of_all
 from exo_gravity.lab.trial.recording import Recording
-from exo_gravity.lab.view.scene import LINE, SPHERE, ArmView, arm_shapes
-from exo_gravity.lab.view.urdf import COLOURS, Described, described
+from exo_gravity.lab.view import COLOURS, LINE, SPHERE, ArmView, Described, arm_shapes, described
 
 SIZE, GIF_SIZE, DPI = (6.4, 4.8), (4.8, 3.6), 100  # inches
 COLOURS_OF_A_GIF, SAMPLES = 64, 12  # one palette for all frames keeps it small

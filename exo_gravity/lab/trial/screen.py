@@ -9,7 +9,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console, Group
@@ -25,21 +24,28 @@ LEAD = 5.0  # s for a person to get ready when the arm is carried
 BRIDGE_TIMEOUT = 5.0  # s from the recorder's first line, in which a bridge that runs already has reported ten times
 
 
-@dataclass(eq=False)
 class TrialScreen:
-    """Follows a script through the recorder's lines."""
+    """Follows a script through the recorder's lines.
 
-    script: TrialScript
-    guided: bool  #: whether a person performs the script
-    console: Console
-    bridges: Collection[str] = ()  #: that must be active before the clock starts; none: all that are seen
-    #: s from then to the first step, in a script that the clock leads; None if the steps are those of the simulator
-    lead: float | None = LEAD
-    #: called with the step and the time left in it, s, once the clock has started
-    on_progress: Callable[[int, float], None] = lambda step, left: None
-    clock: Callable[[], float] = time.monotonic  #: s
+    guided: whether a person performs the script.
+    bridges: that must be active before the clock starts; none: all that are seen.
+    lead: s from then to the first step, in a script that the clock leads; None if the steps are those of the simulator.
+    on_progress: called with the step and the time left in it, s, once the clock has started.
+    clock: s.
+    """
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        script: TrialScript,
+        guided: bool,
+        console: Console,
+        bridges: Collection[str] = (),
+        lead: float | None = LEAD,
+        on_progress: Callable[[int, float], None] = lambda step, left: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.script, self.guided, self.console, self.bridges, self.lead = script, guided, console, bridges, lead
+        self.on_progress, self.clock = on_progress, clock
         self.done = False  #: the last step has ended
         self.status: dict[str, dict[str, Any]] = {}  #: of each node on /diagnostics
         self.faults: list[str] = []  #: warnings and errors of the nodes

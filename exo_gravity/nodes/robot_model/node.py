@@ -25,8 +25,22 @@ from visualization_msgs.msg import Marker, MarkerArray
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab.inputs.arms import fitting
-from exo_gravity.lab.view.scene import ARROW, LINE, SPHERE, TEXT, ArmView, Shape, arm_shapes, gravity_shapes
-from exo_gravity.lab.view.urdf import ROBOT_MODEL, ROOT, Described, described, joint_names, urdf
+from exo_gravity.lab.view import (
+    ARROW,
+    LINE,
+    ROBOT_MODEL,
+    ROOT,
+    SPHERE,
+    TEXT,
+    ArmView,
+    Described,
+    Shape,
+    arm_shapes,
+    described,
+    gravity_shapes,
+    joint_names,
+    urdf,
+)
 from exo_gravity.lab.vocabulary import NodeState
 from exo_gravity.nodes.ros.messages import OK, WARN, Diagnostics, Statuses, by_name, to_nanoseconds
 from exo_gravity.nodes.ros.parameters import OtherNodes, declare
