@@ -258,8 +258,7 @@ class UrdfArm(UrdfShape):
 
         Raises ParameterError while a joint on which it depends is not known (`follow`).
         """
-        felt = self.gravity * tilt.magnitude
-        return self._holding(theta, [felt * component for component in tilt.gravity_in_trunk], ZERO)
+        return self._holding(theta, [self.gravity * tilt.magnitude * part for part in tilt.gravity_in_trunk], ZERO)
 
     def torques(self, theta: ArrayLike, direction: ArrayLike) -> np.ndarray:
         """Return the torque (m, n) in Nm that holds the arm at `theta` (m, n) rad.
