@@ -100,8 +100,8 @@ class ImuRig:
         self.wait_until(lambda: self.sent - max(self.received, len(self.tilts)) < AHEAD)
 
     def settle(self, start, *sample, **options) -> float:
-        """Send the same sample for 4 s of stamps, wait for the last one's tilt, and return its stamp in s."""
-        for stamp in start + 0.01 * np.arange(400):
+        """Send the same sample for 2.5 s of stamps, wait for the last one's tilt, and return its stamp in s."""
+        for stamp in start + 0.01 * np.arange(250):
             self.send(stamp, *sample, **options)
         self.wait_until(lambda: round(stamp * 1e9) in self.tilts)
         return float(stamp)
