@@ -1,10 +1,7 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""The inner parts of rclpy that the nodes use, in one file but for `PolledSubscription`: distributions differ in them.
+"""The inner parts of rclpy that the nodes use: here, in `PolledSubscription` and in `declare`.
 
-    part                                    without it
-    `_take_service`                         a request is as old as the executor stood still
-    `set_parameters_atomically`, replaced   a read-only parameter that is set to its own value is refused, by name;
-                                            one that is not declared is refused without the names of the others
+Without `_take_service` a request is as old as the executor stood still.
 
 rclpy's handlers of the standard services raise on some wrong requests, and an exception in an executor ends the node.
 So `guard` lets them answer a failure. An exception of this package still ends the node, which lets the arm down.
@@ -23,7 +20,6 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor, await_or_execute
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.service import Service
 
 STOOD_STILL = 1.0  # s between two looks at what is due, after which an executor has stood still
@@ -170,21 +166,3 @@ def _failure(request: Any, response: Any, reason: str) -> Any:
         if isinstance(response, SetParametersAtomically.Response):
             response.result.reason = reason
     return response
-
-
-def intercept_changes(node: Node, refusal: Callable[[Parameter], str], is_same: Callable[[Parameter], bool]) -> None:
-    """Refuse parameters with a sentence of ours, and let others be set without any effect.
-
-    refusal: returns why a parameter is refused, '' if it is not.
-    is_same: whether a parameter is set to the value that it has. `ros2 param load` then reads a node's own dump, with
-        its read-only parameters.
-    """
-    set_parameters = node.set_parameters_atomically
-
-    def set_others(parameters: list[Parameter]) -> SetParametersResult:
-        for reason in filter(None, map(refusal, parameters)):
-            return SetParametersResult(successful=False, reason=reason)
-        others = [given for given in parameters if not is_same(given)]
-        return set_parameters(others) if others else SetParametersResult(successful=True)
-
-    node.set_parameters_atomically = set_others  # which rclpy's parameter services call

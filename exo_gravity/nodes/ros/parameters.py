@@ -19,7 +19,6 @@ from rclpy.task import Future
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.motors.joint_motor import OPTIONS
 from exo_gravity.core.params import ROS_PARAMETERS, Param, table_for, values_of
-from exo_gravity.nodes.ros.inner import intercept_changes
 
 T = TypeVar("T")
 
@@ -44,20 +43,23 @@ def declare(node: Node, table: Sequence[Param], free_prefix: str = "") -> dict[s
             node.undeclare_parameter(param.name)
         node.declare_parameter(param.name, values[param.name], descriptor_of(param), ignore_override=True)
 
-    def is_same(given: Parameter) -> bool:
-        if not node.has_parameter(given.name) or not node.describe_parameter(given.name).read_only:
-            return False
-        return bool(plain(given.value) == plain(node.get_parameter(given.name).value))
+    set_declared = node.set_parameters_atomically
 
-    def refusal(given: Parameter) -> str:
-        if not node.has_parameter(given.name):
-            try:
-                values_of(table, {given.name: plain(given.value)}, free_prefix)
-            except ParameterError as error:
-                return str(error)
-        return ""
+    def set_others(given: list[Parameter]) -> SetParametersResult:
+        """Refuse undeclared ones with a sentence of ours; `ros2 param load` may set read-only ones to what they are."""
+        others = []
+        for parameter in given:
+            if not node.has_parameter(parameter.name):
+                try:
+                    values_of(table, {parameter.name: plain(parameter.value)}, free_prefix)
+                except ParameterError as error:
+                    return SetParametersResult(successful=False, reason=str(error))
+            is_fixed = node.has_parameter(parameter.name) and node.describe_parameter(parameter.name).read_only
+            if not is_fixed or plain(parameter.value) != plain(node.get_parameter(parameter.name).value):
+                others.append(parameter)
+        return set_declared(others) if others else SetParametersResult(successful=True)
 
-    intercept_changes(node, refusal, is_same)
+    node.set_parameters_atomically = set_others  # which rclpy's parameter services call
     return values
 
 
