@@ -45,6 +45,7 @@ class MotionLimits:
     least: float = 0.1  #: Nm of margin
     share: float = 0.1  #: of the full load, in addition: 6 degrees of the trunk's tilt
     late: float = 0.02  #: s by which a torque that is fresh may answer an old pose
+    still: float = 0.01  #: rad by which pose or trunk may turn before the range is computed anew
     slow: float = 0.1  #: s, time constant; faster than this, torque changes only with the pose
     patience: float = 0.012  #: s of the full load
     memory: float = 1.0  #: s, time constant
@@ -80,6 +81,8 @@ class MotionMonitor:
         self._moments = [plus(ZERO, way, torque) for way, torque in zip(ways, load, strict=False)]  # Nm
         self._guided = 0.0  # s for which the torque may still be on its way from a tilt before
         self._passed: list[Floats3] = []  # gravity meanwhile: the torque lies between what these need
+        self._gravity = self._down(Tilt.of(SIDES[0]))
+        self._pose: Sequence[float] = ()  # rad, for which the range was computed
         self.follow(Tilt.of(SIDES[0]), None)
         self.reset()
 
@@ -88,7 +91,9 @@ class MotionMonitor:
 
         overtaken: from which the torque is guided, if the trunk has turned suddenly (`TiltInput.overtaken`).
         """
-        self._gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
+        gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
+        if math.dist(gravity, self._gravity) > MOTION.still or overtaken or self._guided:
+            self._gravity, self._pose = gravity, ()
         if overtaken:
             self._passed = self._passed if self._guided else [self._down(overtaken)]
             self._guided = MOTION.guided
@@ -112,7 +117,10 @@ class MotionMonitor:
             return effort, None
         self._guided = max(0.0, self._guided - dt)
         fastest = max([abs(joint.velocity) for joint in joints])
-        lowest, highest = self.explained([joint.position for joint in joints])
+        pose = [joint.position for joint in joints]
+        if not self._pose or math.dist(pose, self._pose) > MOTION.still:
+            self._pose, self._explained = pose, self.explained(pose)
+        lowest, highest = self._explained
         self._slow = self._slow or list(effort)
         passed: list[float] = []
         fault: Fault | None = None
