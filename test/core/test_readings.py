@@ -114,6 +114,11 @@ def test_one_wrong_reading_is_no_fault_and_is_not_passed_on_and_two_are_a_fault(
     assert run.run(4, **WRONG[code]).faults[0] == ("position_jump" if "position" in WRONG[code] else code)
 
 
+@pytest.mark.parametrize(("readings", "faults"), [(7, []), (9, ["over_speed"])])
+def test_a_slap_on_the_table_is_no_over_speed_and_a_joint_that_stays_fast_is(readings, faults):
+    assert Replies(rate=250.0).run(3).run(readings, velocity=7.0).faults == faults  # rad/s, the limit is 5
+
+
 def test_a_joint_outside_its_limits_is_a_fault():
     run = Replies(lambda now: -now)
     assert not run.run(12).faults  # to -0.19 rad; the lower limit of joint 2 is -0.2

@@ -65,6 +65,7 @@ class Derating:
 class ReadingLimits:
     """Which readings of a motor are plausible, and when it is silent."""
 
+    shock: float = 0.03  #: s above `max_velocity`, by half of it at most, that a slap on a table lasts
     overshoot: float = 0.1  #: rad past a joint limit: mechanical stops are not infinitely stiff
     missed: int = 7  #: commands without a reply; with 3 % lost each way an arm misses so many once in 270 h at 100 Hz
     #: commands without a reply, after which a motor is late; with 3 % lost each way, one of four once in 80 s at 250 Hz

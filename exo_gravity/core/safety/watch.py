@@ -210,6 +210,7 @@ class JointWatch:
         self._limits, self._i, self._board, self._peak = limits, i, 0 if replies else 1, peak
         self.sample, self.is_silent, self.missed = UNKNOWN, True, READING.missed
         self._newest = self._asked = -math.inf  # s, of the last reply; `sample` was taken later than asked
+        self._slow_at = -math.inf  # s, of the last reply within `max_velocity`
         self._is_suspect = False
         # rad, forgotten over CONTINUITY.memory: turned by the angle; of that, not explained by the velocity; way to
         # and fro by the velocity
@@ -303,7 +304,10 @@ class JointWatch:
             found[FaultCode.MOTOR_ERROR] = f"the motor reports error {sample.error} ({sample.trouble})"
         if sample.temperature is not None and sample.temperature >= HEAT.most:
             found[FaultCode.OVER_TEMPERATURE] = f"{sample.temperature} degC, the limit is {HEAT.most:g}"
-        if not abs(sample.velocity) <= fastest:
+        if abs(sample.velocity) <= fastest:
+            self._slow_at = sample.time
+        is_shock = abs(sample.velocity) <= 1.5 * fastest and sample.time - self._slow_at <= READING.shock
+        if not abs(sample.velocity) <= fastest and not is_shock:
             found[FaultCode.OVER_SPEED] = f"{sample.velocity:.2f} rad/s, the limit is {fastest:g}"
         turned, silence = sample.position - last.position, sample.time - last.time
         is_jump = abs(turned) > CONTINUITY.jump + fastest * (sample.time - self._asked)
