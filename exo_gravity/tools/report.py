@@ -42,6 +42,11 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     )
     formats = "also write each figure in this format; twice for both"
     option("--figures", action="append", choices=("pdf", "svg"), default=[], help=formats)
+    option("--width", type=non_negative, metavar="MM", help="of these, as printed: 85 is one column (170)")
+    option("--font", metavar="NAME", help="of these, in 8 pt (DejaVu Sans)")
+    option("--joints", type=positive, nargs="+", default=[], metavar="N", help="joints of the overview (all)")
+    option("--from", dest="start", type=non_negative, default=0.0, metavar="S", help="begin of the overview")
+    option("--to", dest="end", type=non_negative, default=math.inf, metavar="S", help="end of the overview")
     for name, default, unit, description in (
         ("--max-drift", 0.5, "DEG", "drift allowed within any 10 s of a hold (%(default)s)"),
         ("--max-drift-after-push", 2.0, "DEG", "the same for a hold after a push (%(default)s)"),
@@ -56,6 +61,8 @@ def _arguments(args: Sequence[str] | None) -> argparse.Namespace:
     options.bag = [Path(text) for found in texts for text in found]
     if options.repair and len(options.bag) > 1:
         parser.error("--repair takes one recording")
+    if (options.width or options.font) and not options.figures:
+        parser.error("--width and --font are those of --figures")
     return options
 
 
@@ -82,6 +89,8 @@ def _run(options: argparse.Namespace) -> int:
 
     from exo_gravity.lab.bag.reader import read_bag
     from exo_gravity.lab.report import cohort, trial_report
+    from exo_gravity.lab.report.figures import Part
+    from exo_gravity.lab.report.html import Print
 
     criteria = HoldCriteria(
         max_stray=math.radians(options.max_drift),
@@ -96,7 +105,10 @@ def _run(options: argparse.Namespace) -> int:
     with screen.status(f"reading {path.name}"):
         bag = read_bag(path, options.decimate)
     report = trial_report.analyse(bag, criteria, options.min_hold)
-    written = trial_report.write(report, options.output or beside, options.figures, options.csv)
+    look = {"width": options.width, "font": options.font}
+    on_paper = Print(options.figures, **{name: value for name, value in look.items() if value})
+    part = Part(options.joints, options.start, options.end)
+    written = trial_report.write(report, options.output or beside, on_paper, part, options.csv)
     if clip:
         clip.write(bag, screen)
     trial_report.print_report(report)
@@ -115,8 +127,9 @@ def _run_cohort(options: argparse.Namespace, criteria: HoldCriteria, output: Pat
 
     found = [one for path in options.bag for one in (path.is_dir() and cohort.recordings_below(path)) or [path]]
     recordings = [*{one.resolve(): one for one in found}.values()]  # one that is named twice is one trial
-    if options.csv or options.figures or options.video:
-        expected = "reported one by one, without --scheduler, for --csv, --figures and --video"
+    of_one = options.csv, options.figures, options.video, options.joints, options.start, math.isfinite(options.end)
+    if any(of_one):
+        expected = "reported one by one, without --scheduler, for --csv, --figures, --video and a part of the overview"
         raise ParameterError("recordings", len(recordings), expected)
     for recording in recordings:
         check_name(recording)

@@ -22,13 +22,14 @@ import matplotlib.image
 import numpy as np
 import pytest
 import yaml
-from matplotlib.figure import Figure
 from rich.console import Console
 
 from exo_gravity.core import ArmModel, Tilt, gravity_torque
 from exo_gravity.core.arm.tilt import gravity_in_trunk
 from exo_gravity.core.arm.wearer import Wearer
+from exo_gravity.core.params import values_of
 from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.limits import CAN_BRIDGE, limits_of
 from exo_gravity.core.vocabulary import Source
 from exo_gravity.lab.bag.content import Event, NodeStatus
 from exo_gravity.lab.bag.reader import read_bag
@@ -166,16 +167,7 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
     assert written == {"holds.csv", "motions.csv", "report.html", "right_drift.png", "right_overview.png"}
     nowhere = run_tool("report", short_bag, "--output", short_bag / "metadata.yaml" / "report")
     assert nowhere.code == 2 and "cannot write the report there" in nowhere.err
-    labelled = Figure(figsize=(1.0, 1.0))
-    labelled.text(0.5, 0.5, "Torque (Nm)")
-    for name in ("overview", "drift"):
-        monkeypatch.setattr(figures, name, lambda *_: labelled)
-    wanted = ("--csv", "--figures", "pdf", "--figures", "svg")
-    assert run_tool("report", short_bag, "--output", tmp_path, *wanted).code == 0
-    for name in ("right_overview", "right_drift"):
-        pdf = (tmp_path / f"{name}.pdf").read_bytes()
-        assert pdf.startswith(b"%PDF") and b"/Type3" not in pdf and b"/FontFile2" in pdf
-        assert ">Torque (Nm)</text>" in (tmp_path / f"{name}.svg").read_text(encoding="utf-8")
+    assert run_tool("report", short_bag, "--output", tmp_path, "--csv").code == 0
     rows, (recording,) = csv_rows(tmp_path / "time_series.csv"), read_bag(short_bag).recordings
     elbow = [row for row in rows if row["joint"] == recording.joint_names[3]]
     values = (recording.time, recording.position[:, 3], recording.velocity[:, 3], recording.effort[:, 3])
@@ -183,6 +175,56 @@ def test_the_report_is_written_next_to_its_recording_and_on_request_time_series_
         np.testing.assert_allclose([float(row[name]) for row in elbow], expected, atol=1e-6)
     assert len(rows) == 4 * len(elbow) and elbow[0]["command_nm"] == ""  # no command before the first joint state
     assert float(elbow[-1]["command_nm"]) == pytest.approx(recording.command[-1, 3], abs=1e-6)
+
+
+@pytest.mark.usefixtures("without_pictures")
+def test_a_figure_for_a_paper_has_its_size_letters_of_8_pt_embedded_fonts_and_the_part_that_was_asked_for(
+    short_bag, tmp_path, run_tool
+):
+    wanted = ["--figures", "pdf", "--figures", "svg", "--width", "85", "--joints", "2", "4", "--from", "3", "--to", "9"]
+    assert run_tool("report", short_bag, "--output", tmp_path, *wanted).code == 0
+    for name in ("right_overview", "right_drift"):
+        pdf = (tmp_path / f"{name}.pdf").read_bytes()
+        width = float(re.search(rb"/MediaBox \[ 0 0 ([\d.]+)", pdf)[1])
+        assert width == pytest.approx(85.0 / 25.4 * 72.0, abs=0.1) and b"/Type3" not in pdf and b"/FontFile2" in pdf
+        svg = (tmp_path / f"{name}.svg").read_text(encoding="utf-8")
+        assert set(re.findall(r"font-size: ([\d.]+)px", svg)) == {"8"} and "@font-face" in svg
+    svg = (tmp_path / "right_overview.svg").read_text(encoding="utf-8")
+    assert re.findall(r">(joint \d)</text>", svg) == ["joint 2", "joint 4"] and ">Velocity (deg/s)</text>" in svg
+    times = [float(x) for x in re.findall(r"text-anchor: middle[^>]*>([\d.]+)</text>", svg)]
+    assert times and max(times) <= 9.0  # s
+
+
+def test_a_push_does_not_flatten_the_velocities_joints_differ_in_grey_and_near_limits_are_drawn(held):
+    ((recording, analysis),) = held.arms
+    names, low = list(recording.joint_names), math.radians(-5.0)
+    values = {"can.interface": "virtual", "can.channel": "a", "joint_names": names, "position_min": [low] * 4}
+    limits = limits_of(values_of(CAN_BRIDGE, values))
+    position, speed, torque = figures.overview(recording, analysis, limits=limits).axes
+    (push,) = [motion for motion in analysis.motions if motion.kind == "push"]
+    peak = math.degrees(push.speed.max())
+    assert speed.get_ylim()[1] < peak and [text.get_text() for text in speed.texts] == [f"to {peak:.0f}"]
+    curves = position.get_lines()[:4]
+    assert len({str(line._dash_pattern) for line in curves}) == 4
+    assert [line.get_ydata()[0] for line in position.get_lines()[4:]] == pytest.approx([-5.0] * 4)
+    commands = [line for line in torque.get_lines() if line.get_alpha()]
+    assert [line.get_color() for line in commands] == [line.get_color() for line in curves]
+
+
+REFUSED = {  # words, and what is said
+    "a joint that it lacks": (["--joints", "5"], "joints = [5]: must be numbers from 1 to 4"),
+    "a time that it lacks": (["--from", "100"], "must be a part of the recording, which lasts from 0.0 to"),
+    "no such font": (["--figures", "svg", "--font", "Nothing"], "font = 'Nothing': must be the name of a font"),
+    "too wide": (["--figures", "svg", "--width", "900"], "width = 900.0: must be a number from 40 to 400 mm"),
+    "a width of nothing": (["--width", "85"], "--width and --font are those of --figures"),
+}
+
+
+@pytest.mark.usefixtures("without_pictures")
+@pytest.mark.parametrize(("words", "said"), REFUSED.values(), ids=REFUSED)
+def test_a_figure_that_cannot_be_drawn_is_refused(short_bag, tmp_path, words, said, run_tool):
+    ended = run_tool("report", short_bag, "--output", tmp_path, *words)
+    assert ended.code == 2 and said in ended.err
 
 
 @pytest.mark.usefixtures("without_pictures")
@@ -285,7 +327,7 @@ SOURCES = [(("virtual", "stage"), "simulated"), (("socketcan", "can0"), "real"),
 @pytest.mark.parametrize(("bridge", "source"), SOURCES)
 def test_page_rows_figures_and_terminal_say_where_the_numbers_come_from(page_of, tmp_path, bridge, source, monkeypatch):
     stamped = []
-    monkeypatch.setattr(html, "saved", lambda *given: stamped.append(given[-1]) or b"")
+    monkeypatch.setattr(html, "saved", lambda *given: stamped.append(given[2]) or b"")
     report = analyse(made.bag_of(WHOLE, parameters={"/right/can_bridge": BRIDGE.format(*bridge)}))
     text = page_of(report).text
     assert text.index(SAID[source]) < text.index(report.held) and f"source: {source}" in printed(report)

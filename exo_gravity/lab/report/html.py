@@ -7,17 +7,24 @@ palette is that of Okabe and Ito (2008), whose colours can be distinguished with
 
 import base64
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from html import escape
 from io import BytesIO
 from itertools import cycle, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.numbers import one_float
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 DPI = 150
+INCH, WIDTHS = 25.4, (40.0, 400.0)  # mm; of a printed figure
+PRINTED, PAGE = 8.0, 230.0  # points of its letters, and mm of height at most
+ROW, LINE, ENTRY = 36.0, 4.5, 38.0  # mm: height of axes and of a line of the legend, width of a name in that
 JOINT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 MORE_COLOURS = ("#E69F00", "#56B4E9", "#882255", "#44AA99", "#999933")  # of arms with more joints
 INK, FAINT, GRID_LINE = "#222222", "#9AA3AB", "#D5DADF"
@@ -110,8 +117,54 @@ def png_of(figure: "Figure", dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
-def saved(figure: "Figure", path: Path, formats: Iterable[str], stamp: str) -> bytes:
-    """Write a figure as the PNG `path` and, beside it, as PDF or SVG whose text stays text; return the PNG.
+@dataclass(frozen=True)
+class Print:
+    """How figures are written for a paper, at the size at which they are printed. Raises ParameterError."""
+
+    formats: Sequence[str] = ()  #: 'pdf' or 'svg'
+    width: float = 170.0  #: mm
+    font: str = "DejaVu Sans"
+
+    def __post_init__(self) -> None:
+        one_float("width", self.width, *WIDTHS, "mm")
+        if self.formats:
+            from matplotlib.font_manager import findfont
+
+            try:
+                findfont(self.font, fallback_to_default=False)
+            except ValueError:
+                raise ParameterError("font", self.font, "the name of a font that is installed here") from None
+
+    def fit(self, figure: "Figure") -> None:
+        """Give a figure of the page its printed size and letters."""
+        from matplotlib.lines import Line2D
+        from matplotlib.text import Text
+
+        width, height = figure.get_size_inches()
+        tall, parts = (
+            max(height / width * self.width, min(PAGE, ROW * len(figure.axes))),
+            list[Any]((figure, *figure.axes)),
+        )
+        for part in parts:
+            for legend in part.legends if part is figure else filter(None, [part.get_legend()]):
+                handles, names = legend.legend_handles, [text.get_text() for text in legend.get_texts()]
+                legend.remove()
+                columns = max(1, min(len(names), int(self.width / ENTRY)))
+                where = "outside upper center" if part is figure else "lower left"
+                anchor = None if part is figure else (0.0, 1.0)
+                part.legend(handles, names, loc=where, bbox_to_anchor=anchor, ncols=columns, frameon=False)
+                tall += LINE * -(-len(names) // columns)
+        figure.set_size_inches(self.width / INCH, tall / INCH)
+        for text in figure.findobj(Text):
+            text.set(fontsize=PRINTED, fontfamily=self.font)
+        for axis in figure.axes:
+            axis.tick_params(labelsize=PRINTED, labelfontfamily=self.font)
+        for line in figure.findobj(Line2D):
+            line.set_linewidth(0.75 * line.get_linewidth())
+
+
+def saved(figure: "Figure", path: Path, stamp: str, on_paper: Print) -> bytes:
+    """Write a figure as the PNG `path` and, beside it, as it is printed; return the PNG.
 
     stamp: at the lower right, which a picture that is copied elsewhere keeps.
     """
@@ -119,10 +172,30 @@ def saved(figure: "Figure", path: Path, formats: Iterable[str], stamp: str) -> b
 
     figure.text(0.995, 0.004, stamp, ha="right", va="bottom", color=INK, fontsize=9, weight="bold")
     path.write_bytes(png := png_of(figure))
+    if on_paper.formats:
+        on_paper.fit(figure)
     with matplotlib.rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):  # journals accept no Type 3
-        for suffix in formats:
+        for suffix in on_paper.formats:
             figure.savefig(path.with_suffix(f".{suffix}"))
+            if suffix == "svg":
+                _embed(path.with_suffix(".svg"), on_paper.font)
     return png
+
+
+def _embed(svg: Path, font: str) -> None:
+    """Embed in an SVG the letters of the font that it uses."""
+    from fontTools import subset
+    from matplotlib.font_manager import findfont
+
+    text, options = svg.read_text(encoding="utf-8"), subset.Options(flavor="woff")
+    face, buffer = subset.load_font(findfont(font), options), BytesIO()
+    chooser = subset.Subsetter(options)
+    chooser.populate(text=text)
+    chooser.subset(face)
+    subset.save_font(face, buffer, options)
+    data = base64.b64encode(buffer.getvalue()).decode()
+    style = f"<style>@font-face {{ font-family: '{font}'; src: url(data:font/woff;base64,{data}); }}</style>"
+    svg.write_text(text.replace("<defs>", f"<defs>{style}", 1), encoding="utf-8")
 
 
 def picture(png: bytes, caption: str) -> str:

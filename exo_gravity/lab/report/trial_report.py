@@ -6,13 +6,14 @@ The verdict says whether each arm held, and leads with the worst that happened, 
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -21,6 +22,7 @@ from rich.markup import escape as marked
 from exo_gravity.core.compensation.guidance import CAUSE_TIME
 from exo_gravity.core.errors import DataError, ParameterError
 from exo_gravity.core.safety.drive import FaultCode
+from exo_gravity.core.safety.limits import Limits, limits_of
 from exo_gravity.core.vocabulary import NONE, Source
 from exo_gravity.lab.bag.content import BRIDGE, Bag, Event
 from exo_gravity.lab.inputs.arms import recorded_of
@@ -30,6 +32,9 @@ from exo_gravity.lab.source import STATEMENTS, of_all
 from exo_gravity.lab.trial.analysis import MIN_HOLD, HoldCriteria, TrialAnalysis, failures
 from exo_gravity.lab.trial.analysis import analyse as analyse_arm
 from exo_gravity.lab.trial.recording import Recording
+
+if TYPE_CHECKING:
+    from exo_gravity.lab.report.figures import Part
 
 EARLY = 0.2  # s; can_bridge publishes its state every 0.1 s, so a shorter gap to the script's end means nothing
 NEAR = 1.0  # s between a let-down and the fault that caused it
@@ -42,7 +47,8 @@ MAX_EVENTS = 200
 STAMPS = {Source.SIMULATED: "SIMULATED", Source.UNKNOWN: "source unknown", Source.REAL: ""}
 WRITTEN = (".csv", ".png", ".html", ".pdf", ".svg")
 CAPTIONS = {
-    "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; dashes show the command.",
+    "overview": "Positions, velocities and torques over time. Holds are shaded and numbered; thin lines "
+    "show the command, dotted ones the limits.",
     "drift": "Deviation of each joint from the start of each hold, and the drift of each hold with its uncertainty.",
     "wearer": "The wearer's torque at each joint, and their share of the torque that carries their arm, each with its "
     "95 % band. A band that reaches zero: not distinguishable from zero. See docs/wearer_torque.md.",
@@ -254,13 +260,17 @@ def _reservations(bag: Bag) -> Iterator[str]:
 
 
 def write(
-    report: Report, folder: str | Path, formats: Iterable[str] = (), with_time_series: bool = False
+    report: Report,
+    folder: str | Path,
+    on_paper: html.Print | None = None,
+    part: "Part | None" = None,
+    with_time_series: bool = False,
 ) -> list[Path]:
     """Write holds.csv, motions.csv, a PNG of each figure and report.html into `folder`; return the files.
 
-    formats: 'pdf' or 'svg', of each figure beside its PNG.
+    on_paper: how each figure is written beside its PNG. part: what the overview shows.
 
-    Raises DataError if the folder can't be written.
+    Raises DataError if the folder can't be written, ParameterError if a recording has no such part.
     """
     from exo_gravity.lab.report import figures  # not for the rows of many recordings: half of a process's start
 
@@ -274,25 +284,38 @@ def write(
             table.write_time_series(folder / "time_series.csv", report.bag.columns())
         for recording, analysis in report.arms:
             source = report.bag.source(recording.name)
-            drawn = {"overview": figures.overview(recording, analysis)}
+            drawn = {
+                "overview": figures.overview(recording, analysis, part or figures.WHOLE, _limits(report, recording))
+            }
             if any(figures.strayed(analysis)):
                 drawn["drift"] = figures.drift(recording, analysis, report.criteria)
-            if part := report.wearers.get(recording.name):
-                drawn["wearer"] = figures.wearer(recording, part)
+            if shared := report.wearers.get(recording.name):
+                drawn["wearer"] = figures.wearer(recording, shared)
             pictures = []
             for name, figure in drawn.items():
                 path = folder / f"{recording.name.replace('/', '_')}_{name}.png"
-                pictures.append(html.picture(html.saved(figure, path, formats, STAMPS[source]), CAPTIONS[name]))
+                pictures.append(
+                    html.picture(html.saved(figure, path, STAMPS[source], on_paper or html.Print()), CAPTIONS[name])
+                )
             if text := figures.stayed_text(recording, analysis):
                 pictures.append(html.bullets("", [text]))
-            if part:
-                shares = wearer_share.sentence(part, source), wearer_share.joint_sentence(part, recording.joint_names)
+            if shared:
+                names = recording.joint_names
+                shares = wearer_share.sentence(shared, source), wearer_share.joint_sentence(shared, names)
                 pictures.append(html.bullets("Wearer", shares))
             sections += table.arm_section(recording, analysis, pictures)
         (folder / "report.html").write_text(_page(report, sections), encoding="utf-8")
     except OSError as error:
         raise DataError(f"{folder}: cannot write the report there ({error.strerror})") from None
     return sorted(path for path in folder.iterdir() if path.suffix in WRITTEN)
+
+
+def _limits(report: Report, recording: Recording) -> Limits | None:
+    """Return the limits of an arm's joints, None if the recording has none that this version permits."""
+    with suppress(DataError, ParameterError):
+        values = recorded_of(report.bag.parameters, recording.name, BRIDGE)
+        return limits_of(values) if values else None
+    return None
 
 
 def write_empty(folder: Path, name: str, trouble: str) -> None:
