@@ -50,11 +50,6 @@ def arm_of(name: str) -> str:
     return name.rpartition("/")[0].strip("/") or "arm"
 
 
-def is_wanted(topic: str, msgtype: str) -> bool:
-    """Return whether the reader decodes this topic."""
-    return msgtype in (READ.get(topic), READ.get(leaf(topic)))
-
-
 class NodeStatus(NamedTuple):
     """What a node reported on /diagnostics when its level or message changed."""
 

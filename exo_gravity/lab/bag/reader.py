@@ -78,8 +78,6 @@ def read_bag(path: str | Path, every: int = 1) -> Bag:
     recordings = tuple(r for topic in arms if (r := contents.recording(topic, series.pop(topic))))
     if not recordings:
         raise DataError(f"{path}: {'; '.join(contents.problems)}")
-    if contents.losses:
-        contents.notes.append(f"the recorder lost messages: {contents.losses}")
     events, markers = (
         tuple(Event(now, *what) for now, (_, *what) in contents.in_order(found))
         for found in (contents.events, contents.markers)
@@ -119,7 +117,8 @@ class _Few:
             try:
                 self._take(row, TYPES.deserialize_cdr(data, self._msgtype))
             except Exception as error:  # rosbags raises whatever its generated code raises
-                self.damaged, self.problem = self.damaged + 1, f"a message is invalid ({type(error).__name__}: {error})"
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                self.damaged, self.problem = self.damaged + 1, f"a message is invalid ({reason})"
 
 
 def _turning_and_felt(imu: np.ndarray) -> np.ndarray:
@@ -138,24 +137,18 @@ def _turning_and_felt(imu: np.ndarray) -> np.ndarray:
     return np.vstack((vector("angular_velocity"), felt)).T
 
 
-def _pitch_and_roll(tilt: np.ndarray) -> np.ndarray:
-    """Return pitch and roll in rad, (n, 2), of geometry_msgs/Vector3Stamped (n,)."""
-    return np.column_stack((tilt["vector.y"], tilt["vector.x"]))
-
-
 class _Contents:
     """Collects the messages of a recording, topic by topic. every: see `read_bag`."""
 
     def __init__(self, every: int) -> None:
         self.every = every
         self.parameters: dict[str, str] = {}
-        self.losses = ""
         self.session = Session()
         self.events: list[tuple[Any, ...]] = []  # row, text, setting and status of faults and changed parameters
         self.markers: list[tuple[Row, str]] = []  # row and text
         self.sources: dict[str, Source] = {}  # by arm, as the nodes say
         self.trunk = _Samples(content.READ[content.IMU], _turning_and_felt, 6)
-        self.tilt = _Samples(content.TILT_TYPE, _pitch_and_roll, 2)
+        self.tilt = _Samples(content.TILT_TYPE, lambda tilt: np.stack((tilt["vector.y"], tilt["vector.x"]), axis=1), 2)
         self.notes: list[str] = []
         self.problems: list[str] = []
         self.is_partial = False  # whether a part is missing, or an arm was not down at the end
@@ -171,7 +164,7 @@ class _Contents:
     def read(self, storage: Storage) -> None:
         """Add the messages of a recording. Note what the files lack, and which messages are damaged."""
         readers: dict[str, JointArrays | _Samples | _Few] = {content.IMU: self.trunk, content.TILT_TOPIC: self.tilt}
-        for rows in storage.rows(content.is_wanted):
+        for rows in storage.rows(lambda topic, kind: kind in (content.READ.get(topic), content.READ.get(leaf(topic)))):
             for (topic, msgtype), batch in rows.by_topic():
                 if topic not in readers and msgtype == JOINT_STATE:
                     kept = (FIELDS, self.every) if leaf(topic) == STATES else (("effort",), 1)
@@ -225,10 +218,9 @@ class _Contents:
         line = self._line = timeline(max(series, key=lambda one: len(one.ordinal)))
         self.start = min(int(line.of(one)[0].min()) for one in series)
         if line.steps:
-            ends = ((line.end - self.start) / 1e9).tolist()
-            changes = [f"{step / 1e9:+.1f} s at {end:.1f} s" for step, end in zip(line.steps, ends, strict=False)]
-            listed = f"{len(changes)}: {', '.join(changes[:LISTED])}"
-            self.notes.append(f"the recording's clock was set, or it paused; it is divided there: {listed}")
+            changes = zip(line.steps, (line.end - self.start).tolist(), strict=False)
+            listed = [f"{step / 1e9:+.1f} s at {end / 1e9:.1f} s" for step, end in changes][:LISTED]
+            self.notes.append(f"the recording's clock was set, or it paused; it is divided there: {', '.join(listed)}")
 
     def in_order(self, found: Sequence[tuple[Any, ...]]) -> list[tuple[float, Any]]:
         """Return entries that begin with a Row in the order of their times, each with its time in s."""
@@ -261,7 +253,7 @@ class _Contents:
                 name, value = parameter.name, _value(parameter.value)
                 self.events.append((row, f"{message.node}: {name} = {value}", (message.node, name, value)))
         elif topic == content.LOSSES:
-            self.losses = message.data
+            self.notes.append(f"the recorder lost messages: {message.data}")
         elif topic == content.MARKERS:
             self.markers.append((row, message.data))
         elif topic == content.SESSION:

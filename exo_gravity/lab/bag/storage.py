@@ -13,7 +13,7 @@ import sqlite3
 import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
@@ -210,15 +210,16 @@ class Storage:
             return b""
 
     def _sqlite(self, file: Path, wanted: Wanted) -> Iterator[StoredRows]:
-        with tempfile.TemporaryDirectory() as folder, closing(_opened(file, Path(folder))) as database:
+        with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
             try:
+                database = stack.enter_context(closing(_opened(file, Path(folder))))
                 topics = {key: (str(topic), str(kind)) for key, topic, kind in database.execute(TOPICS)}
                 chosen = {key: topic for key, topic in topics.items() if wanted(*topic)}
                 cursor = database.execute(f"{MESSAGES} ({','.join('?' * len(chosen))})", list(chosen))
-            except (sqlite3.Error, UnicodeDecodeError) as error:
+            except (sqlite3.Error, OSError, UnicodeDecodeError) as error:
                 reason = " ".join(str(error).split())  # it may quote several lines of a damaged file
-                log = f"copy {file.name}-wal, too, if there is one"
-                raise DataError(f"{file}: not a rosbag2 database, or damaged ({reason}); {log}") from None
+                way = f"copy {file.name}-wal, too, if there is one, or recover it by `sqlite3 {file.name} .recover`"
+                raise DataError(f"{file}: not a rosbag2 database, or damaged ({reason}): {way}") from None
             self.topics.update(topics.values())
             try:
                 while found := cursor.fetchmany(ROWS):

@@ -121,14 +121,10 @@ class Trunk:
 
     def __init__(self, node: Node, settings: Settings) -> None:
         self._side = settings.side
-        self._tilt = TiltInput(settings.side, settings.tilt_timeout)
+        self.tilt = TiltInput(settings.side, settings.tilt_timeout)
         self._felt_at, self._force, self._rate = -math.inf, ZERO, ZERO  # monotonic s, m/s^2, rad/s
         on_motion = self._on_motion
-        self._subscription = TiltSubscription(node, self._tilt, threading.Lock(), on_motion=on_motion, is_polled=True)
-
-    def apply(self, settings: Settings) -> None:
-        """Use the compensator's new settings."""
-        self._tilt.timeout = settings.tilt_timeout
+        self._subscription = TiltSubscription(node, self.tilt, threading.Lock(), on_motion=on_motion, is_polled=True)
 
     def at(self, now: float) -> tuple[Tilt, Floats3, Tilt] | None:
         """Return the tilt of what the trunk feels as gravity, its angular velocity, and the tilt of gravity alone.
@@ -136,7 +132,7 @@ class Trunk:
         now: monotonic s. The angular velocity is in the arm's base frame, (3,) rad/s. None if none is fresh.
         """
         self._subscription.poll()
-        gravity = None if self._tilt.problem(now) else self._tilt.at(now)
+        gravity = None if self.tilt.problem(now) else self.tilt.at(now)
         if now - self._felt_at < FRESH and FELT.range[0] < math.hypot(*self._force) < FELT.range[1]:
             tilt = Tilt.of_felt(self._side, [-component for component in self._force], STANDARD_GRAVITY)
             return tilt, turning_in_base(self._side, self._rate), gravity or tilt
@@ -246,7 +242,7 @@ class WearerNode(Node):
         with self._lock:
             self._watch.apply(settings)
         if self._trunk:
-            self._trunk.apply(settings)
+            self._trunk.tilt.timeout = settings.tilt_timeout
         self._settings, self._refusal = settings, NO_REASON
 
     def _read(self, values: dict[str, Any]) -> Settings | None:
