@@ -643,7 +643,8 @@ def test_an_arm_is_carried_from_the_first_to_the_last_carrying_state(content, tm
     [
         (["active"] * 20, 1),
         (["active"] * 6 + ["letting down"] * 3, 1),
-        *((["active"] * 4 + [last] * 5, 0) for last in ("disabled", "fault", None)),
+        (["active"] * 4 + [None] * 5, 0),
+        *((["active"] * 8 + [last], 0) for last in ("disabled", "fault")),
     ],
 )
 def test_a_recording_that_ends_before_the_arm_is_down_says_so(content, tmp_path, names, notes):
