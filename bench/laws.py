@@ -18,7 +18,7 @@ from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import load, packaged_config
 from exo_gravity.lab.inputs.references import pinocchio_model, toolbox_robot
 
-from .table import Row, race, range_of
+from .table import Row, race
 
 URDF_ARMS = ("three_joints.yaml", "seven_joints.yaml")
 
@@ -47,8 +47,8 @@ def measure_laws(quick: bool) -> Iterator[Row]:
         ),
         blocks,
     )
-    yield Row("law, one pose: Pinocchio", ours.median * 1e6, pinocchio.median * 1e6, "us", ours.text(1e6))
-    yield Row("law, one pose: Robotics Toolbox", ours.median * 1e6, toolbox.median * 1e6, "us", ours.text(1e6))
+    yield row("law, one pose: Pinocchio", ours, pinocchio)
+    yield row("law, one pose: Robotics Toolbox", ours, toolbox)
 
     def pinocchio_loop() -> None:
         for pose in poses[:LOOP]:
@@ -65,28 +65,19 @@ def measure_laws(quick: bool) -> Iterator[Row]:
         return pin.rneaInParallel(1, pool, columns, still, still)
 
     np.testing.assert_allclose(gravity_torque(arm, poses), compiled_loop().T, atol=1e-12)
-    ours, pinocchio, compiled, toolbox = race(
+    ours, *peers = race(
         ((lambda: gravity_torque(arm, poses), 1), (pinocchio_loop, 1), (compiled_loop, 1), (toolbox_loop, 1)), blocks
     )
-    each, spread = ours.median / POSES * 1e6, ours.text(1e6 / POSES)
-    yield Row("law, 100,000 poses, per pose: Pinocchio in a loop", each, pinocchio.median / LOOP * 1e6, "us", spread)
-    ratios = [one / other for one, other in zip(ours.blocks, compiled.blocks, strict=True)]
-    yield Row(
-        "law, 100,000 poses, per pose: Pinocchio's compiled loop, one thread",
-        each,
-        compiled.median / POSES * 1e6,
-        "us",
-        f"{spread}, x{range_of(ratios)}",
-    )
-    yield Row(
-        "law, 100,000 poses, per pose: Robotics Toolbox in a loop",
-        each,
-        toolbox.median / (LOOP // 100) * 1e6,
-        "us",
-        spread,
-    )
+    names = "Pinocchio in a loop", "Pinocchio's compiled loop, one thread", "Robotics Toolbox in a loop"
+    for name, peer, count in zip(names, peers, (LOOP, POSES, LOOP // 100), strict=True):
+        yield row(f"law, 100,000 poses, per pose: {name}", ours, peer, POSES, count)
     for file in URDF_ARMS:
         yield from _measure_urdf(file, blocks)
+
+
+def row(name: str, ours: list[float], peer: list[float], poses: int = 1, of_peer: int = 1) -> Row:
+    """Return the row of calls that took so many s, and computed so many `poses` each, in us a pose."""
+    return Row.of_values(name, np.multiply(1e6 / poses, ours).tolist(), np.multiply(1e6 / of_peer, peer).tolist(), "us")
 
 
 def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
@@ -109,12 +100,8 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
 
     np.testing.assert_allclose(arm.gain * loop(), arm.torques(poses[:LOOP], upright[:LOOP]), atol=1e-12)
     ours, peer = race(((lambda: arm.torques(poses, upright), 1), (loop, 1)), blocks)
-    ratios = [one / other / POSES * LOOP for one, other in zip(ours.blocks, peer.blocks, strict=True)]
     name = f"law of a URDF with {count} joints"
-    spread = f"{ours.text(1e6 / POSES)}, x{range_of(ratios)}"
-    whole = f"{name}, 100,000 poses, per pose: Pinocchio in a loop"
-    yield Row(whole, ours.median / POSES * 1e6, peer.median / LOOP * 1e6, "us", spread)
-
+    yield row(f"{name}, 100,000 poses, per pose: Pinocchio in a loop", ours, peer, POSES, LOOP)
     theta, still, tilt = poses[0].tolist(), np.zeros(count), Tilt.of("left")
     hold = arm.holding(np.tile(arm.moments, (count, 1)))
     np.testing.assert_allclose(hold(theta, tilt), np.divide(arm.torque(theta, tilt), arm.gain), atol=1e-9)
@@ -127,6 +114,5 @@ def _measure_urdf(file: str, blocks: int) -> Iterator[Row]:
         ),
         blocks,
     )
-    yield Row(f"{name}, one pose: Pinocchio", loop_pose.median * 1e6, peer.median * 1e6, "us", loop_pose.text(1e6))
-    what = f"{name}, one pose, moments of each joint: Pinocchio's regressor"
-    yield Row(what, tour_pose.median * 1e6, regressor.median * 1e6, "us", tour_pose.text(1e6))
+    yield row(f"{name}, one pose: Pinocchio", loop_pose, peer)
+    yield row(f"{name}, one pose, moments of each joint: Pinocchio's regressor", tour_pose, regressor)

@@ -40,25 +40,8 @@ class Row:
         return row if len(ours) == 1 else replace(row, spread=f"{range_of(ours)}, x{range_of(ratios)}")
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Seconds per call in each block of calls."""
-
-    blocks: tuple[float, ...]
-
-    @property
-    def median(self) -> float:
-        """Seconds per call."""
-        return statistics.median(self.blocks)
-
-    def text(self, scale: float) -> str:
-        """Return the interquartile range in units of 1/`scale` s."""
-        low, _, high = statistics.quantiles(self.blocks, n=4)
-        return f"{low * scale:.3g} to {high * scale:.3g}"
-
-
-def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list[Timing]:
-    """Time functions in turns, so that other load on the machine affects all of them alike.
+def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list[list[float]]:
+    """Time functions in turns, so that other load on the machine affects all of them alike; return s a call, each time.
 
     calls: each function, and how often a block calls it.
     """
@@ -69,12 +52,12 @@ def race(calls: Sequence[tuple[Callable[[], object], int]], blocks: int) -> list
             for _ in range(count):
                 call()
             taken.append((time.perf_counter() - begin) / count)
-    return [Timing(tuple(taken)) for taken in times]
+    return times
 
 
 def seconds_in_turns(calls: Sequence[Callable[[], object]], repeats: int) -> list[list[float]]:
     """Return how many s each call took, every time; they take turns."""
-    return [list(timing.blocks) for timing in race([(call, 1) for call in calls], repeats)]
+    return race([(call, 1) for call in calls], repeats)
 
 
 def range_of(values: Sequence[float]) -> str:
