@@ -108,7 +108,9 @@ class SimulatedDevice:
         if self.truth:
             self.truth.synchronise(self._clock)
         steps = int((self._clock - self.time) / STEP + 1e-6)
-        at_once = steps if self.truth is None and steps > 0 and self._steady(steps * STEP) else 1
+        # While no torque changes, MuJoCo can make all steps at once.
+        is_idle = self.truth is None and self.wearer.idle(self.time - self._script_start, steps * STEP)
+        at_once = max(1, steps) if is_idle and all(motor.steady for motor in self.motors) else 1
         for _ in range(0, steps, at_once):
             self._step(self.arm.positions, self.arm.velocities, at_once)
 
@@ -215,11 +217,6 @@ class SimulatedDevice:
         if message is None or frame is None or frame[0] not in self._joints_of_id:
             return None, 0.0
         return frame, max(0.0, time.time() - message.timestamp)
-
-    def _steady(self, duration: float) -> bool:
-        """Return whether no torque changes for `duration` s, so that MuJoCo can make all of its steps at once."""
-        is_idle = self.wearer.idle(self.time - self._script_start, duration)
-        return is_idle and all(motor.steady for motor in self.motors)
 
     def _follow_trunk(self, elapsed: float) -> None:
         """Move the trunk, and load the hand, as the wearer's script says, `elapsed` s after its start."""

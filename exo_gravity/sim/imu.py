@@ -74,8 +74,14 @@ class SimulatedImu:
     def sample(self, state: TrunkState) -> Sample:
         """Return angular velocity (3,) in rad/s and acceleration (3,) in m/s^2, both in the IMU's axes."""
         self._past.append(self._readings(state))
+        # Those `delay` s ago, interpolated; the oldest until that time has passed.
+        back = min(self.config.delay * self.config.rate, len(self._past) - 1.0)
+        whole = int(back)
+        seen = self._past[-1 - whole]
+        if whole < back:
+            seen = seen + (back - whole) * (self._past[-2 - whole] - seen)
         self._bias += self._errors(*self._walk)
-        readings = self._delayed() + self._bias + self._errors(*self._noise)
+        readings = seen + self._bias + self._errors(*self._noise)
         angular_velocity, acceleration = np.clip(readings, -self._range, self._range)
         return angular_velocity, acceleration
 
@@ -86,13 +92,6 @@ class SimulatedImu:
         if self._place.any():
             force += np.cross(spin_up, self._place) + np.cross(turning, np.cross(turning, self._place))
         return np.array((self._imu_from_trunk @ turning, self._imu_from_trunk @ force))
-
-    def _delayed(self) -> np.ndarray:
-        """Return the readings `delay` s ago, interpolated; the oldest until that time has passed."""
-        back = min(self.config.delay * self.config.rate, len(self._past) - 1.0)
-        whole = int(back)
-        newer = self._past[-1 - whole]
-        return newer if whole == back else newer + (back - whole) * (self._past[-2 - whole] - newer)
 
     def _errors(self, gyroscope: float, accelerometer: float) -> np.ndarray:
         return self._random.normal(size=(2, 3)) * ((gyroscope,), (accelerometer,))

@@ -179,12 +179,14 @@ def measure(
         of_joints[:, list(unpowered)] = 0.0
     step, excess = _steps(records, period, motors)
     step, excess = step[since[1:] >= steps_from], excess[since[1:] >= steps_from]
+    reached = [joint for joint in range(records["on"].shape[1]) if joint not in unreached]
+    safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & after
     powered = np.flatnonzero(on.any(axis=1))
     whole = driven(records[after], motors) if after.any() else Driven()
     off_at = powered[-1] + 1 if len(powered) else 0
     dark = np.flatnonzero(after & ~records["on"].any(axis=1))
     return Response(
-        reaction=_reaction(records, since, unreached),
+        reaction=float(since[np.argmax(safe)]) if reached and safe.any() else None,
         top_speed=float(speed.max(initial=0.0)),
         driven=float(gained[records["torque"] * records["velocity"] > 0.0].max(initial=0.0)),
         fastest=int(np.argmax(speed.max(axis=0, initial=0.0))) + 1,
@@ -219,15 +221,6 @@ def _gained_while(records: np.ndarray, is_free: np.ndarray) -> np.ndarray:
     for part in np.split(speed, released)[1:]:
         part -= np.minimum.accumulate(part)
     return speed
-
-
-def _reaction(records: np.ndarray, since: np.ndarray, unreached: Collection[int]) -> float | None:
-    """Return the time in s until the last of the reached motors is off or applies damping."""
-    reached = [joint for joint in range(records["on"].shape[1]) if joint not in unreached]
-    if not reached:
-        return None
-    safe = (~records["on"] | (records["damping"] > 0.0))[:, reached].all(axis=1) & (since >= 0.0)
-    return float(since[np.argmax(safe)]) if safe.any() else None
 
 
 def _steps(records: np.ndarray, period: float, motors: Sequence[MotorSpec]) -> tuple[np.ndarray, np.ndarray]:

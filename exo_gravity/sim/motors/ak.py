@@ -40,6 +40,7 @@ from exo_gravity.sim.motors.firmware import (
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 _FULL_LENGTH = 8  # bytes of a command
+SPECIAL_HEAD = b"\xff" * (_FULL_LENGTH - 1)
 _BUS_VOLTAGE = round(24.0 / 80.0 * 0xFF)  # the last byte of a reply of 7 bytes, 0 to 80 V
 
 
@@ -54,11 +55,6 @@ class Heat:
 
     def __post_init__(self) -> None:
         check_owned(self)
-
-    def next(self, temperature: float, ambient: float, load: float, dt: float) -> float:
-        """Return the temperature in degC after `dt` s under `load`, the torque by the rated one."""
-        goal = ambient + self.rise * load * load
-        return temperature - (temperature - goal) * -math.expm1(-dt / self.time)
 
 
 class SimulatedMotor:
@@ -173,8 +169,8 @@ class SimulatedMotor:
             self.entered = False
             if self.firmware.exit_clears:
                 self._clear_command()
-        elif self._is_special(data):
-            # Most of them do nothing that a bus shows.
+        elif joint.enter and data[:-1] == SPECIAL_HEAD and self.firmware.first_special <= data[-1] < 0xFF:
+            # One that the manual does not name; most of them do nothing that a bus shows.
             if data[-1] == BOOT_LOADER:
                 self.has_left, self.entered = True, False
             self._is_shut_off &= data[-1] != CLEAR_FAULTS
@@ -199,11 +195,6 @@ class SimulatedMotor:
 
     def _clear_command(self) -> None:
         self._command, self._data = _NO_COMMAND, None
-
-    def _is_special(self, data: bytes) -> bool:
-        """Return whether the firmware takes the frame for a special one that the manual does not name."""
-        head = data[:-1] == b"\xff" * (_FULL_LENGTH - 1) and bool(self.joint.enter)
-        return head and self.firmware.first_special <= data[-1] < 0xFF
 
     def _take_command(self, data: bytes) -> bool:
         """Take a command, which switches the motor on if no other frame does; return whether it is one."""
@@ -249,8 +240,8 @@ class SimulatedMotor:
         self._watch(0.0 < self.firmware.timeout < self._age)
         torque = self.torque(position, velocity)
         if self._heat.rise:
-            load = torque / self.joint.spec.rated_torque
-            self.temperature = self._heat.next(self.temperature, self.ambient, load, dt)
+            goal = self.ambient + self._heat.rise * (torque / self.joint.spec.rated_torque) ** 2
+            self.temperature += (self.temperature - goal) * math.expm1(-dt / self._heat.time)
         return -torque if self.is_reversed else torque
 
     def _watch(self, is_lost: bool) -> None:
