@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from exo_gravity.core.errors import ParameterError
+from exo_gravity.core.errors import ExoGravityError, ParameterError
 from exo_gravity.panel.view import OF_SUBJECT, SETTABLE
 
 # What a page may ask for in "do", and the other keys of each request.
@@ -188,6 +188,8 @@ class Control:
             problem = await self._carry_out(request, kind, arm, page)
         except ParameterError as error:
             problem = without_value(error)
+        except ExoGravityError as error:  # a package is missing
+            problem = str(error)
         except OSError as error:
             problem = f"{error.filename}: {error.strerror}"
         return self._answer(page or f"{address} unknown page", text, problem, 409 if problem else 200)
