@@ -131,6 +131,9 @@ setup(
             *(f"{name} = exo_gravity.tools.{name}:main" for name in tools),
         ],
         "exo_gravity.laws": ["anfis = exo_gravity.lab.anfis:law"],
+        "exo_gravity.imu_sources": [
+            f"{chip} = exo_gravity.lab.imu_chips:PolledChip" for chip in ("mpu6050", "icm20948", "lsm6dsox")
+        ],
         "exo_gravity.clients": ["weigh = exo_gravity.lab.weighing:Weigher"],
     },
 )

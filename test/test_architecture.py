@@ -47,7 +47,7 @@ ROOMS = {
         "owned_bus",
         "watchdog",
         "trunk_estimator",
-        "imu_sources",
+        "imu_source",
         "urdf_checks",
         "urdf_model",
         "urdf_arm",

@@ -9,6 +9,7 @@ takes it from there (`param_of`).
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -219,3 +220,31 @@ REAL_TIME_PARAMETERS = (
           fixed=True, expert=True),
 )
 # fmt: on
+
+
+@cache
+def installed(group: str) -> Mapping[str, Any]:
+    """Return the entry points of a group by name, looked up once."""
+    from importlib.metadata import entry_points  # slow to import
+
+    return {entry.name: entry for entry in entry_points(group=group)}
+
+
+def loaded(group: str, name: str, what: str) -> Any:
+    """Return what the entry point `name` leads to. Raises KeyError, ParameterError that says `what` does not load."""
+    entry = installed(group)[name]
+    try:
+        return entry.load()
+    except Exception as error:  # the code of others
+        expected = f"a {what} that can be loaded: {entry.value} of {group} ({error})"
+        raise ParameterError(what, name, expected) from error
+
+
+class OpenChoices(tuple[str, ...]):
+    """The choices of a parameter to which the entry points of `group` add others."""
+
+    group = ""
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether `name` is one of them, or a distribution has it."""
+        return super().__contains__(name) or name in installed(self.group)

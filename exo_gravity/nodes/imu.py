@@ -21,11 +21,12 @@ from sensor_msgs.msg import Imu
 from exo_gravity.core.arm.tilt import SIDES, Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
+from exo_gravity.core.params import loaded
 from exo_gravity.core.trunk.inputs import NOT_REPORTED, check_trunk
-from exo_gravity.core.trunk.params import IMU
+from exo_gravity.core.trunk.params import GROUP, IMU
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, ImuState
 from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
-from exo_gravity.hardware.imu_sources import Reopening, open_source
+from exo_gravity.hardware.imu_source import Reopening
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator, TrunkOrientation
 from exo_gravity.nodes.ros.imu_messages import message_of, sample_of
 from exo_gravity.nodes.ros.messages import ERROR, OK, WARN, Diagnostics, milliseconds, row
@@ -179,8 +180,8 @@ class ImuDevice(PeriodicThread):
         super().__init__(values["source"], self.poll, period)
         self._node, self._callback, self._clock = node, callback, clock
         self._publisher = node.create_publisher(Imu, topic, DEPTH)
-        stamps = node.get_clock()
-        self.reopening = Reopening(lambda: open_source(values, lambda: stamps.now().nanoseconds * 1e-9))
+        stamps, opened = node.get_clock(), loaded(GROUP, values["source"], "source")
+        self.reopening = Reopening(lambda: opened(values, lambda: stamps.now().nanoseconds * 1e-9))
         self._number = 0  # of the last message
         self._lost = 0  # samples, at the last poll
         self.poll()

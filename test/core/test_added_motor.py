@@ -18,11 +18,10 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.compensation.compensator import Compensator
-from exo_gravity.core.compensation.laws import installed
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, compensator_table, settings_of
 from exo_gravity.core.motors.families import others
 from exo_gravity.core.motors.joint_motor import motors_of
-from exo_gravity.core.params import values_of
+from exo_gravity.core.params import installed, values_of
 from exo_gravity.core.safety.limits import CAN_BRIDGE, check_bridge, limits_of
 from exo_gravity.sim.params import SIMULATOR, device_of
 from exo_gravity.sim.rig import Rig

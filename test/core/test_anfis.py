@@ -17,7 +17,7 @@ from exo_gravity.core.compensation import laws
 from exo_gravity.core.compensation.compensator import FALLBACK_TIME, Compensator
 from exo_gravity.core.compensation.settings import COMPENSATOR, Settings, settings_of
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import values_of
+from exo_gravity.core.params import installed, values_of
 from exo_gravity.core.safety.guidance import GUIDANCE
 from exo_gravity.lab.anfis import Anfis, AnfisLaw, grades, text_of
 
@@ -207,8 +207,9 @@ class Springs:
 def other_laws(monkeypatch):
     """Another distribution has the law `springs`, and one that is not there."""
     entries = {"springs": f"{__name__}:Springs", "gone": "gone:law"}
-    others = {name: EntryPoint(name, value, laws.GROUP) for name, value in entries.items()} | laws.installed(laws.GROUP)
-    monkeypatch.setattr(laws, "installed", lambda _group: others)
+    others = {name: EntryPoint(name, value, laws.GROUP) for name, value in entries.items()} | installed(laws.GROUP)
+    for module in ("compensation.laws", "params"):
+        monkeypatch.setattr(f"exo_gravity.core.{module}.installed", lambda _group: others)
 
 
 def held(compensator, start, theta, seconds):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.trunk.params import IMU_SOURCES
-from exo_gravity.hardware.imu_sources import SOURCES, ImuSource
+from exo_gravity.core.trunk.params import GROUP
+from exo_gravity.hardware.imu_source import ImuSource
 from exo_gravity.hardware.network import keep_to_this_machine
 from exo_gravity.hardware.trunk_estimator import ImuSample, TrunkEstimator
 from exo_gravity.nodes.imu import ImuNode
@@ -128,7 +129,7 @@ def imu(make_imu) -> ImuRig:
 
 
 def test_the_node_publishes_the_tilt_of_a_chip_that_it_reads_itself_and_reports_its_absence(make_imu, monkeypatch):
-    """How a device is opened again: hardware/test_imu_sources.py."""
+    """How a device is opened again: lab/test_imu_chips.py."""
     chip, roll = FAKES["mpu6050"](time.time), math.radians(20.0)
     bus = FakeI2c(chip)
     chip.acceleration = lambda _: (0.0, math.sin(roll), math.cos(roll))
@@ -161,9 +162,9 @@ class LevelImu(ImuSource):
 
 
 def test_a_new_source_is_opened_by_its_name_and_its_samples_reach_the_node_and_its_topic(make_imu, monkeypatch):
-    assert set(IMU_SOURCES) == {"topic", *SOURCES}
-    monkeypatch.setitem(SOURCES, "mpu6050", LevelImu)
-    imu, raw = make_imu("source:=mpu6050", "rate:=100.0", LEVEL), []
+    entry = EntryPoint("level", f"{__name__}:LevelImu", GROUP)
+    monkeypatch.setattr("exo_gravity.core.params.installed", lambda _group: {"level": entry})
+    imu, raw = make_imu("source:=level", "rate:=100.0", LEVEL), []
     imu.user.create_subscription(Imu, "/imu/data_raw", raw.append, 50)
     imu.wait_until(lambda: raw and imu.received > 2)
     assert raw[-1].linear_acceleration.z == pytest.approx(9.81)

@@ -169,9 +169,9 @@ class Compensator:
             change.stop()
             dt, self._effort = 0.0, torque
         elif before or bool(self._fallback) != was_replaced or (client and client.is_over):
-            change.begin(before, self._torque, needs, torque)
+            change.set_out(before, self._torque, needs, torque)
         if not change.is_over:
-            torque = change.step(dt, velocity, needs, torque)
+            torque = change.follow(dt, velocity, needs, torque)
         self._torque, self._last_time = torque, now
         most = s.max_effort_rate * min(dt, LONGEST_STEP)
         self._effort = tuple([limited(wanted, last, most) for wanted, last in zip(torque, self._effort, strict=True)])

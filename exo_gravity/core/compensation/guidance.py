@@ -58,7 +58,7 @@ Load = TypeVar("Load")
 Needs = Callable[[Load], Torque]  # returns the torque (n,) in Nm that a load needs in the present pose
 
 
-class GuidedChange(Generic[Load]):
+class GuidedChange(GuidedMotion, Generic[Load]):
     """The way of each of `count` joints to the new load from one before it.
 
     A change may follow another before that is done. What a joint has then lies between two loads, so it is on the way
@@ -69,29 +69,19 @@ class GuidedChange(Generic[Load]):
     remainder: (n,) Nm that the torque still has to go.
     """
 
-    def __init__(self, count: int) -> None:
-        self._zeros: Torque = (0.0,) * count
-        self._motion = GuidedMotion(count)
-        self.stop()
-
     def stop(self) -> None:
         """Forget the change: the next torque is the new load's."""
-        self._origins: list[Load | None] = [None] * len(self._zeros)  # None where the new load is the origin, too
-        self._offset = self.remainder = self._zeros
+        super().stop()
+        self._origins: list[Load | None] = [None] * len(self.shares)  # None where the new load is the origin, too
+        self._offset = self.remainder = self._zeros = (0.0,) * len(self.shares)
         self._largest = 0.0  # Nm between the old torque and the new one in this pose
-        self._motion.stop()
-
-    @property
-    def is_over(self) -> bool:
-        """Whether no change is under way."""
-        return self._motion.is_over
 
     @property
     def is_large(self) -> bool:
         """Whether the motors are to damp the joints meanwhile."""
         return not self.is_over and self._largest > LARGE
 
-    def begin(self, carried: Load | None, torque: Torque, needs: Needs[Load], after: Torque) -> None:
+    def set_out(self, carried: Load | None, torque: Torque, needs: Needs[Load], after: Torque) -> None:
         """Begin at the present `torque` the way to `after`, both (n,) Nm in this pose.
 
         carried: what was the new load until now; None where it explains nothing.
@@ -107,16 +97,16 @@ class GuidedChange(Generic[Load]):
             return
         origins, self._offset, shares = zip(*joints, strict=True)
         self._origins = list(origins)
-        self._motion.begin(shares)
+        self.begin(shares)
 
-    def step(self, dt: float, velocity: Sequence[float] | None, needs: Needs[Load], after: Torque) -> Torque:
+    def follow(self, dt: float, velocity: Sequence[float] | None, needs: Needs[Load], after: Torque) -> Torque:
         """Return the torque (n,) in Nm after `dt` s more.
 
         velocity: (n,) rad/s, None if not known.
-        needs, after: as in `begin`, in the present pose.
+        needs, after: as in `set_out`, in the present pose.
         """
         before = _torques(self._origins, self._offset, needs, after)
-        torque = self._motion.step(dt, velocity, before, after)
+        torque = self.step(dt, velocity, before, after)
         self._largest = max([abs(old - new) for old, new in zip(before, after, strict=True)])
         self.remainder = tuple([now - new for now, new in zip(torque, after, strict=True)])
         return torque

@@ -10,16 +10,15 @@ compensator does it at its start (`installed`), so that no change of law holds u
 in the same way (terms/terms.py).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Protocol
+from typing import Protocol
 
 from exo_gravity.core.arm.interface import Arm
 from exo_gravity.core.arm.paper import ArmModel, mobile_torque, static_torque
 from exo_gravity.core.arm.tilt import Tilt
-from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Torque
+from exo_gravity.core.params import installed, loaded
 
 GROUP = "exo_gravity.laws"
 URDF_LAW = "urdf"  # the exact law of an arm from a URDF
@@ -100,24 +99,6 @@ class Laws(dict[str, Maker]):
     def __contains__(self, name: object) -> bool:
         """Return whether the law `name` is known, or a distribution has it."""
         return super().__contains__(name) or name in installed(GROUP)
-
-
-@cache
-def installed(group: str) -> Mapping[str, Any]:
-    """Return the entry points of a group by name, looked up once."""
-    from importlib.metadata import entry_points  # slow to import
-
-    return {entry.name: entry for entry in entry_points(group=group)}
-
-
-def loaded(group: str, name: str, what: str) -> Any:
-    """Return what the entry point `name` leads to. Raises KeyError, ParameterError that says `what` does not load."""
-    entry = installed(group)[name]
-    try:
-        return entry.load()
-    except Exception as error:  # the code of others
-        expected = f"a {what} that can be loaded: {entry.value} of {group} ({error})"
-        raise ParameterError(what, name, expected) from error
 
 
 LAWS = Laws(

@@ -32,7 +32,7 @@ from exo_gravity.core.arm.wearer import (
     Wearer,
     load_by_moments,
 )
-from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law, installed, loaded
+from exo_gravity.core.compensation.laws import LAWS, URDF_LAW, ExactLaw, Law
 from exo_gravity.core.compensation.terms.terms import GROUP, TermSettings, term_parameters, term_settings_of
 from exo_gravity.core.errors import DataError, ParameterError, named
 from exo_gravity.core.numbers import JOINT_COUNT, MAX_JOINTS, Torque, Vector, floats, for_joints
@@ -41,7 +41,9 @@ from exo_gravity.core.params import (
     REAL_TIME_PARAMETERS,
     Param,
     check_owned,
+    installed,
     joint_count,
+    loaded,
     owned,
     param_of,
     params_of,

@@ -1,14 +1,22 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The parameters of `imu`."""
 
-from exo_gravity.core.params import Param
+from exo_gravity.core.params import OpenChoices, Param
 from exo_gravity.core.trunk import checks
 
+GROUP = "exo_gravity.imu_sources"
+
+
+class ImuSources(OpenChoices):
+    """A driver's topic, and what the node `imu` reads itself."""
+
+    group = GROUP
+
+
 # fmt: off
-IMU_SOURCES = ("topic", "mpu6050", "icm20948", "lsm6dsox")
 IMU = (
     Param("source", "topic", "a driver's topic, or a chip on I2C", fixed=True,
-          choices=IMU_SOURCES),
+          choices=ImuSources(("topic", "mpu6050", "icm20948", "lsm6dsox"))),
     Param("input_topic", "/imu/data_raw", "the driver's topic, a sensor_msgs/Imu", fixed=True),
     Param("i2c.bus", 1, "number n of the bus /dev/i2c-n", (0, 255), fixed=True),
     Param("i2c.address", 0, "address of the chip; 0: the usual one of its boards", (0, 0x77), fixed=True),

@@ -19,10 +19,10 @@ from exo_gravity.core.arm.tilt import SIDES
 from exo_gravity.core.compensation import settings
 from exo_gravity.core.compensation.compensator import Compensation, Compensator
 from exo_gravity.core.compensation.guidance import CommandFade
-from exo_gravity.core.compensation.laws import GROUP, URDF_LAW, installed
+from exo_gravity.core.compensation.laws import GROUP, URDF_LAW
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.errors import ParameterError
-from exo_gravity.core.params import Param
+from exo_gravity.core.params import Param, installed
 from exo_gravity.core.trunk.inputs import TILT
 from exo_gravity.core.vocabulary import NONE, UNKNOWN, CompensatorWarning, words
 from exo_gravity.hardware.model_file import read_model

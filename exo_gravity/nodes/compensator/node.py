@@ -21,12 +21,12 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from exo_gravity.core.compensation.compensator import CLIENTS, Compensation, Compensator
-from exo_gravity.core.compensation.laws import installed, loaded
 from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.compensation.support import TOPIC as SUPPORT_REQUEST
 from exo_gravity.core.compensation.terms.terms import Terms
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Rate
+from exo_gravity.core.params import installed, loaded
 from exo_gravity.core.vocabulary import NO_REASON, NONE, CompensatorState, Reason, Withdrawal, words
 from exo_gravity.hardware.clock import request_real_time
 from exo_gravity.nodes.compensator.arm import (

@@ -1,5 +1,10 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
-"""An open IMU, and one that is opened again after it was unplugged."""
+"""An IMU that the node `imu` reads itself, and one that is opened again after it was unplugged.
+
+An entry point of the group GROUP (core/trunk/params.py) names what opens it, given the parameters' values and the clock
+of the stamps; its name is that of the parameter `source`. It raises DeviceError, and ParameterError if a value does not
+suit the device. Ours are chips (lab/imu_chips.py).
+"""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,7 +19,7 @@ Axes = tuple[float, float, float]
 
 
 class ImuSource(ABC):
-    """An open IMU. A new kind needs `read`, `close`, and a line in `SOURCES`."""
+    """An open IMU. A new kind needs `read`, `close`, and an entry point."""
 
     lost = 0  #: samples known to be lost since the device was opened
     loss = ""  #: why the last of them were

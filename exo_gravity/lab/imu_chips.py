@@ -14,7 +14,7 @@ from typing import Any
 
 from exo_gravity.core.errors import DeviceError, ParameterError
 from exo_gravity.core.trunk.checks import ImuSample
-from exo_gravity.hardware.imu_sources.source import ImuSource, StampClock
+from exo_gravity.hardware.imu_source import ImuSource, StampClock
 
 
 @dataclass(frozen=True)

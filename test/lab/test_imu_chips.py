@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from exo_gravity.core.errors import DeviceError, ParameterError
-from exo_gravity.hardware.imu_sources import Reopening, open_source
+from exo_gravity.hardware.imu_source import Reopening
+from exo_gravity.lab.imu_chips import PolledChip
 
 from ..support.fake_chips import FAKES, FakeI2c, FakeTime, G
 
@@ -32,7 +33,7 @@ class ChipRig:
         self.attempts += 1
         self.time.wait(self.opening_time)
         self.bus.is_open = True
-        return open_source(self.values | values, self.time)
+        return PolledChip(self.values | values, self.time)
 
     def read_for(self, duration, read=None, pause=0.005):
         """Return the samples of `duration` s; the thread of the node rests for `pause` s after each call."""
@@ -172,11 +173,11 @@ def test_the_temperature_is_read_where_the_driver_reports_it(rig):
 
 def test_a_missing_bus_is_named():
     with pytest.raises(DeviceError, match=r"^mpu6050 at 0x68 on /dev/i2c-251: cannot be opened: No device found"):
-        open_source({"source": "mpu6050", "rate": 100.0, "i2c.bus": 251, "i2c.address": 0}, FakeTime())
+        PolledChip({"source": "mpu6050", "rate": 100.0, "i2c.bus": 251, "i2c.address": 0}, FakeTime())
 
 
 def test_a_missing_library_is_a_parameter_error_that_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "adafruit_mpu6050", None)
     monkeypatch.setattr("adafruit_extended_bus.ExtendedI2C", lambda number, frequency: None)
     with pytest.raises(ParameterError, match=r"topic, or install the extra imu \(adafruit_mpu6050 is missing\)"):
-        open_source({"source": "mpu6050", "rate": 100.0, "i2c.bus": 1, "i2c.address": 0}, FakeTime())
+        PolledChip({"source": "mpu6050", "rate": 100.0, "i2c.bus": 1, "i2c.address": 0}, FakeTime())
