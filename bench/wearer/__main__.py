@@ -19,7 +19,7 @@ from exo_gravity.core.numbers import COVER
 
 from ..device_study import Row, run_study
 from .devices import draw
-from .study import KINDS, Trial, judge, play
+from .study import KINDS, Trial, play
 
 COVERAGE = (0.92, 0.98)
 SHARE_ERROR = 0.05
@@ -28,7 +28,7 @@ SHARE_ERROR = 0.05
 def judged(seed: int) -> Trial | str:
     """Play and judge one wearer; return the sentence that says why there was no calibration."""
     try:
-        return judge(play(draw(seed)))
+        return play(draw(seed))
     except (DataError, RuntimeError) as error:
         return str(error)
 
@@ -71,7 +71,7 @@ def verdict(found: list[Trial | str]) -> list[Row]:
 
 def cover(trials: Sequence[Trial], kinds: Sequence[int]) -> float:
     """Return the share of times and joints at which the 95 % band covers the truth."""
-    inside = [(np.abs(trial.error) <= COVER * trial.curve.deviation)[np.isin(trial.kind, kinds)] for trial in trials]
+    inside = [(np.abs(trial.error) <= COVER * trial.deviation)[np.isin(trial.kind, kinds)] for trial in trials]
     return float(np.concatenate(inside).mean())
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from exo_gravity.core.compensation.settings import Settings
 from exo_gravity.core.safety.limits import Limits
 from exo_gravity.lab.observer.share import Share, WearerCurve, observed, share_of
 from exo_gravity.lab.trial.offline import ArmSetup, OfflineTrial
-from exo_gravity.lab.trial.recording import Recording
 from exo_gravity.sim import SimulatedImu
 from exo_gravity.sim.imu import ImuConfig
 from exo_gravity.sim.script import TrialScript
@@ -45,36 +44,16 @@ TILT_TIME = 3.0  # s
 KINDS = ("reach", "hold", "rest", "trunk in motion")
 
 
-@dataclass(frozen=True, eq=False)
-class Played:
-    """What one trial left: what was recorded, and what is true.
-
-    trunk: (m, 10), s, angular velocity in rad/s, felt gravity in g and gravity's direction as measured, in the trunk's
-    axes. elapsed, torque, weight: every 1 ms from the wearer's start, s, and (k, 4) Nm of their muscles and that carry
-    their arm. trouble: '' if the arm was carried to the end.
-    """
-
-    worn: Worn
-    recording: Recording
-    trunk: np.ndarray
-    elapsed: np.ndarray
-    torque: np.ndarray
-    weight: np.ndarray
-    trouble: str
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
+class Trial(NamedTuple):
     """What one trial showed, at n times.
 
-    error: Nm, estimate minus truth, (n, 4). kind: (n,) index in KINDS. share, true_share: over the trial. parts: of
-    lifting, resting and tiring alike: (found, true).
+    error: Nm, estimate minus truth, and its standard deviation, (n, 4) each. kind: (n,) index in KINDS. share,
+    true_share: over the trial. parts: of lifting, resting and tiring alike: (found, true). trouble: '' if the arm was
+    carried to the end.
     """
 
-    seed: int
-    curve: WearerCurve
-    truth: WearerCurve
     error: np.ndarray
+    deviation: np.ndarray
     kind: np.ndarray
     share: Share
     true_share: float
@@ -111,7 +90,7 @@ class WornImu:
         # Of gravity in the trunk's axes; `mounting` is in the base frame.
         x, y, z = worn.mounting
         self._mounting, self._drift = np.array((y, x, z)), np.zeros(3)
-        self.log: list[tuple[float, ...]] = []  # rows of Played.trunk
+        self.log: list[tuple[float, ...]] = []  # s, angular velocity in rad/s, felt gravity in g, gravity
 
     def __call__(self, now: float, state: TrunkState) -> TrunkReading:
         """Return the reading."""
@@ -135,8 +114,8 @@ def phases_of(seed: int) -> tuple[Phase, ...]:
     return (*lifts, *rests, *tires)
 
 
-def play(worn: Worn) -> Played:
-    """Play the trial of `worn`."""
+def play(worn: Worn) -> Trial:
+    """Play the trial of `worn`, and return what the estimates make of it, and how far they are off."""
     phases, device, imu = phases_of(worn.seed), worn.device(), WornImu(worn)
     ends = np.cumsum([phase.move + phase.hold for phase in phases])
     script = TrialScript.parse({"name": "wearer", "steps": list(TRUNK)})
@@ -150,37 +129,31 @@ def play(worn: Worn) -> Played:
     setup = ArmSetup(worn.side, device, worn.motors, limits, compensator.own, RATE, imu)
     trial = OfflineTrial(setup, script, DELAY, compensator, wearer)
     recording = trial.run()
+    # Every 1 ms from the wearer's start: s, and Nm of their muscles, and that carry their arm.
     elapsed, torque, weight = (np.array(column) for column in zip(*wearer.log, strict=True))
-    return Played(worn, recording, np.array(imu.log), elapsed, torque, weight, trial.trouble)
-
-
-def judge(played: Played) -> Trial:
-    """Return what the estimates make of a trial, and how far they are off."""
-    worn, recording = played.worn, played.recording
-    phases, start = phases_of(worn.seed), recording.steps[0].start
-    length = sum(phase.move + phase.hold for phase in phases)
-    keep = (recording.time > start + 1.0) & (recording.time < start + length)
+    trunk = np.array(imu.log)
 
     def trunk_at(now: float) -> tuple[Tilt, tuple[float, float, float], Tilt]:
-        row = played.trunk[np.searchsorted(played.trunk[:, 0], now - 0.5 / RATE) - 1, 1:].tolist()  # one cycle late
+        row = trunk[np.searchsorted(trunk[:, 0], now - 0.5 / RATE) - 1, 1:].tolist()  # one cycle late
         felt, gravity = Tilt.of_felt(worn.side, row[3:6]), Tilt.of_gravity(worn.side, row[6:])
         return felt, turning_in_base(worn.side, row[:3]), gravity
 
     joints = (recording.position, recording.velocity, recording.effort)
     whole = observed(worn.settings, recording.time, joints, trunk_at)
-    index = np.searchsorted(played.elapsed, recording.time[keep] - start).clip(max=len(played.elapsed) - 1)
-    curve = only(whole, keep)
+    since = recording.time - recording.steps[0].start
+    keep = (since > 1.0) & (since < ends[-1])
+    curve, since = only(whole, keep), since[keep]
+    index = np.searchsorted(elapsed, since).clip(max=len(elapsed) - 1)
     exact = np.zeros_like(curve.torque)
-    truth = WearerCurve(curve.time, played.torque[index], exact, played.weight[index], exact)
-    error = curve.torque - truth.torque
-    at = [phase_at(phases, now) for now in (curve.time - start).tolist()]
-    kind = np.array([_kind(phases[n], since) for n, since in at])
-    kind[_trunk_moves(curve.time - start)] = KINDS.index("trunk in motion")
+    truth = WearerCurve(curve.time, torque[index], exact, weight[index], exact)
+    at = [phase_at(phases, now) for now in since.tolist()]
+    kind = np.array([_kind(phases[n], passed) for n, passed in at])
+    kind[_trunk_moves(since)] = KINDS.index("trunk in motion")
     part = np.searchsorted((3, 5), [n for n, _ in at], side="right")
     parts = tuple((share_of(only(curve, part == n)), float(share_of(only(truth, part == n)).value)) for n in range(3))
-    return Trial(
-        worn.seed, curve, truth, error, kind, share_of(curve), float(share_of(truth).value), parts, played.trouble
-    )
+    true_share = float(share_of(truth).value)
+    error = curve.torque - truth.torque
+    return Trial(error, curve.deviation, kind, share_of(curve), true_share, parts, trial.trouble)
 
 
 def _kind(phase: Phase, since: float) -> int:
