@@ -40,7 +40,6 @@ from exo_gravity.sim.motors.firmware import (
 
 _NO_COMMAND = MotorCommand(0.0, 0.0, 0.0, 0.0, 0.0)
 _FULL_LENGTH = 8  # bytes of a command
-SPECIAL_HEAD = b"\xff" * (_FULL_LENGTH - 1)
 _BUS_VOLTAGE = round(24.0 / 80.0 * 0xFF)  # the last byte of a reply of 7 bytes, 0 to 80 V
 
 
@@ -169,7 +168,7 @@ class SimulatedMotor:
             self.entered = False
             if self.firmware.exit_clears:
                 self._clear_command()
-        elif joint.enter and data[:-1] == SPECIAL_HEAD and self.firmware.first_special <= data[-1] < 0xFF:
+        elif joint.enter and data[:-1] == b"\xff" * 7 and self.firmware.first_special <= data[-1] < 0xFF:
             # One that the manual does not name; most of them do nothing that a bus shows.
             if data[-1] == BOOT_LOADER:
                 self.has_left, self.entered = True, False
