@@ -7,6 +7,7 @@ import struct
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from exo_gravity.core.errors import ParameterError
@@ -101,6 +102,18 @@ def test_a_reply_is_in_motor_coordinates_and_its_zero_is_where_set_zero_found_th
     play(motor, SET_ZERO, position=0.3)
     for position, replied in ((0.3, 0.0), (0.5, -0.2)):
         assert reply_to(motor, ZERO, position, now=2.0).position == pytest.approx(replied, abs=2e-4)
+
+
+def test_replied_torques_are_noisy_and_readings_beyond_the_range_of_a_reply_are_clamped():
+    motor = motor_of(changes={"current_noise": 0.02})
+    play(motor, ENTER)
+    replied = [reply_to(motor, command(5.0)).torque for _ in range(500)]
+    assert np.std(replied) == pytest.approx(0.1, rel=0.2) and np.mean(replied) == pytest.approx(5.0, abs=0.02)
+    assert motor.torque(0.0, 0.0) == pytest.approx(5.0, abs=TORQUE_CODE / 2)
+    motor.temperature = 300.0
+    reply = reply_to(motor, ZERO, position=-20.0, velocity=90.0)
+    assert (reply.position, reply.temperature) == (-SPEC.position_range, 215)
+    assert reply.velocity == pytest.approx(SPEC.velocity_range)
 
 
 def test_an_unplugged_motor_neither_replies_nor_gives_torque_and_comes_back_with_its_zero_alone():

@@ -75,6 +75,12 @@ def test_walking_accelerates_the_trunk_as_much_as_measured_and_goes_nowhere_but_
     np.testing.assert_allclose(orientation(bent) @ bent.acceleration, there, atol=1e-9)
 
 
+def test_the_shock_of_sitting_down_stops_the_fall():
+    up = np.array([SitDown((0.0, 0.0)).at(t).acceleration[2] for t in np.arange(0.0, 1.0, 1e-3)])
+    speed = np.cumsum(up) * 1e-3
+    assert (speed.min(), speed[-1], up.max()) == pytest.approx((-0.8, 0.0, 1.28 * G), abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("step", "motion"),
     [

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -95,22 +96,41 @@ def test_springs_of_a_wearer_on_an_arm_of_five_joints_from_a_urdf():
         replace(settings, tissue=Springs((1.0,) * 4, (0.0,) * 4))
 
 
-def test_moments_in_place_of_masses_and_what_is_impossible_is_refused():
-    given = {"wearer.first_moment": list(ALONG), "wearer.off_axis": list(ACROSS)}
-    values = values_of(COMPENSATOR, {"mode": "zero_g", "support": 1.0, **given})
-    alone = settings_of(values)
+GIVEN = {"wearer.first_moment": list(ALONG), "wearer.off_axis": list(ACROSS)}
+VALUES = values_of(COMPENSATOR, {"mode": "zero_g", "support": 1.0, **GIVEN})
+
+
+def test_moments_stand_in_place_of_masses():
+    alone, tabled = settings_of(VALUES), settings_of({**VALUES, "wearer.body_mass": 75.0})
     assert alone.arm.first_moment == pytest.approx(np.add(alone.robot.first_moment, ALONG))
     assert sum(alone.wearer_mass) == pytest.approx(3.6, rel=0.3)  # for the inertia
-    tabled = settings_of({**values, "wearer.body_mass": 75.0})
     mass, _ = Wearer(75.0).on_links(tabled.robot.length)
     assert tabled.arm == alone.arm and tuple(tabled.wearer_mass) == tuple(mass)
-    with pytest.raises(ParameterError, match=r"exact with wearer\.first_moment"):
-        settings_of({**values, "law": "paper_static"})
-    with pytest.raises(ParameterError, match=r"wearer\.first_moment.* at most 10 kg, not 1[0-9]"):
-        settings_of({**values, "wearer.first_moment": [0.2, 0.6, 2.0, 2.0]})
-    for row, wrong in ((0, 4.1), (0, -0.1), (1, 0.6), (1, float("nan"))):
-        with pytest.raises(ParameterError, match=f"wearer.{('first_moment', 'off_axis')[row]}"):
-            replace(SETTINGS, wearer_moments=np.insert(np.zeros((1, 4)), row, (0.0, 0.0, wrong, 0.1), axis=0).tolist())
-    for name, springs in (("stiffness", ((0.0, 0.0, MAX_TISSUE + 0.1, 0.0),)), ("rest", ((1.0,) * 4, (4.0,) * 4))):
-        with pytest.raises(ParameterError, match=f"wearer.joint_{name}"):
-            replace(SETTINGS, tissue=Springs(*springs))
+
+
+REFUSED = {
+    r"exact with wearer\.first_moment": lambda: settings_of({**VALUES, "law": "paper_static"}),
+    r"wearer\.first_moment.* at most 10 kg, not 1[0-9]": lambda: settings_of(
+        {**VALUES, "wearer.first_moment": [0.2, 0.6, 2.0, 2.0]}
+    ),
+    **{
+        f"wearer.{name} = .*{wrong}": lambda row=row, wrong=wrong: replace(
+            SETTINGS,
+            wearer_moments=np.insert(np.zeros((1, 4)), row, (0.0, 0.0, wrong, 0.1), axis=0).tolist(),
+        )
+        for row, name, wrong in (
+            (0, "first_moment", 4.1),
+            (0, "first_moment", -0.1),
+            (1, "off_axis", 0.6),
+            (1, "off_axis", math.nan),
+        )
+    },
+    "wearer.joint_stiffness": lambda: replace(SETTINGS, tissue=Springs((0.0, 0.0, MAX_TISSUE + 0.1, 0.0))),
+    "wearer.joint_rest": lambda: replace(SETTINGS, tissue=Springs((1.0,) * 4, (4.0,) * 4)),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_what_no_wearer_has_is_refused(words):
+    with pytest.raises(ParameterError, match=words):
+        REFUSED[words]()
