@@ -49,10 +49,9 @@ CONFIRMING = (
 )
 # A node that may end alone: the arm does not depend on it, and a full disk must not let the arm down.
 OBSERVERS = ("/recorder", "/robot_model", "/panel", "/wearer")
-# What no arm waits for, and no operator: it imports what it needs when the others have, and while an arm is checked.
-LAST, DELAY = ("/wearer", "/robot_model"), {"EXO_GRAVITY_DELAY": "2.5"}
+# What no arm waits for, and no operator: it imports what it needs after the s in which an arm is checked and taken up.
+LAST, DELAY = ("/wearer", "/robot_model"), {"EXO_GRAVITY_DELAY": "4"}
 ABSOLUTE_TOPICS = ("/imu/data", "/imu/data_raw", "/imu/pitch_yaw")  # those that a namespace must be added to
-LOG_FORMAT = "{severity} {message}"
 
 Stopping = threading.Event
 
@@ -210,7 +209,7 @@ class Launcher:
 
     def _start(self, node: str, variables: Mapping[str, str]) -> tuple[subprocess.Popen[str], threading.Thread]:
         """Start one node with more environment `variables`; return its process and the reader of its log."""
-        log_format = f"{{name}} {LOG_FORMAT}" if node in self._guests else LOG_FORMAT
+        log_format = f"{'{name} ' if node in self._guests else ''}{{severity}} {{message}}"
         environment = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": log_format, **os.environ, **variables}
         process = subprocess.Popen(
             self._commands[node], env=environment, stdin=PIPE, stdout=PIPE, stderr=STDOUT, text=True, errors="replace",
