@@ -104,8 +104,7 @@ def test_a_session_is_recorded_and_reported_an_arm_put_back_and_the_panels_death
     (trial,) = out.glob("P01/*-*-*/long_*")
     bag = read_bag(trial / "bag")
     assert bag.session.subject == "P01" and [marker.text for marker in bag.markers] == ["marker"]
-    report = (trial / "report.html").read_text(encoding="utf-8")
-    assert "stopped by the operator" in report and "Subject: P01" in report
+    assert "stopped by the operator" in (trial / "report.html").read_text(encoding="utf-8")
     assert any("wearer: done" in line for line in nodes.log)
     nodes.process("/panel").kill()
     wait_for_state(page, "unseen")
