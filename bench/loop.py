@@ -100,12 +100,12 @@ def run_loop(kind: str, rate: float, file: str, seconds: float) -> LoopRun:
         while len(log.matching(r"wearer: move \(0")) < len(namespaces):
             time.sleep(0.05)
             if launcher.dead() or time.monotonic() > begin + START_LIMIT:
-                raise RuntimeError(f"the arm was not carried: {log.lines[-10:]}")
+                raise RuntimeError(f"the arm was not carried: {[line for _, line in log.lines[-10:]]}")
         start = min(when for when, _ in log.matching(r": (INFO|WARN) active\b")) - begin if kind in OURS else math.nan
         time.sleep(SETTLING)
         window, cpu = _measure(pids, seconds)
-        if wrong := launcher.dead() or log.matching("letting down"):
-            raise RuntimeError(f"the arm was not carried to the end: {wrong[0]}; {log.lines[-5:]}")
+        if (dead := launcher.dead()) or (let_down := log.matching("letting down")):
+            raise RuntimeError(f"the arm was not carried to the end: {dead[0] if dead else let_down[0][1]}")
         stack.close()
         if any(listener.wait() for listener in listeners):
             raise RuntimeError("the listener lost frames: the machine is too busy to measure anything")
