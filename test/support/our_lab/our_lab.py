@@ -100,5 +100,5 @@ class Push(TermParameters):
     effort: Sequence[float] = owned((0.0,) * JOINT_COUNT, "torque; 0: off", (-3.0, 3.0), "Nm")
 
     def torque(self, _state: TermState) -> tuple[float, ...]:
-        """Return the torque (n,) in Nm."""
+        """Return the constant torques, (n,) in Nm."""
         return tuple(self.effort)
