@@ -281,7 +281,8 @@ class MotorBus:
         if kind != REPLY:
             self.ignored[kind] += 1
             if kind == FOREIGN_COMMAND:
-                for joint in self._commanded(port, can_id):
+                v3 = [joint for joint, own in enumerate(self._ports) if own is port and not self.replies[joint]]
+                for joint in v3 if can_id == BROADCAST_ID else [self._joint_of[can_id]]:
                     self._oppose(joint, bytes(message.data))
             elif kind in (MALFORMED, SERVO, ELSEWHERE):
                 frame = message.arbitration_id, bytes(message.data)
@@ -307,12 +308,6 @@ class MotorBus:
         last, most = self._warmth[joint], WARMING * max(0.0, sample.time - self.samples[joint].time)
         reading = float(sample.temperature or 0.0)
         self._warmth[joint] = reading if last is None else limited(reading, last, most)
-
-    def _commanded(self, port: CanPort, can_id: int) -> list[int]:
-        """Return the joints of the motors that obey a command to this ID."""
-        if can_id != BROADCAST_ID:
-            return [self._joint_of[can_id]]
-        return [joint for joint, own in enumerate(self._ports) if own is port and not self.replies[joint]]
 
     def _follow(self, joint: int, sample: JointSample) -> None:
         """Let the held position of a contested joint follow it slowly, or at once if its motor does not hold it."""

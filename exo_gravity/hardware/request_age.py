@@ -69,21 +69,21 @@ class Requests:
         is_late = now - self._due >= AGE.late
         self._due, self._period = now + period, period
         now = self._run(now)
-        if self._sent:
+        is_quiet = now - self._replied >= AGE.quiet
+        is_short = len(self._open) < AGE.fewest or now - self._open[0] <= AGE.longest
+        if self._sent or (self.late and not is_short):
             self._looks += 1
-            if is_late:
+            if self._sent and is_late:
                 self._sent = []
-            elif self._looks >= AGE.looks and now - self._replied >= AGE.quiet:
-                self._forget()
-            return not self._sent
-        if len(self._open) < AGE.fewest or now - self._open[0] <= AGE.longest:
+                return True
+            if self._looks >= AGE.looks and is_quiet:
+                self._open.clear()
+                self._sent, self.late = [], 0.0
+                return True
+            return False
+        if is_short:
             return True
-        if self.late:
-            self._looks += 1
-            if self._looks >= AGE.looks and now - self._replied >= AGE.quiet:
-                self._forget()
-            return not self._open
-        if is_late or self._asked_in_vain or now - self._replied >= AGE.quiet:
+        if is_late or self._asked_in_vain or is_quiet:
             return True  # nothing is known, or it does not reply: a pause would only make it silent for longer
         self._sent, self._replies, self._looks = list(self._open), [], 0
         return False
@@ -119,7 +119,3 @@ class Requests:
         self._ran += min(self._period + AGE.look, max(0.0, now - self._seen))
         self._seen = now
         return self._ran
-
-    def _forget(self) -> None:
-        self._open.clear()
-        self._sent, self.late = [], 0.0

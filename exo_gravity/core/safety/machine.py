@@ -55,7 +55,7 @@ from exo_gravity.core.safety.start import (
     missing_of_trunk,
     torque_while_hanging,
 )
-from exo_gravity.core.safety.watch import POWER, REST, ArmWatch, Power, PowerChange
+from exo_gravity.core.safety.watch import POWER, ArmWatch, Power, PowerChange
 from exo_gravity.core.vocabulary import NO_REASON, Motors, Reason, Resume, Wait
 
 CARRIED = (State.RAMPING_IN, State.ACTIVE)
@@ -190,10 +190,6 @@ class SafetyMachine:
         self._descent = ArmDescent(now, self._none, (DAMPING,) * len(self._none), self.limits.max_effort)
         self.watch.change_power(PowerChange.PROBED)
 
-    def is_at_rest(self, now: float) -> bool:
-        """Return whether no replying joint has moved for a while."""
-        return now - self.watch.rest.since >= REST.time
-
     def step(self, now: float, joints: Sequence[JointSample], efforts: Efforts) -> Drive:
         """Return what the motors receive in the cycle at `now` s.
 
@@ -312,7 +308,8 @@ class SafetyMachine:
             self._on(StateEvent.PASSED)
         elif self._now - self._since >= patience:
             waited = f"not enabled within {patience:g} s: waited for {self.waiting_for}"
-            self._refuse(Reason(self.waiting_for.word, waited))
+            self.refusal = Reason(self.waiting_for.word, waited)
+            self._on(StateEvent.REFUSED)
 
     def _prove(self, asked: Sequence[float]) -> None:
         """Advance the checks of motors that were just switched on; asked: (n,) Nm."""
@@ -429,10 +426,6 @@ class SafetyMachine:
     @property
     def _all_off(self) -> bool:
         return all(motor.power is Power.OFF for motor in self.watch.joints)
-
-    def _refuse(self, reason: Reason) -> None:
-        self.refusal = reason
-        self._on(StateEvent.REFUSED)
 
     def _latch(self, fault: Fault | None, now: float) -> None:
         if not fault:

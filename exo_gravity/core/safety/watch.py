@@ -116,15 +116,8 @@ class Stall:
     gained: float = 0.3
 
 
-@dataclass(frozen=True)
-class Rest:
-    """What a joint at rest is."""
-
-    turn: float = 0.005  #: rad that it may turn meanwhile
-    time: float = 0.5  #: s without such a turn, after which the arm counts as at rest
-
-
-CONTINUITY, POWER, DELIVERY, STALL, REST = ContinuityLimits(), PowerTuning(), Delivery(), Stall(), Rest()
+CONTINUITY, POWER, DELIVERY, STALL = ContinuityLimits(), PowerTuning(), Delivery(), Stall()
+REST_TURN = 0.005  # rad that a joint at rest may turn
 # Readings after which the angles are no longer continuous.
 BREAKS = frozenset(
     {FaultCode.MOTOR_ERROR, FaultCode.OVER_SPEED, FaultCode.POSITION_JUMP, FaultCode.READINGS_CONTRADICT}
@@ -536,7 +529,7 @@ class ArmWatch:
 class RestTracker:
     """Whether an arm of `count` joints is at rest, judged by position: a damped arm can creep at less than one code.
 
-    since: s, the time since which no replying joint has turned by more than `REST.turn`.
+    since: s, the time since which no replying joint has turned by more than `REST_TURN`.
     """
 
     def __init__(self, count: int) -> None:
@@ -547,7 +540,7 @@ class RestTracker:
         """Take the newest readings at `now` s. silent: (n,) whether the joint's motor does not reply."""
         columns = zip(samples, self._reference, silent, strict=True)
         if any(
-            [not is_silent and not abs(new.position - old.position) <= REST.turn for new, old, is_silent in columns]
+            [not is_silent and not abs(new.position - old.position) <= REST_TURN for new, old, is_silent in columns]
         ):
             self.since, self._reference = now, samples
         if any(silent):  # a silent joint may have moved by the time it replies again
