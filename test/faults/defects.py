@@ -132,11 +132,9 @@ def replies_with_torque(judge: Callable[..., str]) -> Callable[..., str]:
     """Take a reply without torque for none."""
 
     def judge_torque(self: Any, *args: Any) -> str:
-        sample = self.sample
-        self.sample = sample if abs(sample.effort) > 0.1 else sample._replace(time=-math.inf)
-        reason = judge(self, *args)
-        self.sample = sample
-        return reason
+        sample = self.sample if abs(self.sample.effort) > 0.1 else self.sample._replace(time=-math.inf)
+        with patch.object(self, "sample", sample):
+            return judge(self, *args)
 
     return judge_torque
 

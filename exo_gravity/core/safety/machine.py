@@ -263,7 +263,7 @@ class SafetyMachine:
         """Return a drive of motors that may be on, within the barrier."""
         watch, torque = self.watch, tuple(effort)
         bounded = self.shaper.damping(self._dt, watch.samples, watch.silent, torque, tuple(damping), watch.is_late)
-        return Drive(torque, bounded, tuple(send), any([motor.may_be_on for motor in watch.joints]))
+        return Drive(torque, bounded, tuple(send), any(motor.may_be_on for motor in watch.joints))
 
     def _check(self, efforts: Efforts) -> None:
         """Continue to PROVING once all has been well for a while, or trip on a fault that refuses the start.

@@ -539,9 +539,7 @@ class RestTracker:
     def step(self, now: float, samples: Sequence[JointSample], silent: Sequence[bool]) -> None:
         """Take the newest readings at `now` s. silent: (n,) whether the joint's motor does not reply."""
         columns = zip(samples, self._reference, silent, strict=True)
-        if any(
-            [not is_silent and not abs(new.position - old.position) <= REST_TURN for new, old, is_silent in columns]
-        ):
+        if any(not is_silent and not abs(new.position - old.position) <= REST_TURN for new, old, is_silent in columns):
             self.since, self._reference = now, samples
         if any(silent):  # a silent joint may have moved by the time it replies again
             known = zip(self._reference, silent, strict=True)
