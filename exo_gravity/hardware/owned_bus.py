@@ -26,8 +26,8 @@ from exo_gravity.hardware.clock import COMPUTER_CLOCK, Clock
 from exo_gravity.hardware.control_loop import ControlLoop, NoController
 from exo_gravity.hardware.motor_bus import MotorBus
 
-OPEN_PERIOD = 0.05  # s between two attempts to open the bus of an arm that another process has left
-FIRST_REPLIES = 0.05  # s in which its motors must reply to the first commands
+# s between two attempts to open the bus of an arm that another process has left, and for its motors' first replies
+REACH_PERIOD = 0.05
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ def let_down(arm: ArmOnBus, notes: ArmNotes, log: Callable[[str], None], is_want
         if not any(ports):
             if is_wanted():
                 return False
-            notes.clock.sleep(OPEN_PERIOD)
+            notes.clock.sleep(REACH_PERIOD)
     left = [joint for joint in arm.joints if not ports[joint]]
     own = notes.of([joint for joint in arm.joints if ports[joint]])
     drive, clock, is_complete = notes.drive, notes.clock, False
     motors = MotorBus(ports, arm.motors, note=own.note, clock=clock)
     send = [Send.COMMAND if replies else Send.NOTHING for replies in motors.replies]
     first = drive._replace(send=tuple(send), powered=True)
-    end = clock.monotonic() + FIRST_REPLIES
+    end = clock.monotonic() + REACH_PERIOD
     while not is_complete and clock.monotonic() < end:
         try:
             is_complete = motors.exchange(first, clock.monotonic() + arm.period)
