@@ -187,6 +187,11 @@ def test_a_lost_turn_ends_trust_whatever_the_velocity_shows(lag, rate):
     assert set(run.faults) <= {"position_jump", "over_speed"}
 
 
+def test_a_motor_that_replies_again_where_its_velocity_says_has_lost_no_turn():
+    run = Replies(reaching, rate=250.0).run(60)  # at 4 rad/s
+    assert not set(run.run(18, lost=True).run(3).faults) - {"motor_silent"} and run.watch.trusted
+
+
 EFFORT = (0.5, -3.8, 2.0, 1.0)  # Nm
 
 
