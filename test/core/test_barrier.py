@@ -304,10 +304,9 @@ def test_a_torque_on_its_way_from_a_tilt_that_was_overtaken_is_no_fault_for_some
 
 
 def test_a_torque_that_follows_a_bow_and_its_return_is_no_fault() -> None:
-    monitor, upright = MotionMonitor(WATCHED), Tilt.of("left")
+    monitor, bowed = MotionMonitor(WATCHED), gravity_torque(ROBOT, RAISED, Tilt.of("left", 0.8).direction)
     for pitch in (*np.linspace(0.0, 1.4, 50), *np.linspace(1.4, 0.0, 50)):  # the torque is still in the bow
-        monitor.follow(Tilt.of("left", pitch), upright if pitch > 0.1 else None)
-    bowed = gravity_torque(ROBOT, RAISED, Tilt.of("left", 0.8).direction)
+        monitor.follow(Tilt.of("left", pitch), Tilt.of("left") if pitch > 0.1 else None)
     assert not any(monitor.step(PERIOD, samples(RAISED), bowed)[1] for _ in range(200))
 
 

@@ -193,8 +193,7 @@ def test_a_command_that_would_spell_a_special_frame_gets_a_slightly_lower_torque
 
 def test_every_frame_that_some_firmware_takes_for_another_is_special():
     assert all(is_special(data) for data in (*SPECIAL_FRAMES, ENTER, EXIT, SET_ZERO))
-    assert not is_special(b"\xff" * 7 + b"\xed") and not is_special(b"\xff" * 6 + b"\xfe\xfc")
-    assert not is_special(ENTER[1:])
+    assert not any(map(is_special, (b"\xff" * 7 + b"\xed", b"\xff" * 6 + b"\xfe\xfc", ENTER[1:])))
 
 
 @pytest.mark.parametrize(
@@ -237,8 +236,7 @@ def test_an_error_is_named_as_in_the_manuals(board, byte, text):
 
 def test_a_v3_board_is_switched_off_by_a_current_of_0():
     motor = JointMotor(V3_AK60, 5, wire_format=MIT_V3)
-    assert motor.exit == ((EXTENDED | 0x105, bytes(4)),)
-    assert motor.enter == motor.set_zero == ()
+    assert (motor.exit, motor.enter, motor.set_zero) == (((EXTENDED | 0x105, bytes(4)),), (), ())
 
 
 def test_a_motor_keeps_its_wire_format_on_the_way_to_the_watchdog():

@@ -92,7 +92,7 @@ class MotionMonitor:
         overtaken: from which the torque is guided, if the trunk has turned suddenly (`TiltInput.overtaken`).
         """
         gravity, self.trunk_tilt = self._down(tilt), tilt.axis_angle
-        if math.dist(gravity, self._gravity) > MOTION.still or overtaken or self._guided:
+        if overtaken or not math.dist(gravity, self._gravity) <= MOTION.still:
             self._gravity, self._pose = gravity, ()
         if overtaken:
             self._passed = self._passed if self._guided else [self._down(overtaken)]
@@ -118,8 +118,8 @@ class MotionMonitor:
         self._guided = max(0.0, self._guided - dt)
         fastest = max([abs(joint.velocity) for joint in joints])
         pose = [joint.position for joint in joints]
-        if not self._pose or math.dist(pose, self._pose) > MOTION.still:
-            self._pose, self._explained = pose, self.explained(pose)
+        if not self._pose or not math.dist(pose, self._pose) <= MOTION.still:
+            self._pose, self._explained = () if self._guided else pose, self.explained(pose)
         lowest, highest = self._explained
         self._slow = self._slow or list(effort)
         passed: list[float] = []
