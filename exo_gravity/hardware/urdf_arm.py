@@ -36,7 +36,7 @@ from exo_gravity.core.arm.rotation import ZERO, Floats3
 from exo_gravity.core.arm.tilt import Tilt
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import Torque, Vector, floats, one_float
-from exo_gravity.hardware.urdf_checks import checked, unused_efforts
+from exo_gravity.hardware.urdf_checks import carrier_of, checked, unused_efforts
 from exo_gravity.hardware.urdf_model import LEAST_LENGTH, UrdfJoints, UrdfShape
 
 PACKAGE = "package://"
@@ -452,8 +452,8 @@ class UrdfArm(UrdfShape):
         arm.__dict__.update(changes)
         arm._by_mass, (mass, place) = arm._bare.copy(), arm._held.payload
         if mass:
-            hand = arm._by_mass.frames[arm._by_mass.getBodyId(self._hand)]
-            arm._add(hand.parentJoint, mass, hand.placement.act(np.array(place)))
+            joint, at = carrier_of(arm._by_mass, self._hand)
+            arm._add(joint, mass, at.act(np.array(place)))
         for joint, (worn, cog), way in zip(self._joints, arm._held.worn, self.directions, strict=False):
             arm._add(joint, worn, way * cog)
         arm._model = self._shifted(arm._by_mass, np.array(arm._held.moments), "wearer.moment")

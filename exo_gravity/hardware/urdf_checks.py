@@ -94,8 +94,15 @@ def links_of(root: Element, model: Any) -> Iterator[Link]:
         products = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
         inertia = tuple(float(parts.get("inertia", {}).get(own, "0")) for own in products)
         is_drawn = any(link.find(shape) is not None for shape in SHAPES)
-        joint = model.frames[model.getBodyId(name)].parentJoint if model.existBodyName(name) else 0
+        joint = carrier_of(model, name)[0] if model.existBodyName(name) else 0
         yield Link(name, float(mass), tuple(map(float, cog.split())), inertia, is_drawn, joint)
+
+
+def carrier_of(model: Any, body: str) -> tuple[int, Any]:
+    """Return the joint that carries a body of Pinocchio's `model`, by its number, and the body's place on it."""
+    frame = model.frames[model.getBodyId(body)]
+    joint = frame.parentJoint if hasattr(frame, "parentJoint") else frame.parent  # the latter until Pinocchio 3
+    return joint, frame.placement
 
 
 def checked(stage: str, thing: object) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from exo_gravity import pip_install
 from exo_gravity.core.arm.interface import STANDARD_GRAVITY
 from exo_gravity.core.errors import ParameterError
 from exo_gravity.core.numbers import MAX_JOINTS
-from exo_gravity.hardware.urdf_checks import LIMITS, checked, links_of, mimics_of, robot_of
+from exo_gravity.hardware.urdf_checks import LIMITS, carrier_of, checked, links_of, mimics_of, robot_of
 
 TURNING = "JointModelR"  # how Pinocchio's names of revolute and continuous joints begin
 LARGEST = 1e3  # rad or m; a larger limit means that there is none
@@ -350,10 +350,10 @@ class UrdfShape:
     def _ways(self) -> np.ndarray:
         """Return the way (n, 3) in m from each joint to the next one in its chain, or to the hand, in its own frame."""
         model, ways = self._model, np.zeros((len(self._joints), 3))
-        hands = [model.frames[model.getBodyId(self._hand)]] if self._hand else []
+        hands = [carrier_of(model, self._hand)] if self._hand else []
         for way, joint in zip(ways, self._joints, strict=True):
             following = [model.jointPlacements[other] for other in self._joints if model.parents[other] == joint]
-            ends = following if len(following) == 1 else [hand.placement for hand in hands if hand.parentJoint == joint]
+            ends = following if len(following) == 1 else [place for carrier, place in hands if carrier == joint]
             way[:] = sum(end.translation for end in ends)
         return ways
 
