@@ -16,7 +16,7 @@ from exo_gravity.core import vocabulary
 from exo_gravity.core.safety.drive import FaultCode, State
 from exo_gravity.core.safety.start import TRANSIENT_FAULTS
 from exo_gravity.core.vocabulary import NONE, TEXT, Reason, Word
-from exo_gravity.lab import vocabulary as beside
+from exo_gravity.lab import vocabulary as of_lab
 
 from .support.keys import documented, row_of
 
@@ -41,15 +41,15 @@ VOCABULARY: dict[tuple[str, str], Iterable[str]] = {
     ("compensator", "warnings"): vocabulary.CompensatorWarning,
     ("compensator", "support request"): vocabulary.SupportRequested,
     ("compensator", "assist reason"): vocabulary.AssistProblem,
-    ("compensator", "weighing"): beside.WeighingPhase,
-    ("compensator", "weighing trouble"): beside.WeighingTrouble,
-    ("compensator", "weigh refused"): beside.WeighingRefused,
-    ("wearer", "state"): beside.WearerState,
-    ("wearer", "reason"): beside.NoEstimate,
-    ("wearer", "budget"): beside.Budget,
-    ("wearer", "support adapts"): beside.Adapts,
+    ("compensator", "weighing"): of_lab.WeighingPhase,
+    ("compensator", "weighing trouble"): of_lab.WeighingTrouble,
+    ("compensator", "weigh refused"): of_lab.WeighingRefused,
+    ("wearer", "state"): of_lab.WearerState,
+    ("wearer", "reason"): of_lab.NoEstimate,
+    ("wearer", "budget"): of_lab.Budget,
+    ("wearer", "support adapts"): of_lab.Adapts,
     ("imu", "state"): vocabulary.ImuState,
-    ("simulator", "warnings"): beside.SimulatorWarning,
+    ("simulator", "warnings"): of_lab.SimulatorWarning,
 }
 PARAMETERS = {"position_min", "position_max", "use_sim_time"}
 BESIDE = ("simulator", "robot_model", "panel", "calibrator")  # nodes whose states are of one enumeration
@@ -76,8 +76,8 @@ def test_the_page_has_each_word_of_the_code_and_no_other(node: str, key: str) ->
 
 def test_every_word_belongs_to_a_key_and_every_state_of_other_nodes_is_documented() -> None:
     used = {type(word) for words in VOCABULARY.values() for word in words}
-    assert {*Word.__subclasses__()} - used == {beside.NodeState}
-    assert {word for node in BESIDE for word in documented_words(node, "state")} == as_words(beside.NodeState)
+    assert {*Word.__subclasses__()} - used == {of_lab.NodeState}
+    assert {word for node in BESIDE for word in documented_words(node, "state")} == as_words(of_lab.NodeState)
     assert documented()[""]["interface"].words == {str(vocabulary.INTERFACE)}
 
 

@@ -290,7 +290,7 @@ def verdict(arm: ArmBudget, names: str, what: str) -> Iterator[str]:
     elif arm.support:
         yield f"The largest support within rated torque everywhere is {fits:g}."
     skeleton = chain_of(arm.carrying).skeleton()
-    if skeleton is None:  # no single chain, of which the can_bridge judges no efforts
+    if skeleton is None:  # not a single chain: can_bridge cannot judge its efforts
         return
     yield f"For the can_bridge of {names}, if it never carries more; add what assistance and terms may add:"
     rows = {

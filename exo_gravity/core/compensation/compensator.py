@@ -37,7 +37,7 @@ CLIENT_EFFORT = 2.0  # Nm of any joint, that a client may ask for beyond what an
 
 
 class Client(Protocol):
-    """What moves a carried arm a little from beside the path, as a weighing does (lab/weighing.py)."""
+    """Moves a carried arm slightly from outside the path, as a weighing does (lab/weighing.py)."""
 
     @property
     def is_over(self) -> bool:

@@ -4,6 +4,7 @@
 Two states are safe. While nothing is proven (checking, proving), any fault switches the motors off, as soon as their
 push is taken back (3 Nm in 60 ms): the arm hangs, and a motor that damps with the wrong sign would drive it. Once the
 arm is carried, it is lowered under damping.
+
 A fault is latched in `FAULT`, which only the operator leaves, and only to `DISABLED`: that never enables the arm.
 
 Every fault has a code for programs and a sentence for people.

@@ -81,9 +81,9 @@ class MotionMonitor:
         self._moments = [plus(ZERO, way, torque) for way, torque in zip(ways, load, strict=False)]  # Nm
         self._guided = 0.0  # s for which the torque may still be on its way from a tilt before
         self._passed: list[Floats3] = []  # gravity meanwhile: the torque lies between what these need
-        self._gravity = self._down(Tilt.of(SIDES[0]))
+        upright = Tilt.of(SIDES[0])
+        self._gravity, self.trunk_tilt = self._down(upright), upright.axis_angle
         self._pose: Sequence[float] = ()  # rad, for which the range was computed
-        self.follow(Tilt.of(SIDES[0]), None)
         self.reset()
 
     def follow(self, tilt: Tilt, overtaken: Tilt | None) -> None:

@@ -86,7 +86,6 @@ class SafetyMachine:
         self._none, self._commands = (0.0,) * count, (Send.COMMAND,) * count
         #: the last hand on every drive
         self.shaper = Shaper(limits, [motor.peak_damping for motor in motors] or [math.inf] * count)
-        self._replies = [motor.wire_format.replies for motor in motors] or [True] * count
         self.watch = ArmWatch(limits, period, motors)
         self._since = self._calm_since = 0.0
         self._now, self._dt = -math.inf, 0.0  # of the present cycle
@@ -95,7 +94,7 @@ class SafetyMachine:
         self._rise = GuidedMotion(count)  # of the torque, where it begins
         self.pose = PoseQuestion(limits.joint_names)
         self.motion = MotionMonitor(limits)
-        self._switching = SwitchingOn(self._replies)
+        self._switching = SwitchingOn(self.watch.replies)
         self._switch_on = SwitchOnCheck(limits)
         self._signs = SignCheck(limits.joint_names, self._none)
         self._left: Sequence[float] = ()  # Nm, what another process left the motors with
@@ -301,7 +300,7 @@ class SafetyMachine:
                 return
             self.waiting_for = NO_REASON
             largest = 0.0 if watch.trusted else limits.sign_check_torque
-            self._switching, self._attempts = SwitchingOn(self._replies), 0
+            self._switching, self._attempts = SwitchingOn(self.watch.replies), 0
             self._switch_on = SwitchOnCheck(limits)
             self._signs = SignCheck(limits.joint_names, [min(largest, most) for most in limits.max_effort])
             watch.reset_delivery()
@@ -344,7 +343,7 @@ class SafetyMachine:
             pushed, again, damped = self._switch_on.effort, self._switch_on.enter, [True] * len(self._none)
         if any(again):
             self.watch.reset_delivery()
-        boards = zip(again, self._replies, strict=True)
+        boards = zip(again, self.watch.replies, strict=True)
         send = [Send.ENTER if is_missing and replies else Send.COMMAND for is_missing, replies in boards]
         rise = DAMPING_RATE * self._dt
         drive = self._powered(pushed, [min(DAMPING, last + rise) for last in self._sent.damping], send)
@@ -387,7 +386,7 @@ class SafetyMachine:
                 motor.can_reenable = False
                 watch.require_sign_check()
                 descent.rejoin(i)
-                send[i] = Send.ENTER if self._replies[i] else Send.COMMAND
+                send[i] = Send.ENTER if self.watch.replies[i] else Send.COMMAND
         if undelivered:
             watch.reset_delivery()
         return self._powered(*descent.applied, send)

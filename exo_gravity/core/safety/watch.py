@@ -10,7 +10,7 @@ continuous, and that is judged here alone, whichever fault lets the arm down. Th
 - an angle jumps, or a joint turns faster than `max_velocity`: an encoder that slips looks like a joint that is thrown;
 - angle and velocity contradict each other: a wrong `velocity_range` or sign, a frozen angle, a slow slip;
 - a motor reports an error;
-- another part has a reason of its own (`require_sign_check`): a motor found off, a command of another sender.
+- another part calls `require_sign_check`: a motor was found off, or another sender commanded one.
 
 What no reading shows: an encoder that slips by less than `CONTINUITY.jump` at a time while its velocity follows, and a
 motor that repeats one angle with a velocity of 0. The proof of signs, at the next start, finds the second.
@@ -297,10 +297,10 @@ class JointWatch:
             found[FaultCode.MOTOR_ERROR] = f"the motor reports error {sample.error} ({sample.trouble})"
         if sample.temperature is not None and sample.temperature >= HEAT.most:
             found[FaultCode.OVER_TEMPERATURE] = f"{sample.temperature} degC, the limit is {HEAT.most:g}"
-        if abs(sample.velocity) <= fastest:
+        speed = abs(sample.velocity)
+        if speed <= fastest:
             self._slow_at = sample.time
-        is_shock = abs(sample.velocity) <= 1.5 * fastest and sample.time - self._slow_at <= READING.shock
-        if not abs(sample.velocity) <= fastest and not is_shock:
+        elif not (speed <= 1.5 * fastest and sample.time - self._slow_at <= READING.shock):
             found[FaultCode.OVER_SPEED] = f"{sample.velocity:.2f} rad/s, the limit is {fastest:g}"
         turned, silence = sample.position - last.position, sample.time - last.time
         is_jump = abs(turned) > CONTINUITY.jump + fastest * (sample.time - self._asked)
@@ -411,7 +411,8 @@ class ArmWatch:
 
     period: s of the loop.
 
-    joints: of each (n,) what is known. samples: (n,) the newest readings that count. silent: (n,) whether a motor is.
+    joints: of each (n,) what is known. replies: (n,) whether a board replies to commands. samples: (n,) the newest
+    readings that count. silent: (n,) whether a motor is.
     fault: what the newest readings show, or None. is_late: whether a motor has not replied to some commands.
     trusted: whether zeros and signs were proven, and the angles have been continuous since.
     pause_damping: Nm s/rad, after a pause of the loop; it falls to 0.
@@ -421,9 +422,9 @@ class ArmWatch:
 
     def __init__(self, limits: Limits, period: float = 0.0, motors: Sequence[JointMotor] = ()) -> None:
         count = len(limits.joint_names)
-        replies = [motor.wire_format.replies for motor in motors] or [True] * count
+        self.replies = [motor.wire_format.replies for motor in motors] or [True] * count
         peak = [motor.peak_effort for motor in motors] or limits.max_effort
-        self.joints = tuple(JointWatch(limits, i, replies[i], peak[i]) for i in range(count))
+        self.joints = tuple(JointWatch(limits, i, self.replies[i], peak[i]) for i in range(count))
         self.samples: tuple[JointSample, ...] = (UNKNOWN,) * count
         self.silent: Sequence[bool] = (True,) * count
         self.fault: Fault | None = None

@@ -141,10 +141,8 @@ class Print:
         from matplotlib.text import Text
 
         width, height = figure.get_size_inches()
-        tall, parts = (
-            max(height / width * self.width, min(PAGE, ROW * len(figure.axes))),
-            list[Any]((figure, *figure.axes)),
-        )
+        tall = max(height / width * self.width, min(PAGE, ROW * len(figure.axes)))
+        parts: list[Any] = [figure, *figure.axes]
         for part in parts:
             for legend in part.legends if part is figure else filter(None, [part.get_legend()]):
                 handles, names = legend.legend_handles, [text.get_text() for text in legend.get_texts()]
@@ -164,7 +162,7 @@ class Print:
 
 
 def saved(figure: "Figure", path: Path, stamp: str, on_paper: Print) -> bytes:
-    """Write a figure as the PNG `path` and, beside it, as it is printed; return the PNG.
+    """Write a figure to the PNG `path`, and in the formats for print next to it; return the PNG.
 
     stamp: at the lower right, which a picture that is copied elsewhere keeps.
     """

@@ -103,7 +103,7 @@ class CompensatorNode(Node):
         request_real_time(values["thread_priority"], self.get_logger().warning)
 
     def _serve_wearer(self, terms: Terms) -> None:
-        """Add assistance, support on request, and what clients beside the path do, as to weigh."""
+        """Add assistance, support on request, and the services of clients, such as `weigh`."""
         self._assist = terms.assist
         self._assistant, self._requester = Publishers(), Publishers()
         self._threads += [
