@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Support that adapts: what makes it rise, what does not, and how it is forgotten. One joint, in virtual time."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -112,31 +110,3 @@ def test_a_gap_changes_nothing_until_the_request_has_expired_and_nothing_is_aske
     assert arm.adaptation.requested == pytest.approx(expected, abs=0.01)
     arm.settings = replace(arm.settings, **({"support_adapts": False} if is_kept else {"mode": "one_g"}))
     assert arm.move(-0.05, 5.0) == 0.4 and arm.adaptation.requested is None
-
-
-@pytest.mark.parametrize("adapts", [True, False])
-def test_a_wearer_who_tires_is_carried_further_and_without_haste(adapts: bool) -> None:
-    step, damping, inertia, friction = 0.002, 2.0, 0.8, 0.3
-    arm = Arm(support_adapts=adapts)
-    speed, fastest, effort, support, supports = 0.0, 0.0, 0.5 * WEIGHT, 0.4, list[float]()
-    for number in range(round(85.0 / step)):
-        arm.now = step * number
-        weight = WEIGHT * math.sin(arm.angle)
-        most = (0.6 - 0.4 * min(1.0, arm.now / 60.0)) * weight + 0.3  # Nm, that the wearer can give: they tire
-        effort = max(-most, min(most, effort + 25.0 * (1.0 - arm.angle) * step))
-        muscles = max(-most, min(most, 25.0 * (1.0 - arm.angle) + effort)) - damping * speed
-        wanted = arm.adaptation.requested or 0.4
-        support += max(-0.04 * step, min(0.04 * step, wanted - support))
-        free = speed + (muscles + (support - 1.0) * weight) / inertia * step
-        speed = math.copysign(max(0.0, abs(free) - friction / inertia * step), free)
-        arm.angle += speed * step
-        fastest = max(fastest, abs(speed))
-        if number % 5 == 0:
-            arm.sample(round(speed / 0.024) * 0.024, muscles, weight)
-            supports.append(support)
-    assert fastest < 0.3
-    tired = supports[-1500:]
-    if adapts:
-        assert 0.65 < sum(tired) / len(tired) < 0.9 and arm.angle > 0.6
-    else:
-        assert set(supports) == {0.4} and arm.angle < 0.4

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The wearer's torque: the estimate against MuJoCo and known torques, its share of the weight, and contacts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -56,11 +54,11 @@ SOFT = 100.0  # Nm/rad, of elastic joints
 CODE = 0.024  # rad/s of a motor's 12 bits
 
 
-def still(effort, tilt=TILT, settings=SETTINGS, pose=POSE):
-    """Return the estimate of an arm that stands at `pose` under the motors' `effort`."""
+def still(effort, tilt=TILT, settings=SETTINGS, pose=POSE, velocity=STILL):
+    """Return the estimate after a second in which the joints report `pose`, `velocity` and `effort`."""
     observer = MomentumObserver(settings)
     for n in range(100):
-        estimate = observer.update(n * PERIOD, (pose, STILL, effort), tilt)
+        estimate = observer.update(n * PERIOD, (pose, velocity, effort), tilt)
     return estimate
 
 
@@ -233,7 +231,6 @@ def test_the_whole_share_hides_a_joint_that_carries_little_and_its_own_share_sho
     values, _, _ = watched(effort=(needed - (0.0, 0.0, 0.0, own[3])).tolist())  # the wearer carries all of the elbow
     assert float(values["share of the wearer (%)"]) < 5.0
     assert values["elbow share (%)"] == "100" and values["b share (%)"] == "0"
-    assert values["elbow share band (%)"] != "unknown"
     held = curve((0.2,))
     held = held._replace(torque=held.weight * (0.0, 0.1, 0.9, 0.5))
     assert joint_shares(held).value[1:] == pytest.approx((0.1, 0.9, 0.5))
@@ -298,16 +295,10 @@ def test_a_watch_tells_torques_beyond_their_band_the_share_and_nothing_that_is_o
     assert abs(float(carried["b wearer (Nm)"])) < float(carried["b wearer band (Nm)"])
 
 
-def test_a_watch_follows_the_load_and_the_stiffness_of_elastic_joints_in_the_settings():
+def test_a_watch_follows_the_load_in_the_settings():
     loaded = replace(SETTINGS, payload=Payload(1.0))
     needed = gravity_torque(loaded.loaded.with_wearer(LOAD.mass, LOAD.cog), POSE, TILT.direction)
     assert watched(loaded, needed.tolist())[1].torque == pytest.approx(STILL, abs=1e-9)
-    elastic = replace(SETTINGS, joint_stiffness=(150.0,) * 4)
-    held = gravity_torque(WHOLE, POSE, TILT.direction)
-    behind = gravity_torque(WHOLE, np.subtract(POSE, np.divide(held, 150.0)), TILT.direction)
-    estimate = watched(elastic, held.tolist())[1]
-    assert np.abs(held - behind).max() > 0.05
-    assert estimate.torque == pytest.approx(behind - held, abs=1e-9)
 
 
 def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
@@ -315,14 +306,9 @@ def test_friction_that_grows_with_the_torque_is_not_taken_for_the_wearers():
     needed = gravity_torque(WHOLE, POSE, TILT.direction)
     rubbing = np.sign(speed) * (COULOMB + VISCOUS * np.abs(speed))
     effort = (needed + rubbing) / (1.0 - np.sign(speed * needed) * load)  # = g + sign(v) (c + viscous |v| + load |e|)
-    estimates = []
-    for share in (STILL, load):
-        terms = TermSettings(friction=Friction(0.0, COULOMB, VISCOUS, share))
-        observer = MomentumObserver(replace(SETTINGS, terms=terms))
-        for n in range(100):
-            estimate = observer.update(n * PERIOD, (POSE, speed, effort), TILT)
-        estimates.append(np.abs(estimate.torque).max())
-    blind, aware = estimates
+    terms = [TermSettings(friction=Friction(0.0, COULOMB, VISCOUS, share)) for share in (STILL, load)]
+    found = [still(effort, settings=replace(SETTINGS, terms=one), velocity=speed).torque for one in terms]
+    blind, aware = np.abs(found).max(axis=1)
     assert blind > 0.5 and aware < 0.1
 
 
@@ -341,20 +327,18 @@ def touched(torques: list[float], deviation: float = 0.2, gap: float = 0.0) -> C
     return watch
 
 
-def test_a_blow_is_a_contact_once_with_its_time_joint_and_sign() -> None:
-    watch = touched([*REST, *[-4.0] * 100])
-    assert watch.count == 1 and watch.last == (pytest.approx(0.5, abs=0.02), 3, pytest.approx(-3.6, abs=0.4))
-
-
 @pytest.mark.parametrize(
     ("torques", "deviation", "gap", "count"),
     [
+        ([*REST, *[-4.0] * 100], 0.2, 0.0, 1),
         ([*REST, *BLOW, *[0.0] * 250, *REST, *BLOW], 0.2, 0.0, 2),
         (GROWING, 0.2, 0.0, 0),
         ([*REST, *BLOW], 3.0, 0.0, 0),
         ([*REST, 9.0], 0.1, 10.0, 0),
     ],
-    ids=["two blows more than a second apart", "as a person's", "within the band", "after a gap"],
+    ids=["a blow", "two blows more than a second apart", "as a person's", "within the band", "after a gap"],
 )
-def test_only_a_blow_is_a_contact(torques: list[float], deviation: float, gap: float, count: int) -> None:
+def test_only_a_blow_is_a_contact_with_its_time_joint_and_sign(torques, deviation, gap, count) -> None:
     assert touched(torques, deviation, gap).count == count
+    blow = touched([*REST, *[-4.0] * 100]).last
+    assert blow == (pytest.approx(0.5, abs=0.02), 3, pytest.approx(-3.6, abs=0.4))

@@ -28,7 +28,6 @@ class FakeTime:
         return self.now
 
     def wait(self, duration: float) -> None:
-        """Let `duration` s pass."""
         self.now += duration
 
 
@@ -62,7 +61,6 @@ class FakeChip:
         self.registers = defaultdict(int, self._layout.values)
 
     def write(self, register: int, value: int) -> None:
-        """Take a byte."""
         place, (reset, bit) = self.bank << 8 | register, self._layout.reset
         if register == 0x7F:  # of a chip with banks
             self.bank = value >> 4
@@ -72,7 +70,6 @@ class FakeChip:
             self.registers[place] = value
 
     def read(self, register: int) -> int:
-        """Return a byte."""
         return self.registers[self.bank << 8 | register]
 
     def measure(self) -> None:

@@ -194,17 +194,18 @@ def write_bag(
     plugin: StoragePlugin = StoragePlugin.MCAP,
     compression: CompressionMode | None = None,
     topics: Iterable[tuple[str, str]] = (),
+    is_sorted: bool = True,
 ) -> Path:
-    """Write a bag with rosbags, in the order of arrival; return its folder.
+    """Write a bag with rosbags; return its folder.
 
-    topics: topic and type of those that exist even without messages.
+    topics: topic and type of those that exist even without messages. is_sorted: in the order of arrival, not as given.
     """
     writer = Writer(folder, version=9, storage_plugin=plugin)
     if compression:
         writer.set_compression(compression, CompressionFormat.ZSTD)
     with writer:
         connections = {topic: writer.add_connection(topic, kind, typestore=STORE) for topic, kind in topics}
-        for topic, kind, stamp, data in sorted(content, key=lambda entry: entry[2]):
+        for topic, kind, stamp, data in sorted(content, key=lambda entry: entry[2] if is_sorted else 0):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
             writer.write(connections[topic], stamp, data)

@@ -8,11 +8,13 @@ from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 import yaml
 
 from exo_gravity.lab.report import html
+from exo_gravity.tools import budget
 
 from ..support import CONFIG
 
@@ -65,3 +67,4 @@ def params_with(tmp_path: Path) -> Callable[..., Path]:
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures take longest: leave them empty in tests that do not look at them."""
     monkeypatch.setattr(html, "png_of", lambda *_: b"")
+    monkeypatch.setattr(budget, "joint_figure", Mock())

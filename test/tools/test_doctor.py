@@ -27,7 +27,6 @@ LINK = {"linkinfo": {"info_kind": "can", "info_data": {
 
 
 def wakeups(late: int, by: float) -> Wakeups:
-    """10 s at 250 Hz, of which `late` are late by `by` s."""
     return IN_TIME._replace(lateness=np.r_[np.full(2500 - late, 1e-4), np.full(late, by)])
 
 
@@ -36,7 +35,6 @@ def of_computer(root: Path, is_late: bool = False, woken: Wakeups = IN_TIME, pri
 
 
 def tells(root: Path, link: object) -> None:
-    """Have `ip` report this of each interface."""
     (root / "bin/ip").write_text(f"#!/bin/sh\necho '{json.dumps([link])}'\n")
 
 
@@ -169,7 +167,6 @@ def test_an_environment_that_would_end_every_node_is_refused_before_one_starts(
 
 
 def test_multicast_is_needed_by_the_simulated_bus_alone(monkeypatch):
-    assert settings.of_multicast(True).level is Level.FINE
     monkeypatch.setattr(settings, "GROUP", "10.0.0.1")  # no multicast address: refused
     assert settings.of_multicast(True).level is Level.FAULT and settings.of_multicast(False).level is Level.FINE
 
@@ -247,8 +244,7 @@ def test_a_serial_adapter_that_keeps_bytes_is_found_by_its_name(computer):
     assert port.level is Level.WARNING
     assert "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB3/latency_timer" in port.remedy
     (computer / "dev/ttyUSB3").unlink()
-    port = settings.of_port("/dev/serial/by-id/usb-IMU", computer)
-    assert port.level is Level.FAULT and port.found == "no such port"
+    assert settings.of_port("/dev/serial/by-id/usb-IMU", computer).level is Level.FAULT
 
 
 BUS = {"interface": "udp_multicast", "channel": "239.74.163.2"}
@@ -274,10 +270,8 @@ def test_an_interface_that_does_not_open_is_a_fault_with_what_opens_it(run, can,
 def test_a_bus_that_a_bridge_holds_is_left_alone_and_the_last_line_says_that_not_all_was_tried(run):
     options = {"port": next(PORTS), "hop_limit": 0}
     lock = BusLock((BUS["interface"], BUS["channel"], options), "/right/can_bridge (PID 7)")
-    try:
-        code, text = run("sim.yaml", can={**BUS, "options": options})
-    finally:
-        lock.release()
+    code, text = run("sim.yaml", can={**BUS, "options": options})
+    lock.release()
     (row,) = (line for line in text.splitlines() if ": opens" in line)
     assert row.startswith("unknown") and "not tried: held by /right/can_bridge (PID 7)" in row
     assert code == 0 and text.splitlines()[-1] == "Nothing is wrong in what could be tried; unknown: 1"

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Wrong use of each tool ends with exit code 2, and a sentence that names what is wrong in place of a traceback."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -14,6 +12,7 @@ from importlib import import_module, metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -185,10 +184,6 @@ def test_a_full_or_missing_temporary_folder_is_named(monkeypatch, run_tool, tmp_
     assert code == 2 and error.startswith("launcher: TMPDIR = ") and "none': must be a folder with room" in error
 
 
-def raised(error: type[BaseException]) -> int:
-    raise error
-
-
 @pytest.mark.parametrize(("output", "code", "said"), [("pipe", 141, ""), ("/dev/full", 2, "No space left on device")])
 def test_an_output_that_cannot_be_written_ends_with_a_code_and_no_traceback(output, code, said, monkeypatch, capsys):
     if output == "pipe":
@@ -204,7 +199,7 @@ def test_an_output_that_cannot_be_written_ends_with_a_code_and_no_traceback(outp
 
 
 def test_ctrl_c_is_one_line_and_a_terminal_without_a_character_shows_its_code(monkeypatch, capsys):
-    assert exit_code("tool", "report", lambda: raised(KeyboardInterrupt)) == 130
+    assert exit_code("tool", "report", Mock(side_effect=KeyboardInterrupt)) == 130
     assert capsys.readouterr().err == "tool: stopped\n"
     ascii_alone = io.TextIOWrapper(io.BytesIO(), "ascii")
     monkeypatch.setattr(sys, "stdout", ascii_alone)

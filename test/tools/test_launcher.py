@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from unittest.mock import Mock
 
 import pytest
 
@@ -69,25 +70,6 @@ def test_a_node_is_run_from_this_package_whatever_lies_in_the_folders(tmp_path, 
     assert ended.returncode == 2 and "can.interface" in ended.stderr, ended.stderr
 
 
-def node_of(command: Sequence[str]) -> str:
-    return command[command.index("--enclave") + 1]
-
-
-class Process:
-    """A node's process that has printed `log`, and ends when it is terminated."""
-
-    def __init__(self, log: Sequence[str]) -> None:
-        self.stdout, self._code = log, None
-
-    def poll(self, timeout: float = 0.0) -> int | None:
-        return self._code
-
-    wait = poll
-
-    def terminate(self) -> None:
-        self._code = 0
-
-
 @pytest.fixture
 def launched(monkeypatch, run_tool):
     """A function that launches the simulated arm with `words`; it returns the commands by node, and what is printed.
@@ -98,11 +80,15 @@ def launched(monkeypatch, run_tool):
     def launched(*words: str, log: Sequence[str] = ()) -> tuple[dict[str, list[str]], list[str]]:
         commands: dict[str, list[str]] = {}
 
-        def start(command: list[str], env: dict[str, str], **_: object) -> Process:
-            node = node_of(command)
+        def start(command: list[str], env: dict[str, str], **_: object) -> Mock:
+            node = command[command.index("--enclave") + 1]
             commands[node] = command
             assert (node.endswith("/wearer")) == (DELAY.items() <= env.items())  # no arm waits for it
-            return Process(log if node_of(command).endswith("/can_bridge") else ())
+            process = Mock(stdout=log if node.endswith("/can_bridge") else (), **{"poll.return_value": None})
+            process.configure_mock(
+                **{"wait.return_value": 0, "terminate": lambda: process.poll.configure_mock(return_value=0)}
+            )
+            return process
 
         ended = threading.Event()
         ended.set()
@@ -114,11 +100,8 @@ def launched(monkeypatch, run_tool):
     return launched
 
 
-def test_only_a_part_of_the_nodes_is_started(launched):
+def test_a_part_of_the_nodes_is_started_and_a_namespace_remappings_and_a_log_level_reach_every_one(launched):
     assert list(launched("--only", "*/can_bridge", "*/w*")[0]) == ["/right/can_bridge", "/right/wearer"]
-
-
-def test_a_namespace_remappings_and_a_log_level_reach_every_node_and_the_imus_topics(launched):
     remap = "assist_efforts:=mine"
     commands, _ = launched("--namespace", "lab/", "--log-level", "warn", "--remap", remap)
     words = commands["/lab/right/compensator"]
@@ -159,10 +142,6 @@ def test_a_simulation_that_dies_starts_again_three_times_and_a_real_arm_never(mo
 NAMES = ["/recorder", "/imu", "/left/can_bridge", "/left/compensator", "/right/can_bridge"]
 
 
-def test_bridges_stop_first_and_recorders_last():
-    assert stages(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
-
-
 WEARERS = {  # the nodes of a file, and the wearers that start with them
     "both arms": (
         {"/right/compensator": {}, "/left/compensator": {"law": "anfis"}}, ["/right/wearer", "/left/wearer"],
@@ -179,7 +158,8 @@ def test_a_compensator_behind_a_bridge_gets_a_wearer_unless_the_file_has_one(nod
     assert wearers(nodes) == added
 
 
-def test_patterns_are_compared_with_full_names():
+def test_bridges_stop_first_and_recorders_last_and_patterns_are_compared_with_full_names():
+    assert stages(NAMES) == (["/left/can_bridge", "/right/can_bridge"], ["/imu", "/left/compensator"], ["/recorder"])
     assert chosen(NAMES, ()) == NAMES
     assert chosen(NAMES, ("/left/*",)) == ["/left/can_bridge", "/left/compensator"]
     assert chosen(NAMES, ("*/can_bridge", "/imu")) == ["/imu", "/left/can_bridge", "/right/can_bridge"]

@@ -4,8 +4,6 @@
 And its screen: what a person reads, how the clock or the virtual wearer leads, and why a trial ends early.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json
@@ -31,9 +29,9 @@ from exo_gravity.core.errors import ParameterError
 from exo_gravity.lab import processes
 from exo_gravity.lab.report import video as clips
 from exo_gravity.lab.trial import run as running
-from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen, describe
+from exo_gravity.lab.trial.screen import BRIDGE_TIMEOUT, LEAD, TrialScreen
 from exo_gravity.lab.trial.scripted import analysed, read_script
-from exo_gravity.sim.script import Step, TrialScript
+from exo_gravity.sim.script import TrialScript
 from exo_gravity.tools import trial
 
 from ..support import CONFIG, csv_rows
@@ -62,7 +60,6 @@ def test_a_packaged_trial_stays_within_rated_torque_and_clear_of_the_joint_limit
 
 
 def bag_with(holds):
-    """Return a recording without a script, of one arm with that many holds of 4 s."""
     recording = made.trial([[0.1 * n] * 4 for n in range(holds)], hold=4.0, rate=100.0)
     return made.bag_of(replace(recording, steps=(), carried=((0.0, recording.time[-1]),)))
 
@@ -205,25 +202,23 @@ def test_over_ros_the_arm_holds_in_the_pose_that_it_has_offline(run):
 # On a computer that is too busy
 
 
-def simulator(stall=12.0, silence=14.0, disconnected="no"):
-    values = {"longest stall (ms)": f"{stall:.0f}", "longest silence (ms)": f"{silence:.0f}"}
-    return {"right/simulator": {"level": 0, "message": "running", "disconnected": disconnected, **values}}
-
-
-CASES = {  # what a simulator says, and what was not run for long
-    "a stalled device": (simulator(140, 150), "right/simulator was not run for 140 ms"),
-    "a stalled bridge": (simulator(12, 130), "right/can_bridge was not run for 130 ms"),
-    "no gap": (simulator(), ""),
-    "a simulated fault": (simulator(60, 70, "yes"), ""),
-    "a real arm": ({}, ""),
+CASES = {  # longest stall and silence in ms of a simulator, whether it is disconnected, and what was not run for long
+    "a stalled device": ("140", "150", "no", "right/simulator was not run for 140 ms"),
+    "a stalled bridge": ("12", "130", "no", "right/can_bridge was not run for 130 ms"),
+    "no gap": ("12", "14", "no", ""),
+    "a simulated fault": ("60", "70", "yes", ""),
 }
 
 
-@pytest.mark.parametrize(("device", "said"), CASES.values(), ids=CASES)
-def test_a_trial_that_failed_says_which_process_of_the_simulation_stood_still(device, said):
+@pytest.mark.parametrize(("stall", "silence", "disconnected", "said"), CASES.values(), ids=CASES)
+def test_a_trial_that_failed_says_which_process_of_the_simulation_stood_still(stall, silence, disconnected, said):
     bridge = {"level": 2, "message": "letting down", "state": "letting down", "fault": "motor_silent"}
-    found = running.stall_of({"right/can_bridge": bridge, **device})
+    device = {"longest stall (ms)": stall, "longest silence (ms)": silence, "disconnected": disconnected}
+    found = running.stall_of(
+        {"right/can_bridge": bridge, "right/simulator": {"level": 0, "message": "running", **device}}
+    )
     assert said in found and bool(found) == bool(said)
+    assert running.stall_of({"right/can_bridge": bridge}) == ""  # a real arm
 
 
 # The screen
@@ -239,8 +234,6 @@ ACTIVE = status("active")
 
 
 class Screen(TrialScreen):
-    """The screen of a trial, whose clock and recorder's lines the test sets."""
-
     def __init__(self, guided=True, bridges=("right/can_bridge",), lead=LEAD):
         self.now, self.out, self.steps = 0.0, io.StringIO(), []
         console = Console(file=self.out, width=120)
@@ -260,7 +253,6 @@ class Screen(TrialScreen):
 
     @property
     def printed(self):
-        """The lines that stay on the screen, without the number of the step."""
         return [line[5:] for line in self.out.getvalue().splitlines()]
 
     def end_of_trial(self, exit_code=None, stopped=None):
@@ -356,23 +348,6 @@ def test_a_trial_on_running_nodes_ends_after_a_few_seconds_without_a_bridge(brid
     assert not is_missing or "no can_bridge has reported" in screen.end_of_trial()
 
 
-STEPS = [
-    (Step("bow", 3.0, (0.52,)), ("bow", "30 deg forward", "3 s")),
-    (Step("lean", 2.0, (-0.26,)), ("lean", "-15 deg to the right", "2 s")),
-    (Step("walk", 60.0), ("walk", "60 s")),
-    (Step("sit", 2.0), ("sit",)),
-    (Step("load", 1.0, (0.5,)), ("take", "0.5 kg")),
-    (Step("load", 1.0, (0.0,)), ("let go",)),
-]
-
-
-@pytest.mark.parametrize(("step", "words"), STEPS)
-def test_the_steps_of_the_trunk_and_of_a_load_are_instructions_too(step, words):
-    for guided in (True, False):
-        said = describe(step, guided)
-        assert all(word in said for word in words) and said.startswith("the wearer: ") != guided
-
-
 # As a clip
 
 CLIPS = {  # the file, the speed, the packages that are needed, and what is said
@@ -385,21 +360,15 @@ CLIPS = {  # the file, the speed, the packages that are needed, and what is said
 
 @pytest.mark.parametrize(("video", "speed", "needed", "said"), CLIPS.values(), ids=CLIPS)
 def test_a_wrong_clip_is_refused_before_the_trial(tmp_path, monkeypatch, video, speed, needed, said):
+    for kind, step in (("gif", 0.4), ("mp4", 0.16)):
+        assert clips.requested(str(tmp_path / f"clip.{kind}"), 4.0).step == pytest.approx(step)
     monkeypatch.setattr(clips, "NEEDED", needed)
     with pytest.raises(ParameterError, match=said):
         clips.requested(str(tmp_path / video), speed)
 
 
-def test_from_frame_to_frame_the_recording_goes_on_at_the_speed_of_the_clip(tmp_path):
-    assert clips.requested(None, 1.0) is None
-    for kind, step in (("gif", 0.4), ("mp4", 0.16)):
-        assert clips.requested(str(tmp_path / f"clip.{kind}"), 4.0).step == pytest.approx(step)
-
-
 def colourful(frame):
-    """Return how many pixels are not grey: torques, states and centres of gravity."""
-    pixels = frame[..., :3].astype(int)
-    return int(np.count_nonzero(np.ptp(pixels, axis=-1) > 60))
+    return int(np.count_nonzero(np.ptp(frame[..., :3].astype(int), axis=-1) > 60))  # torques, states and centres
 
 
 @pytest.mark.usefixtures("without_pictures")

@@ -33,7 +33,7 @@ from exo_gravity.lab.bag.content import NodeStatus
 from exo_gravity.lab.bag.layout import Decoder, batch_of
 from exo_gravity.lab.bag.reader import read_bag
 from exo_gravity.lab.report.trial_report import analyse
-from exo_gravity.lab.trial.recording import in_blocks
+from exo_gravity.lab.trial.recording import ARRAYS, in_blocks
 from exo_gravity.lab.trial.session import Session
 
 from ...support import synthetic_bags as made
@@ -61,15 +61,7 @@ def read(folder: Path, content: Entries = CONTENT, *form: object):
     return read_bag(made.write_bag(folder / "bag", content, *form))
 
 
-def in_order(folder: Path, content: Entries, plugin: StoragePlugin = StoragePlugin.MCAP) -> Path:
-    """Write a bag whose messages lie in the order given, whatever their times."""
-    with made.Writer(folder, version=9, storage_plugin=plugin) as writer:
-        connections = {}
-        for topic, kind, stamp, data in content:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=made.STORE)
-            writer.write(connections[topic], stamp, data)
-    return folder
+in_order = partial(made.write_bag, is_sorted=False)
 
 
 def poses(change: Callable[[int, np.ndarray], Sequence[float]], names: Sequence[str] = made.NAMES) -> list[made.Entry]:
@@ -427,19 +419,12 @@ def test_joints_are_found_by_name_whatever_their_order_and_their_number_of_bytes
 
 @pytest.mark.parametrize("commanded", [4, 7])
 def test_of_a_driver_with_seven_joints_those_that_are_commanded_are_reported(tmp_path, commanded):
-    names = (*made.NAMES, "wrist_a", "wrist_b", "wrist_c")
-
-    def more(content):
-        for topic, kind, stamp, data in content:
-            if kind == made.JOINT_STATE and (topic == STATES or commanded > len(made.NAMES)):
-                message = made.STORE.deserialize_cdr(data, kind)
-                arrays = ((*array, 0.3, 0.2, 0.1) if len(array) else () for array in (
-                    message.position, message.velocity, message.effort))  # fmt: skip
-                at = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
-                data = made.joint_state(at, names, *arrays)
-            yield topic, kind, stamp, data
-
-    report, arm, analysis = report_of(made.write_bag(tmp_path / "bag", more(CONTENT)))
+    names, wrist = (*made.NAMES, "wrist_a", "wrist_b", "wrist_c"), np.tile((0.3, 0.2, 0.1), (len(TRIAL.time), 1))
+    wide = {field: np.hstack((getattr(TRIAL, field), wrist)) for field in ARRAYS}
+    of_driver = [*made.messages(replace(TRIAL, joint_names=names, **wide))]
+    commands = [item for item in (MESSAGES if commanded == 4 else of_driver) if item[0] == COMMANDS]
+    content = [item for item in of_driver if item[0] != COMMANDS] + commands
+    report, arm, analysis = report_of(made.write_bag(tmp_path / "bag", content))
     assert arm.joint_names == names[:commanded] and len(analysis.holds) == 2 and not report.failures
     assert arm.position.shape == arm.command.shape == (len(TRIAL.time), commanded)
     assert np.isfinite(arm.command[2:]).all()
