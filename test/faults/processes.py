@@ -173,7 +173,7 @@ class ProcessRig:
     def set(self, node: str, values: Parameters) -> None:
         """Set parameters of a node of the right arm together."""
         named = {name.replace(".", "__"): value for name, value in values.items()}
-        result = self.probe.set_parameters(node, atomically=True, **named)
+        result = self.probe.set_parameters(node, **named)
         assert result.successful, result.reason
 
     def pid(self, name: str) -> int:

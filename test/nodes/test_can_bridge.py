@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import threading
 import time
@@ -19,8 +20,8 @@ import rclpy
 from diagnostic_msgs.msg import KeyValue
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -61,7 +62,7 @@ from exo_gravity.sim import ArmConfig
 
 from ..hardware.arms import NoWatchdog, SimulatedRig, raised_arm
 from ..support.keys import broken
-from ..support.node_thread import NodeThread, Served, own_node
+from ..support.node_thread import Served, own_node
 from ..support.simulated_device import make_device
 from ..support.waiting import wait_until
 
@@ -137,10 +138,6 @@ def riding(n):
     return loop
 
 
-def inactive(_n):
-    return None
-
-
 @pytest.mark.parametrize(
     ("loop", "at", "level", "said", "expected"),
     [
@@ -154,7 +151,7 @@ def inactive(_n):
         ),
         (riding, 15, WARN, "active, riding through: efforts 70 ms old", {"rides": "1"}),
         (riding, -1, OK, "active", {}),
-        (inactive, 0, WARN, "", {"state": "inactive", "source": "simulated", "control held by": "nobody"}),
+        (lambda _: None, 0, WARN, "", {"state": "inactive", "source": "simulated", "control held by": "nobody"}),
     ],
 )
 def test_what_an_operator_must_know_is_in_the_headline_and_in_a_key(sent, loop, at, level, said, expected):
@@ -238,19 +235,18 @@ def test_the_answer_to_a_request_has_a_word_of_its_own_for_each_reason(ask, monk
     loop = standing()
     assert ask("enable", loop, True, hindrance="leaves") == "leaves" and ask.last == ("enable", "leaving")
     assert ask("enable", loop, False, hindrance="leaves") == "" and ask.last == ("let_down", "done")
-    run, waiting = loop.call, Future()
-    loop.call = lambda function: waiting
     monkeypatch.setattr(operation, "CALL_TIMEOUT", 0.0)
-    assert "did not respond" in ask("enable", loop, True) and ask.last == ("enable", "no_response")
-    assert not waiting.set_running_or_notify_cancel()  # as the control thread asks: it never enables the arm later
-    broken = Future()
+    run, (waiting, broken, overtaken) = loop.call, (Future() for _ in range(3))
     broken.set_exception(BusError("unplugged"))
-    loop.call = lambda function: broken
-    assert ask("resume", loop) == "unplugged" and ask.last == ("resume", "bus_error")
-    overtaken = Future()
     overtaken.cancel()
-    loop.call = lambda function: overtaken
-    assert "asked to be let down" in ask("confirm_pose", loop) and ask.last == ("confirm_pose", "overtaken")
+    for service, future, said, word in (
+        ("resume", waiting, "did not respond", "no_response"),
+        ("resume", broken, "unplugged", "bus_error"),
+        ("confirm_pose", overtaken, "asked to be let down", "overtaken"),
+    ):
+        loop.call = Mock(return_value=future)
+        assert said in ask(service, loop) and ask.last == (service, word)
+    assert not waiting.set_running_or_notify_cancel()  # as the control thread asks: nothing happens later
     loop.call = run
     monkeypatch.setattr(operation, "age_of_request", lambda node: 1.5)
     assert "1.5 s old" in ask("enable", loop, True) and ask.last == ("enable", "too_old")
@@ -424,17 +420,13 @@ def test_under_a_clock_that_stands_still_efforts_grow_old_and_one_that_is_set_ch
     assert (tuple(found.effort), found.answered, found.damped, found.held) == (EFFORT, answered, False, bool(held))
 
 
-def shift(message: JointState) -> None:
-    message.header.stamp.sec -= 3600
-
-
 @pytest.mark.parametrize(
     ("spoil", "word", "tripped"),
     [
         (lambda message: message.effort.pop(), "invalid", ["command_impossible"]),
         (lambda message: message.name.__setitem__(3, "left_knee"), "invalid", ["command_impossible"]),
         (lambda message: message.velocity.append(0.5), "invalid", ["command_impossible"]),
-        (shift, "unknown_stamp", []),
+        (lambda message: setattr(message.header.stamp, "sec", message.header.stamp.sec - 3600), "unknown_stamp", []),
     ],
     ids=["three efforts", "a wrong name", "a velocity", "a stamp an hour old"],
 )
@@ -444,8 +436,7 @@ def test_efforts_that_are_malformed_let_the_arm_down_and_those_of_another_stamp_
     """What the arm does then: rows `effort NaN` and `compensator frozen` of the fault matrix."""
 
     def answer(state: JointState) -> JointState:
-        message = JointState(name=list(state.name), effort=EFFORT)
-        message.header.stamp.sec, message.header.stamp.nanosec = state.header.stamp.sec, state.header.stamp.nanosec
+        message = JointState(header=copy.deepcopy(state.header), name=list(state.name), effort=EFFORT)
         spoil(message)
         return message
 
@@ -488,15 +479,14 @@ def test_an_arm_is_let_down_gently_when_its_operator_is_gone_but_not_after_a_rel
     operated.arm.assert_let_down()
 
 
-def test_an_operator_who_leaves_during_the_descent_leaves_no_fault(operated):
+def test_requests_for_control_arrive_by_topic_and_an_operator_who_leaves_during_the_descent_leaves_no_fault(
+    operated, node
+):
     operated.run(1.0, holding="anna")
     operated.safety.disable(operated.arm.clock.monotonic())
     operated.run(3.0)
     operated.arm.assert_let_down()
     assert operated.safety.state is State.DISABLED
-
-
-def test_requests_for_control_arrive_by_topic(operated, node):
     publisher = node.create_publisher(KeyValue, "listener/control", 10)
     for kind, holder in (("hold", "anna"), ("release", "")):
         ask = KeyValue(key="anna", value=kind)
@@ -553,22 +543,6 @@ def make_bridge(rig: SimulatedRig, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     rclpy.try_shutdown()
 
 
-@pytest.fixture
-def user() -> Iterator[Node]:
-    """The node of a user, whom a thread spins."""
-    thread = NodeThread("user")
-    thread.start()
-    yield thread.nodes[0]
-    thread.close()
-
-
-def asked(user: Node, kind: Any, name: str, **fields: Any) -> Any:
-    """Ask for a service of the bridge; return the future of its response."""
-    client = user.create_client(kind, f"/can_bridge/{name}")
-    wait_until(client.service_is_ready)
-    return client.call_async(kind.Request(**fields))
-
-
 def spin_until(bridge: CanBridge, condition: Callable[[], object]) -> None:
     """Spin the bridge until `condition()` holds: a node that stands still carries no arm."""
     wait_until(condition, lambda: rclpy.spin_once(bridge, timeout_sec=0.01))
@@ -613,27 +587,33 @@ def test_carried_deactivated_once_all_motors_reply_activated_again_and_cleaned_u
 
 
 @real_time
-def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_bridge, user, monkeypatch):
+def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_bridge, node, monkeypatch):
     bridge = make_bridge()
     carry(bridge, rig)
     usual, leave = descent.DESCENT, Transition(id=Transition.TRANSITION_DEACTIVATE)
     # However late this thread runs, the arm is not down before the requests are answered.
     monkeypatch.setattr(descent, "DESCENT", replace(usual, rest_time=1e3, longest_rest=1e3))
-    executor = NodeExecutor()
+    executor, own = NodeExecutor(), SingleThreadedExecutor(context=node.context)
     executor.add_node(bridge)
+    own.add_node(node)
+
+    def asked(kind: Any, name: str, **fields: Any) -> Future[Any]:
+        client = node.create_client(kind, f"/can_bridge/{name}")
+        wait_until(client.service_is_ready)
+        return client.call_async(kind.Request(**fields))
 
     def spin_until(condition: Callable[[], object]) -> None:
-        wait_until(condition, lambda: executor.spin_once(0.01))
+        wait_until(condition, lambda: executor.spin_once(0.01) or own.spin_once(0.01))
 
     def answer_to_enable() -> str:
-        enabled = asked(user, SetBool, "enable", data=True)
+        enabled = asked(SetBool, "enable", data=True)
         spin_until(enabled.done)
         return enabled.result().message
 
-    left = asked(user, ChangeState, "change_state", transition=leave)
+    left = asked(ChangeState, "change_state", transition=leave)
     wait_until(lambda: answer_to_enable() == can_bridge.LEAVING)
     for transition in (leave, Transition(id=Transition.TRANSITION_ACTIVATE)):  # nor is the arm armed again afterwards
-        again = asked(user, ChangeState, "change_state", transition=transition)
+        again = asked(ChangeState, "change_state", transition=transition)
         spin_until(again.done)
         assert not left.done() and not again.result().success
     assert bridge.loop.safety.state is State.LETTING_DOWN
@@ -641,7 +621,8 @@ def test_a_deactivation_lets_the_arm_down_while_requests_are_answered(rig, make_
     spin_until(left.done)
     assert left.result().success
     assert_nothing_runs(bridge, rig)
-    executor.shutdown()
+    for each in (executor, own):
+        each.shutdown()
 
 
 @real_time
@@ -719,10 +700,3 @@ def test_a_constant_torque_warms_a_cold_motor_exponentially_whatever_the_period(
     (_, rms, share), (_, other, _) = load_after(THERMAL_TIME, step, 6.0)
     assert rms == pytest.approx(6.0 * math.sqrt(1.0 - math.exp(-1.0)), rel=1e-9)
     assert share == pytest.approx(rms / 3.0) and other == 0.0
-
-
-def test_power_is_torque_times_speed_and_negative_where_the_motor_brakes():
-    loads = MotorLoad((3.0, 9.0, 3.0)).update(
-        1.0, [JointSample(0.0, 3.0, effort, 30, 0, 0.0) for effort in (2.0, -2.0)] + [UNKNOWN]
-    )
-    assert [power for power, *_ in loads] == [6.0, -6.0, 0.0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -13,7 +13,6 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Vector3, Vector3Stamped
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.time import Time
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
@@ -28,7 +27,8 @@ from exo_gravity.nodes.ros.messages import to_nanoseconds
 
 from ..support.fake_chips import FAKES, FakeI2c
 from ..support.imu_motion import bowing_and_walking
-from ..support.waiting import each_closed, wait_until
+from ..support.node_thread import NodeRig
+from ..support.waiting import each_closed
 
 keep_to_this_machine()
 G = 9.80665
@@ -40,7 +40,7 @@ AHEAD = 25  # samples in flight: fewer than the node queues, so that none is los
 ERROR = DiagnosticStatus.ERROR
 
 
-class ImuRig:
+class ImuRig(NodeRig):
     """The node with `parameters` in ROS's form, a driver that feeds it, and a listener.
 
     tilts, data: what it published, by stamp in ns. reported: its statuses so far; one lasts for a moment only.
@@ -48,35 +48,27 @@ class ImuRig:
     """
 
     def __init__(self, *parameters: str) -> None:
-        rclpy.init(args=["--ros-args", *(word for parameter in parameters for word in ("-p", parameter))])
-        self.imu, self.user, self.executor = ImuNode(), rclpy.create_node("driver"), SingleThreadedExecutor()
-        for node in (self.imu, self.user):
-            self.executor.add_node(node)
-        self.tilts: dict[int, Vector3] = {}
-        self.data: dict[int, Imu] = {}
-        self.reported: list[DiagnosticStatus] = []
-        self.sent = self.received = 0
+        super().__init__(*(word for parameter in parameters for word in ("-p", parameter)))
+        self.imu = self.add(ImuNode())
+        self.tilts, self.data = dict[int, Vector3](), dict[int, Imu]()
+        self.reported, self.sent, self.received = list[DiagnosticStatus](), 0, 0
         self.publisher = self.user.create_publisher(Imu, "/imu/data_raw", 50)
         subscribe = self.user.create_subscription
         subscribe(Vector3Stamped, "/imu/pitch_yaw", self._on_tilt, 1000)
         subscribe(Imu, "/imu/data", lambda m: self.data.update({to_nanoseconds(m.header.stamp): m}), 1000)
-        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         self.wait_until(lambda: self.reported)
 
     def _on_tilt(self, message: Vector3Stamped) -> None:
         self.tilts[to_nanoseconds(message.header.stamp)] = message.vector
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+    def on_diagnostics(self, message: DiagnosticArray) -> None:
+        super().on_diagnostics(message)
         self.reported += message.status
         self.received = int(self.values["received"])
 
     @property
-    def values(self) -> dict[str, str]:
-        """The newest value of each key."""
-        return {pair.key: pair.value for pair in self.reported[-1].values}
-
-    def wait_until(self, condition: Callable[[], object]) -> None:
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01), seen=lambda: self.reported[-3:])
+    def values(self) -> Mapping[str, str]:
+        return self.values_of("imu")
 
     def reports(self, text: str, level: bytes = ERROR, since: int = 0) -> bool:
         """Return whether a status with `text` has come, not counting the first `since`."""
@@ -109,10 +101,7 @@ class ImuRig:
 
     def close(self) -> None:
         self.imu.close()
-        self.executor.shutdown()
-        for node in (self.imu, self.user):
-            node.destroy_node()
-        rclpy.try_shutdown()
+        super().close()
 
 
 @pytest.fixture

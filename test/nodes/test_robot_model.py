@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `robot_model` in this process, with what the nodes of both arms publish; and the viewers' layouts."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator
@@ -12,7 +10,6 @@ import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -29,7 +26,7 @@ from exo_gravity.nodes.ros.subscriptions import LATCHED
 from exo_gravity.tools.urdf import urdf_of
 
 from ..support import CONFIG, PARTS
-from ..support.waiting import wait_until
+from ..support.node_thread import NodeRig
 
 keep_to_this_machine()
 READINGS = {"left": (0.1, 0.2, 0.3, 0.4), "right": (-0.1, 0.5, 0.6, 0.7)}
@@ -41,43 +38,39 @@ def names(side):
     return [f"{side}_{part}" for part in PARTS]
 
 
-class Viewer:
+class Viewer(NodeRig):
     """A robot_model, nodes with the parameters of both arms, and a viewer that keeps the newest of what it sends.
 
     The viewer sends the tilt, and the states of bridges and joints of `sides`.
     """
 
     def __init__(self) -> None:
-        rclpy.init()
-        self.node, self.executor = rclpy.create_node("viewer"), SingleThreadedExecutor()
-        self.nodes = [RobotModel(), self.node]
+        super().__init__()
+        self.add(RobotModel())
         for name, given in load(BOTH).items():
             side, _, leaf = name[1:].partition("/")
             table = {"compensator": COMPENSATOR, "can_bridge": CAN_BRIDGE}.get(leaf)
             if table:
-                self.nodes.append(rclpy.create_node(leaf, namespace=side))
+                node = self.add(rclpy.create_node(leaf, namespace=side))
                 for parameter, value in values_of(table_for(table, given), given, "can.options").items():
-                    self.nodes[-1].declare_parameter(parameter, value)
-        for node in self.nodes:
-            self.executor.add_node(node)
-        create, subscribe = self.node.create_publisher, self.node.create_subscription
+                    node.declare_parameter(parameter, value)
+        create, subscribe = self.user.create_publisher, self.user.create_subscription
         self.sent = {side: create(JointState, f"/{side}/joint_states", 1) for side in READINGS}
         self.tilt, self.reports = (
             create(Vector3Stamped, "/imu/pitch_yaw", 1),
             create(DiagnosticArray, "/diagnostics", 10),
         )
-        self.description, self.states, self.problem = String(), JointState(), ""
+        self.description, self.states = String(), JointState()
         self.markers: dict[tuple[str, int], Marker] = {}
         subscribe(String, "/robot_description", lambda message: setattr(self, "description", message), LATCHED)
         subscribe(JointState, "/joint_states", lambda message: setattr(self, "states", message), 1)
         subscribe(MarkerArray, "/robot_model/markers", self._on_markers, 1)
-        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.sides = set(READINGS)
-        self.node.create_timer(0.05, self._send)
+        self.user.create_timer(0.05, self._send)
 
     def _send(self):
         tilt = Vector3Stamped()
-        tilt.header.stamp, tilt.vector.y = self.node.get_clock().now().to_msg(), 0.5
+        tilt.header.stamp, tilt.vector.y = self.user.get_clock().now().to_msg(), 0.5
         self.tilt.publish(tilt)
         for side in self.sides:
             message = JointState(name=names(side), position=READINGS[side], velocity=(0.0,) * 4, effort=EFFORT)
@@ -89,19 +82,6 @@ class Viewer:
 
     def _on_markers(self, message):
         self.markers = {(marker.ns, marker.id): marker for marker in message.markers}
-
-    def _on_diagnostics(self, message):
-        self.problem = next((s.message for s in message.status if s.name == "robot_model"), self.problem)
-
-    def wait_until(self, condition):
-        seen = lambda: f"{self.problem!r}, joints {list(self.states.name)}"  # noqa: E731
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01), seen=seen)
-
-    def close(self):
-        self.executor.shutdown()
-        for node in self.nodes:
-            node.destroy_node()
-        rclpy.try_shutdown()
 
 
 @pytest.fixture
@@ -141,7 +121,7 @@ def test_a_viewer_gets_the_description_the_joint_states_of_both_arms_and_markers
     viewer.sides = {"right"}
     viewer.wait_until(lambda: list(viewer.states.name) == names("right"))
     viewer.wait_until(lambda: not any(group.startswith("left") for group, _ in viewer.markers))
-    viewer.wait_until(lambda: viewer.problem == "no messages on /left/joint_states")
+    viewer.wait_until(lambda: viewer.statuses["robot_model"].message == "no messages on /left/joint_states")
 
 
 # The layouts of RViz, PlotJuggler and Foxglove, and the launch file: what they name exists. The viewers have no wheels
@@ -161,16 +141,13 @@ def test_a_layout_names_topics_fields_and_frames_that_exist(layout):
     assert {*re.findall(r"(?:Fixed Frame: |\"followTf\": \")(\w+)", text)} <= {ROOT}
 
 
-def test_rviz_subscribes_with_the_quality_of_service_that_the_topics_have():
+def test_rviz_subscribes_with_the_quality_of_service_that_the_topics_have_and_the_launch_file_names_what_exists():
     displays = yaml.safe_load((CONFIG / "rviz" / "exo.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
     topics = [each[key] for each in displays for key in each if key in ("Description Topic", "Topic")]
     assert {topic["Value"]: topic["Durability Policy"] for topic in topics} == {
         "/robot_description": "Transient Local",
         "/robot_model/markers": "Volatile",
     }
-
-
-def test_the_launch_file_names_executables_and_files_that_exist():
     tree = ast.parse((CONFIG.parent / "launch" / "view.launch.py").read_text(encoding="utf-8"))
     texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert {"robot_model", "robot_state_publisher", "rviz2", "sim.yaml", "rviz/exo.rviz"} <= texts

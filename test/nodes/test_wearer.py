@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `wearer` beside a compensator: what it estimates, asks for and warns of, and the arm that it makes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -29,8 +27,9 @@ from exo_gravity.nodes.wearer.node import WearerNode
 from ..support import PARTS, ROBOT
 from ..support.chains import random_chain
 from ..support.compensator_rig import NAMES, POSE, CompensatorRig
+from ..support.node_thread import NodeRig
 from ..support.urdf_oracle import MujocoArm
-from ..support.waiting import each_closed, wait_until
+from ..support.waiting import each_closed
 
 LOAD = Wearer(75.0).on_links(ROBOT.length)
 WORN = {"use_imu": "false", "max_effort": [9.0, 18.0, 9.0, 9.0], "wearer.body_mass": 75.0}
@@ -122,10 +121,9 @@ def test_beside_a_compensator_that_hangs_nothing_is_known_of_the_wearer(worn):
 @pytest.mark.thorough
 def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_that_fits(worn, capfd):
     rig = worn({"use_imu": "false"})
-    bridge = rclpy.create_node("can_bridge")
+    bridge = rig.add(rclpy.create_node("can_bridge"))
     for param in CAN_BRIDGE:
         bridge.declare_parameter(param.name, param.default)
-    rig.executor.add_node(bridge)
     rig.start(with_wearer=True)
     rig.wait_until(lambda: rig.found("budget") == "within_rated")
     worn = {"mode": "zero_g", "support": 1.0, "wearer.body_mass": 75}
@@ -140,34 +138,26 @@ def test_a_load_beyond_the_motors_is_clamped_and_one_warning_states_the_support_
     rig.wait_until(lambda: rig.found("budget text"))  # the next report does not repeat the warning
     warnings = [line for line in capfd.readouterr().err.splitlines() if needs in line]
     assert len(warnings) == 1 and "WARN" in warnings[0]
-    bridge.destroy_node()
 
 
 @pytest.fixture
-def wearer() -> Iterator[WearerNode]:
-    """A wearer in this process, which is not spun."""
-    rclpy.init()
-    node = WearerNode()
-    yield node
-    node.close()
-    node.destroy_node()
-    rclpy.try_shutdown()
+def alone() -> Iterator[NodeRig]:
+    """A rig with a wearer, `alone.wearer`."""
+    alone = NodeRig()
+    alone.wearer = alone.add(WearerNode())
+    yield alone
+    alone.wearer.close()
+    alone.close()
 
 
-def test_a_node_of_another_program_with_the_compensators_name_does_not_end_the_node_and_is_refused(wearer):
-    other, executor, told = rclpy.create_node("compensator"), rclpy.executors.SingleThreadedExecutor(), []
+def test_a_node_of_another_program_with_the_compensators_name_does_not_end_the_node_and_is_refused(alone):
+    other = alone.add(rclpy.create_node("compensator"))
     publisher = other.create_publisher(DiagnosticArray, "/diagnostics", 10)
     values = [KeyValue(key="answers", value="many")]
     report = DiagnosticArray(status=[DiagnosticStatus(name="compensator", values=values)])
     other.create_timer(0.05, lambda: publisher.publish(report))
-    other.create_subscription(DiagnosticArray, "/diagnostics", lambda message: told.extend(message.status), 10)
-    for node in (wearer, other):
-        executor.add_node(node)
-    refusal = "the compensator has no parameter 'law'"
-    wait_until(lambda: refusal in {status.message for status in told}, lambda: executor.spin_once(0.05))
-    assert wearer.failure is None
-    executor.shutdown()
-    other.destroy_node()
+    alone.wait_until(lambda: alone.statuses["wearer"].message == "the compensator has no parameter 'law'")
+    assert alone.wearer.failure is None
 
 
 @pytest.mark.thorough
@@ -193,11 +183,8 @@ def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_wh
     def sink(_stamp: object) -> None:
         rig.pose[1] -= sinking[0]
 
-    def number(text: str) -> float:
-        return 0.0 if text in ("", "none") else float(text)
-
-    in_use = lambda: number(rig.values["support in use"])  # noqa: E731
-    asked = lambda: number(rig.found("support asked for"))  # noqa: E731
+    in_use = lambda: float(rig.values["support in use"] or 0.0)  # noqa: E731
+    asked = lambda: float(rig.found("support asked for").replace("none", "") or 0.0)  # noqa: E731
     rig.on_cycle = sink
     rig.start(with_wearer=True)
     rig.wait_until(lambda: rig.found("support adapts") == "on" and asked() == 0.4)
@@ -219,7 +206,7 @@ def test_the_support_follows_an_arm_that_sinks_and_returns_when_the_node_ends_wh
 # Compensator, wearer and the tools make the same arm of a URDF whose chain has joints that are not the arm's
 
 
-def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(wearer, tmp_path):
+def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alone, tmp_path):
     text, names = random_chain(3, seed=5)
     urdf, listed = tmp_path / "chain.urdf", [names[0], names[2]]
     urdf.write_text(text)
@@ -230,16 +217,14 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(wea
         "can_id": [1, 2], "max_effort": [9.0] * 2, "position_min": [-1.0] * 2, "position_max": [1.0] * 2,
     }  # fmt: skip
     own = [Parameter(name, value=value) for name, value in given.items()]
-    node = rclpy.create_node(
-        "compensator", parameter_overrides=own, automatically_declare_parameters_from_overrides=True
-    )
+    has = {"parameter_overrides": own, "automatically_declare_parameters_from_overrides": True}
+    node = alone.add(rclpy.create_node("compensator", **has), is_spun=False)
     _, values, read, arm = declared(node)
     assert arm.fixed == (names[1],)
     of_tools = read_arm({"/right/can_bridge": bridge, "/right/compensator": given}, "/right").settings
-    made = read(values), wearer._read(values), of_tools
+    made = read(values), alone.wearer._read(values), of_tools
     oracle = MujocoArm(text, listed)
     for theta in np.random.default_rng(0).uniform(-2.0, 2.0, (10, 2)):
         for settings in made:
             torque, _ = settings.torque(theta.tolist(), Tilt.of("left"))
             np.testing.assert_allclose(torque, oracle.torque(theta, GRAVITY), rtol=0.0, atol=1e-10)
-    node.destroy_node()

@@ -303,8 +303,16 @@ def test_a_wearers_data_ask_first_while_an_arm_is_carried_and_lower_the_support_
     wait_for_text(page, "#message", "The support of the right arm is now 5.0 %", "raise it")
     give_wearer(page, "200")  # at once: the limit is still that of 75 kg
     wait_until(page, lambda: (left["wearer.body_mass"], left["support"]) == (200.0, 0.025))
-    give_wearer(page, "60")
+    held: list[Route] = []
+    page.route("**/action", lambda route: route.continue_() if held else held.append(route))
+    give_wearer(page, "61")
+    wait_until(page, lambda: held)
+    give_wearer(page, "60")  # of the first one not even one arm is told yet
+    page.evaluate(HANDLED)
+    held[0].continue_()
+    page.unroute("**/action")
     wait_until(page, lambda: left["wearer.body_mass"] == 60.0 and page.inner_text("#message") == "Applied.")
+    assert [call for call in stage.arms.calls if "60.0" in call[2]] == stage.arms.calls[-2:]
     assert (right["support"], left["support"]) == (0.025, 0.025)
     # The first wearer of a carried arm; its compensator has the moments of the last one.
     stage.arms.calls.clear()

@@ -6,14 +6,11 @@ from __future__ import annotations
 import tempfile
 import threading
 import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.parameter import Parameter
 from rclpy.time import Time
 from sensor_msgs.msg import JointState
@@ -25,7 +22,8 @@ from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.wearer.node import WearerNode
 
 from . import PARTS
-from .waiting import pause, wait_until
+from .node_thread import NodeRig
+from .waiting import pause
 
 keep_to_this_machine()
 NAMES = [f"right_{part}" for part in PARTS]
@@ -34,12 +32,12 @@ STILL = [0.0] * 4
 PERIOD = 0.01  # s
 
 
-class CompensatorRig:
+class CompensatorRig(NodeRig):
     """The compensator in `namespace`, with `parameters` as in a parameter file, on its own thread once it is started.
 
     user: the node that plays its environment; waiting spins it. It publishes joint states of `names`, `pose`,
     `velocity` and `effort`, stamped `lag` s late, while `is_feeding`; and then calls `on_cycle` with their stamp.
-    commands: (n,) Nm each, all so far. statuses: the newest ones by node. is_stopped: whether no node is spun.
+    commands: (n,) Nm each, all so far. is_stopped: whether no node is spun.
     """
 
     def __init__(
@@ -49,18 +47,13 @@ class CompensatorRig:
         with tempfile.NamedTemporaryFile("w", suffix=".yaml") as file:
             file.write("\n    ".join((f"{namespace}/compensator:\n  ros__parameters:", *lines)) + "\n")
             file.flush()
-            rclpy.init(args=["--ros-args", "-r", f"__ns:={namespace}", "--params-file", file.name])
-        self.user = rclpy.create_node("environment")
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.user)
+            super().__init__("-r", f"__ns:={namespace}", "--params-file", file.name)
         self.names, self.pose = list(names), list(pose)
         self.velocity, self.effort = [0.0] * len(self.names), [0.0] * len(self.names)
         self.lag, self.is_feeding, self.is_stopped = 0.0, True, False
         self.on_cycle: Callable[[Time], object] = lambda stamp: None
         self.commands: list[tuple[float, ...]] = []
-        self.statuses: dict[str, DiagnosticStatus] = defaultdict(DiagnosticStatus)
         subscribe = self.user.create_subscription
-        subscribe(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         subscribe(JointState, "effort_commands", lambda message: self.commands.append(tuple(message.effort)), 100)
         controller = "effort_controller/commands"
         subscribe(Float64MultiArray, controller, lambda message: self.commands.append(tuple(message.data)), 100)
@@ -73,8 +66,8 @@ class CompensatorRig:
 
     def start(self, with_wearer: bool = False) -> CompensatorRig:
         """Start the compensator, and a wearer beside it."""
-        self.node = CompensatorNode()
-        self.wearer = WearerNode() if with_wearer else None
+        self.node = self.add(CompensatorNode(), is_spun=False)
+        self.wearer = self.add(WearerNode(), is_spun=False) if with_wearer else None
         self._thread.start()
         return self
 
@@ -94,52 +87,26 @@ class CompensatorRig:
             self._joint_states.publish(message)
             self.on_cycle(stamp)
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self.statuses.update({status.name.rpartition("/")[2]: status for status in message.status})
-
     @property
     def status(self) -> DiagnosticStatus:
-        """The compensator's newest status."""
         return self.statuses["compensator"]
 
     @property
     def values(self) -> Mapping[str, str]:
-        """The newest value of each of its keys, '' before the first report."""
         return self.values_of("compensator")
-
-    def values_of(self, node: str) -> Mapping[str, str]:
-        """Return the newest value of each key of a node."""
-        return defaultdict(str, {item.key: item.value for item in self.statuses[node].values})
 
     def set(self, **values: object) -> list[str]:
         """Set parameters (`__` for a dot) and return why each was refused, '' if it was not."""
         changes = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
         return [result.reason for result in self.node.set_parameters(changes)]
 
-    def wait_until(self, condition: Callable[[], object]) -> None:
-        """Spin the environment until `condition()` holds."""
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01), seen=lambda: dict(self.statuses))
-
     def wait_for(self, values: dict[str, str], node: str = "compensator") -> None:
-        """Wait until one report of a node has all of these values."""
         self.wait_until(lambda: values.items() <= self.values_of(node).items())
 
-    def end_wearer(self) -> None:
-        """End the wearer."""
-        wearer, self.wearer = self.wearer, None
-        wearer.close()
-        wearer.destroy_node()
-
     def close(self) -> None:
-        """End the nodes."""
         self._closing = True
         with suppress(RuntimeError):  # it was not started
             self._thread.join()
-        if self.wearer is not None:
-            self.end_wearer()
-        if self.node is not None:
-            self.node.close()
-            self.node.destroy_node()
-        self.executor.shutdown()
-        self.user.destroy_node()
-        rclpy.try_shutdown()
+        for node in filter(None, (self.wearer, self.node)):
+            node.close()
+        super().close()

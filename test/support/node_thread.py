@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
@@ -63,6 +65,43 @@ def own_node(name: str, namespace: str = "/right", **options: Any) -> Iterator[t
         yield thread.nodes[0], thread.executor
     finally:
         thread.close()
+
+
+class NodeRig:
+    """Nodes under test, and `user`, which plays what is around them; waiting spins all that were added.
+
+    statuses: the newest ones by the last part of their nodes' names.
+    """
+
+    def __init__(self, *arguments: str) -> None:
+        rclpy.init(args=["--ros-args", *arguments])
+        self.executor, self.nodes = SingleThreadedExecutor(), list[Any]()
+        self.user = self.add(rclpy.create_node("environment"))
+        self.statuses: dict[str, DiagnosticStatus] = defaultdict(DiagnosticStatus)
+        self.user.create_subscription(DiagnosticArray, "/diagnostics", self.on_diagnostics, 50)
+
+    def add(self, node: Any, is_spun: bool = True) -> Any:
+        """Have a node spun, and destroyed at the end."""
+        self.nodes.append(node)
+        if is_spun:
+            self.executor.add_node(node)
+        return node
+
+    def on_diagnostics(self, message: DiagnosticArray) -> None:
+        self.statuses.update({status.name.rpartition("/")[2]: status for status in message.status})
+
+    def values_of(self, node: str) -> Mapping[str, str]:
+        """Return the newest value of each key of a node, '' before its first report."""
+        return defaultdict(str, {item.key: item.value for item in self.statuses[node].values})
+
+    def wait_until(self, condition: Callable[[], object]) -> None:
+        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01), seen=lambda: dict(self.statuses))
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
 
 
 class Served:

@@ -6,15 +6,15 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters, SetParametersAtomically
-from rclpy.parameter import Parameter, parameter_value_to_python
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
@@ -124,31 +124,11 @@ class RosProbe:
         """Call can_bridge's service `enable`."""
         return self.call(SetBool, f"{self.arm}/can_bridge/enable", SetBool.Request(data=on))
 
-    def set_parameters(self, node: str, atomically: bool = False, **values: Any) -> SetParametersResult:
-        """Set parameters as `ros2 param set` does; `__` in a name stands for a dot."""
+    def set_parameters(self, node: str, **values: Any) -> SetParametersResult:
+        """Set all these parameters or none; `__` in a name stands for a dot."""
         parameters = [Parameter(name.replace("__", "."), value=value) for name, value in values.items()]
-        messages = [parameter.to_parameter_msg() for parameter in parameters]
-        if atomically:
-            name, request = f"{self.arm}/{node}/set_parameters_atomically", SetParametersAtomically.Request()
-            request.parameters = messages
-            return self.call(SetParametersAtomically, name, request).result
-        name = f"{self.arm}/{node}/set_parameters"
-        return self.call(SetParameters, name, SetParameters.Request(parameters=messages)).results[0]
-
-    def dump_parameters(self, nodes: Iterable[str]) -> dict[str, dict[str, Any]]:
-        """Return what `ros2 param dump` writes for the nodes, by their full names."""
-        content: dict[str, dict[str, Any]] = {}
-        for node in nodes:
-            names = self.call(ListParameters, f"{node}/list_parameters", ListParameters.Request()).result.names
-            values = self.call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=names)).values
-            content[node] = {"ros__parameters": {}}
-            for name, value in zip(names, values, strict=True):
-                *branches, leaf = name.split(".")
-                parameters = content[node]["ros__parameters"]
-                for branch in branches:
-                    parameters = parameters.setdefault(branch, {})
-                parameters[leaf] = parameter_value_to_python(value)
-        return content
+        request = SetParametersAtomically.Request(parameters=[each.to_parameter_msg() for each in parameters])
+        return self.call(SetParametersAtomically, f"{self.arm}/{node}/set_parameters_atomically", request).result
 
     def joint_angles(self) -> list[float]:
         """Return the newest joint angles in rad."""

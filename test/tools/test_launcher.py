@@ -84,10 +84,9 @@ def launched(monkeypatch, run_tool):
             node = command[command.index("--enclave") + 1]
             commands[node] = command
             assert (node.endswith("/wearer")) == (DELAY.items() <= env.items())  # no arm waits for it
-            process = Mock(stdout=log if node.endswith("/can_bridge") else (), **{"poll.return_value": None})
-            process.configure_mock(
-                **{"wait.return_value": 0, "terminate": lambda: process.poll.configure_mock(return_value=0)}
-            )
+            ends = {"poll.return_value": None, "wait.return_value": 0}
+            process = Mock(stdout=log if node.endswith("/can_bridge") else (), **ends)
+            process.terminate.side_effect = lambda: process.poll.configure_mock(return_value=0)
             return process
 
         ended = threading.Event()

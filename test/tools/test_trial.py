@@ -213,10 +213,9 @@ CASES = {  # longest stall and silence in ms of a simulator, whether it is disco
 @pytest.mark.parametrize(("stall", "silence", "disconnected", "said"), CASES.values(), ids=CASES)
 def test_a_trial_that_failed_says_which_process_of_the_simulation_stood_still(stall, silence, disconnected, said):
     bridge = {"level": 2, "message": "letting down", "state": "letting down", "fault": "motor_silent"}
-    device = {"longest stall (ms)": stall, "longest silence (ms)": silence, "disconnected": disconnected}
-    found = running.stall_of(
-        {"right/can_bridge": bridge, "right/simulator": {"level": 0, "message": "running", **device}}
-    )
+    device = {"level": 0, "message": "running", "disconnected": disconnected}
+    device |= {"longest stall (ms)": stall, "longest silence (ms)": silence}
+    found = running.stall_of({"right/can_bridge": bridge, "right/simulator": device})
     assert said in found and bool(found) == bool(said)
     assert running.stall_of({"right/can_bridge": bridge}) == ""  # a real arm
 

@@ -25,11 +25,17 @@ export class Sections {
     this.cards = cards;
     this.form = byId("wearer");
     this.edited = false;
+    this.applied = Promise.resolve(); // the last Apply, when it has ended
     this.workspace = {}; // of the subject, sent with the wearer's data
     this.session = new Session(send, this);
     this.markers = new Markers(send);
     this.form.addEventListener("input", () => (this.edited = true));
-    this.form.addEventListener("submit", (event) => this.apply(event));
+    this.form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      const values = this.wearer();
+      const apply = () => this.apply(values);
+      this.applied = this.applied.then(apply, apply); // in turn: every arm ends with the wearer who was given last
+    });
     byId("trial-start").addEventListener("click", () => send({ do: "trial", name: byId("trials").value }));
     byId("trial-stop").addEventListener("click", () => send({ do: "stop_trial" }));
     byId("record").addEventListener("click", () => send({ do: "record" }));
@@ -57,15 +63,17 @@ export class Sections {
     LENGTHS.forEach((name, n) => (fields[name].value = Math.round(1000 * settings["wearer.segment_length"][n]) / 10));
   }
 
-  async apply(event) {
-    event.preventDefault();
+  wearer() {
     const fields = this.form.elements;
-    const values = {
+    return {
       "wearer.body_mass": Number(fields.body_mass.value),
       "wearer.sex": fields.sex.value,
       "wearer.segment_length": LENGTHS.map((name) => Number(fields[name].value) / 100),
       ...this.workspace,
     };
+  }
+
+  async apply(values) {
     const cards = [...this.cards.values()];
     const acts = () => cards.some((card) => card.isCarried && card.mode === "zero_g");
     if (!(await this.sure(cards, () => (acts() ? [t("wearer"), t("wearer_ask"), t("change")] : null)))) return;
