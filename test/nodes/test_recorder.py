@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `recorder` as a process, over real DDS: every published message is in the recording."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -73,13 +71,11 @@ class PublishingArm:
         node.declare_parameter("support", 0.0)
         self.topics = {topic: node.create_publisher(kind, topic, qos) for topic, (kind, qos) in MESSAGES.items()}
 
-    def wait_until(self, condition):
-        """Spin until `condition()` holds."""
-        wait_until(condition, lambda: self.executor.spin_once(timeout_sec=0.01))
-
-    def is_recorded(self):
-        """Return whether every topic that is to be recorded has a subscriber."""
-        return all(each.get_subscription_count() for topic, each in self.topics.items() if topic != "chatter")
+    def wait_until_recorded(self):
+        """Spin until every topic that is to be recorded has a subscriber."""
+        asked = [each for topic, each in self.topics.items() if topic != "chatter"]
+        spin = partial(self.executor.spin_once, timeout_sec=0.01)
+        wait_until(lambda: all(each.get_subscription_count() for each in asked), spin)
 
     def send(self, topic, message):
         self.topics[topic].publish(message)
@@ -94,40 +90,34 @@ class PublishingArm:
         self.executor.spin_once(timeout_sec=0.002)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def arm():
     with own_node("bridge") as own:
         yield PublishingArm(*own)
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory):
+def session(arm, tmp_path_factory):
     """A complete recording: its folder, the lines of JSON, the exit code, and the type hash that DDS announces."""
     path = tmp_path_factory.mktemp("recorder") / "bag"
-    with own_node("bridge") as own:
-        arm = PublishingArm(*own)
-        arm.send("wearer_step", String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
-        of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
-        process = start(path, "-p", "live:=true", *of_whom)
-        try:
-            arm.wait_until(arm.is_recorded)
-            known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
-            for k in range(COUNT):
-                arm.publish(k)
-            status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
-            arm.send("/event_marker", String(data="cramp"))
-            arm.send("grip_force", Float64(data=12.5))
-            arm.send("/diagnostics", DiagnosticArray(status=[status]))
-            arm.node.set_parameters([Parameter("support", value=0.5)])
-            lines = []
-            while not lines or "motor 2 is silent" not in lines[-1]:
-                lines.append(process.stdout.readline())
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=PATIENCE)
-            yield path, lines, process.returncode, known.topic_type_hash
-        finally:
-            process.kill()
-            process.wait()
+    arm.send("wearer_step", String(data=json.dumps({"step": 0, "action": "hold", "duration": 9.0})))
+    of_whom = ("-p", "subject:=P01", "-p", "protocol:=pilot", "-p", "note:='second: visit'")
+    process = start(path, "-p", "live:=true", *of_whom)
+    arm.wait_until_recorded()
+    known = arm.node.get_publishers_info_by_topic("/right/joint_states")[0]
+    for k in range(COUNT):
+        arm.publish(k)
+    status = DiagnosticStatus(level=DiagnosticStatus.ERROR, name="right/bridge", message="motor 2 is silent")
+    arm.send("/event_marker", String(data="cramp"))
+    arm.send("grip_force", Float64(data=12.5))
+    arm.send("/diagnostics", DiagnosticArray(status=[status]))
+    arm.node.set_parameters([Parameter("support", value=0.5)])
+    lines = []
+    while not lines or (lines[-1] and "motor 2 is silent" not in lines[-1]):
+        lines.append(process.stdout.readline())
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=PATIENCE)
+    return path, lines, process.returncode, known.topic_type_hash
 
 
 def recorded(path, topic):
@@ -185,8 +175,8 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
     small = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (60_000, 60_000))
     # A compiled module that is cut would keep every later process of this environment from starting.
     process = start(tmp_path / "bag", preexec_fn=small, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"})
-    arm.wait_until(arm.is_recorded)
-    arm.wait_until(lambda: arm.publish(1) or process.poll() is not None)
+    arm.wait_until_recorded()
+    wait_until(process.poll, partial(arm.publish, 1))
     _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1 and "recording ended after" in errors and "File too large" in errors
     assert len(read_bag(tmp_path / "bag").recordings[0].time) > 20  # all but what was in the last chunk
@@ -195,7 +185,7 @@ def test_a_full_disk_ends_the_recorder_with_the_reason_and_keeps_what_fits(arm, 
 @pytest.mark.thorough
 def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_recording(arm, tmp_path):
     process = start(tmp_path / "bag")
-    arm.wait_until(arm.is_recorded)
+    arm.wait_until_recorded()
     for k in range(3051):
         if k in (20, 3000):
             time.sleep(0.2)  # so that all arrive before the recorder stops
@@ -212,7 +202,7 @@ def test_messages_that_a_stopped_recorder_misses_are_counted_and_noted_in_the_re
 
 def test_a_recorder_whose_launcher_died_records_until_the_arm_is_down(arm, tmp_path):
     process = start(tmp_path / "bag", env=dict(os.environ, EXO_GRAVITY_SUPERVISED="1"))
-    arm.wait_until(arm.is_recorded)
+    arm.wait_until_recorded()
     k = 0
     for duration in (0.3, 1.0):
         end, before = time.monotonic() + duration, k

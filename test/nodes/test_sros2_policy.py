@@ -6,8 +6,6 @@ loop for each arm; the bridges are not enabled.
 These tests do not show that DDS enforces the policy, which takes a middleware built with security.
 """
 
-from __future__ import annotations
-
 import runpy
 import time
 import xml.etree.ElementTree as ElementTree
@@ -29,7 +27,6 @@ from ..support.node_thread import NodeThread, own_node
 SCRIPT = runpy.run_path(str(CONFIG / "sros2" / "policy.py"))
 POLICY = SCRIPT["policy"]()
 NODES = [enclave for enclave in POLICY if enclave != "/operator"]
-ARMS = ("left", "right")
 NO_RULES = {"publish": set(), "subscribe": set(), "reply": set(), "request": set()}
 
 
@@ -41,9 +38,8 @@ def reads(nodes):
 def graph_of(node, name):
     """Return the same for the running node `name`, as `node` observes it."""
     namespace, _, leaf = name.rpartition("/")
-    queries = [
-        getattr(node, f"get_{of}_names_and_types_by_node") for of in ("publisher", "subscriber", "service", "client")
-    ]
+    kinds = ("publisher", "subscriber", "service", "client")
+    queries = [getattr(node, f"get_{kind}_names_and_types_by_node") for kind in kinds]
     try:
         found = [{item for item, _ in query(leaf, namespace or "/") if "/observer/" not in item} for query in queries]
     except NodeNameNonExistentError:
@@ -103,20 +99,15 @@ def test_a_node_may_do_exactly_what_it_does(tmp_path, one_process):
         assert not POLICY[node]["request"] or node.endswith(("wearer", "panel", "recorder", "robot_model"))
 
 
-@pytest.mark.parametrize("arm", ARMS)
-def test_a_wearer_may_read_the_parameters_of_its_own_compensator_and_bridge(arm):
+SOURCES = {"effort_commands": "compensator", "assist_efforts": "outer_loop", "support_request": "wearer"}
+
+
+@pytest.mark.parametrize("arm", ["left", "right"])
+def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on_and_its_wearer_reads_its_own_arm(arm):
+    for topic, node in SOURCES.items():
+        publishers = [name for name, rules in POLICY.items() if f"/{arm}/{topic}" in rules["publish"]]
+        assert publishers == [f"/{arm}/{node}"]
     assert POLICY[f"/{arm}/wearer"]["request"] == reads([f"/{arm}/compensator", f"/{arm}/can_bridge"])
-
-
-def test_only_one_node_of_an_arm_may_publish_what_its_torque_depends_on():
-    for topic, node in (
-        ("effort_commands", "compensator"),
-        ("assist_efforts", "outer_loop"),
-        ("support_request", "wearer"),
-    ):
-        for arm in ARMS:
-            publishers = [name for name, rules in POLICY.items() if f"/{arm}/{topic}" in rules["publish"]]
-            assert publishers == [f"/{arm}/{node}"]
 
 
 def test_the_text_is_an_access_control_policy_of_version_0_2_0_with_these_rules():
