@@ -4,8 +4,6 @@
 PARTS are some of law,loop,recordings,starts. It takes 20 minutes on two cores.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 from collections.abc import Callable, Iterator

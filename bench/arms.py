@@ -5,8 +5,6 @@ The simulated arm is the one that the compensator assumes. Its friction is the s
 study's kind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property

@@ -8,8 +8,6 @@ MuJoCo's arm: the largest error of any joint as a share of the largest torque, a
 that `model_error.torque` gives. On elastic joints the poses are those of the motors, behind which the links rest.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys

@@ -5,8 +5,6 @@ Writes one table as Markdown: for each recorded trial with an optical reference 
 in degrees, RMS (largest), over the samples in motion. FOLDER holds trials as .npz files.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

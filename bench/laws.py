@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The law, against compiled Pinocchio and the Robotics Toolbox, all called from Python on the same arm and poses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, cast
 

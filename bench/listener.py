@@ -9,8 +9,6 @@ because the kernel stamps the frames. On SIGTERM it writes FILE (NumPy): `time` 
 `length` (n,). Its exit code is 1 if the kernel dropped frames.
 """
 
-from __future__ import annotations
-
 import signal
 import socket
 import struct

@@ -6,8 +6,6 @@ ROS, and bare rclpy. All run on the same simulated device, which a virtual
 wearer moves to and fro, with the same law and rate. The arms are those of a file in config.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -4,8 +4,6 @@
 The kinds of loop take turns, so that other load on the machine affects all of them alike; a row compares run by run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np

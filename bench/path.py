@@ -8,8 +8,6 @@ reply until that motor's next command is sent. Counted are the functions that ru
 records (named tuples and frozen dataclasses) that are made; what belongs to the simulation is not. --hops: print each.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections import Counter

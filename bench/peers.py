@@ -7,8 +7,6 @@
 ends on SIGTERM.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

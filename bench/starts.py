@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The rows of starts: how long a person waits for `--help` of a tool, against the limit."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -9,8 +9,6 @@ answer is searched in the later cycles; where a newer answer overtook it, that o
 runs from its reply to its command.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

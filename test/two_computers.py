@@ -10,8 +10,6 @@ pose and lets go; the simulator's truth judges it. Exit code 1 at the first case
 up. Needs root, or `unshare --map-root-user` in front.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -5,8 +5,6 @@ Plays an arm in virtual time: many starts, a wearer who reaches, walks and rests
 build/ordinary.json. Exit code 1 if a start was refused, an arm was let down, or was without tilt for a second.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -5,8 +5,6 @@ What carries it is what the nodes use: the rig's loop, Compensator and TrunkEsti
 truth.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Motors whose current loop lags, whose velocity is filtered, and whose torque is noisy in their replies."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@
 Then the other arms of config, which have no IMU, with the same motors, rates and computers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ..arms import ARMS, Friction

@@ -6,8 +6,6 @@ is permitted, or beyond. build/search_ARM.jsonl keeps every case by its seed: th
 With --seed one case is replayed: a table of what happened. Exit code 1 if a case was beyond.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -5,8 +5,6 @@ Each kind of event belongs to a group: operator, hardware, computer, wearer, IMU
 different groups, and often an operator who clears the fault and enables the arm afterwards.
 """
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable

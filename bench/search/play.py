@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Plays a case, and judges it by the truth of the simulated device."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from exo_gravity.core.safety.drive import State

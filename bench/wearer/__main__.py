@@ -4,8 +4,6 @@
 Random calibrated devices with a virtual wearer go through one trial each, offline, one on each core.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ wearer are not simulated: MuJoCo gives the torques that hold the worn arm, and a
 table is wrong for the person by MASS_ERROR and COG_ERROR, and friction is found to WITHIN.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any

@@ -6,8 +6,6 @@ once, and of what they command: a share of their arm's weight, plus a slow corre
 through ACTIVATION, with noise in proportion to the torque (signal-dependent noise, Harris and Wolpert 1998).
 """
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

@@ -6,8 +6,6 @@ while the support rises as much. Their trunk stands, bows and walks meanwhile. T
 through CAN frames and their 12 bits, and an IMU, once every 10 ms.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Short versions of `make study NAME=ordinary`, where ordinary equipment lets no arm down, and of the IMU report."""
 
-from __future__ import annotations
-
 import pytest
 
 from bench.imu_report import read_trials, report

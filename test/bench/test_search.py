@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The search: a seed replays its case, and each cause has its bound."""
 
-from __future__ import annotations
-
 import json
 import math
 

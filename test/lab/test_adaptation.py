@@ -47,7 +47,6 @@ class Arm:
 
 
 def raised() -> Arm:
-    """Return an arm whose support has risen."""
     arm = Arm()
     arm.move(-0.05, 8.0)
     assert arm.adaptation.support > 0.6

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Files of arms that ship and that once did, each carried without ROS; sessions, sources, and work in processes."""
 
-from __future__ import annotations
-
 from datetime import date
 from pathlib import Path
 

@@ -19,8 +19,6 @@ LSB = {"mpu6050": (1 / 16.4, 1 / 2048), "icm20948": (1 / 16.4, 1 / 2048), "lsm6d
 
 
 class ChipRig:
-    """A chip on a bus, and the source that reads it."""
-
     def __init__(self, kind):
         self.time = FakeTime()
         self.chip = FAKES[kind](self.time)

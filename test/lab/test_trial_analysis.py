@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Holds, drift, pushes, let-downs, smoothness and the verdict, from synthetic recordings with known motion."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

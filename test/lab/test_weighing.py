@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Weighing the load in the hand of a simulated arm, whose masses, friction and wearer the controller knows."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -136,7 +134,6 @@ def test_what_would_hide_the_load_is_refused_before_anything_moves(changes, term
 
 
 def weighed(mass: float, pose: Sequence[float], empty: Weighed | None = None) -> Weighing:
-    """Return a weighing that found `mass` kg."""
     weighing = Weighing(SETTINGS, JOINTS, RATE, empty)
     weighing.torque(0.01, pose, STILL, TILT, STILL)
     weighing.result = Weighed(mass, 0.004, np.array(SETTINGS.unit_load.torque(pose, TILT)))

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Fixtures for the tests of running nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -32,7 +30,6 @@ def executor() -> Iterator[SingleThreadedExecutor]:
 
 @pytest.fixture
 def probe() -> Iterator[RosProbe]:
-    """A ROS node in this process that observes the right arm."""
     probe = RosProbe()
     yield probe
     probe.close()

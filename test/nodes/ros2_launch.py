@@ -5,8 +5,6 @@ Run them by their path; PyPI carries no `launch`. Judged by the simulated arm's 
 before the simulator, and with it the motors, ends.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -53,7 +51,6 @@ class Launched:
         os.killpg(self.process.pid, signal.SIGINT)
 
     def wait(self) -> int:
-        """Wait for the end; return the exit code."""
         code = self.process.wait(STOP_TIMEOUT)
         self._reader.join(STOP_TIMEOUT)
         return int(code)
@@ -65,7 +62,6 @@ class Launched:
 
 @pytest.fixture
 def launched(prepare: Callable[..., LaunchedNodes], probe: RosProbe) -> Iterator[Launched]:
-    """An arm that is carried."""
     nodes = prepare(truth=True)
     launched = Launched(nodes)
     try:

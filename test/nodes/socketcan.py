@@ -5,8 +5,6 @@ An emulated machine is 10 to 20 times slower than a real one, so the nodes' cloc
 limits stay those of a worn arm.
 """
 
-from __future__ import annotations
-
 import subprocess
 import time
 from collections.abc import Iterator
@@ -56,7 +54,6 @@ def bus_on(channels: str) -> MotorBus:
 
 @contextmanager
 def down(name: str) -> Iterator[None]:
-    """Have a link down for a while."""
     subprocess.run(["ip", "link", "set", name, "down"], check=True)
     try:
         yield
@@ -65,7 +62,6 @@ def down(name: str) -> Iterator[None]:
 
 
 def heard(bus: can.BusABC) -> list[can.Message]:
-    """Return the frames that wait."""
     return list(iter(lambda: bus.recv(0.0), None))
 
 

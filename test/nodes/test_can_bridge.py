@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """can_bridge in this process: its report, its services, who operates it, and every transition of its lifecycle."""
 
-from __future__ import annotations
-
 import copy
 import math
 import threading

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The compensator's node in this process, over real DDS: its inputs, parameters, services and both kinds of output."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -70,7 +68,6 @@ def make_rig(monkeypatch) -> Iterator[Callable[..., CompensatorRig]]:
 
 @pytest.fixture
 def rig(make_rig) -> CompensatorRig:
-    """The right arm of the exoskeleton, without an IMU."""
     return make_rig("/right", {"use_imu": "false"}, NAMES, POSE).start()
 
 
@@ -212,7 +209,6 @@ REFUSALS = [
 
 
 def call(rig: CompensatorRig, kind: Any, name: str, request: Any) -> Any:
-    """Return the response of a service of the compensator."""
     client = rig.user.create_client(kind, f"compensator/{name}")
     rig.wait_until(client.service_is_ready)
     future = client.call_async(request)

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `imu` in this process, over real DDS: a trunk that moves, impossible samples, and a chip that it reads."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -71,7 +69,6 @@ class ImuRig(NodeRig):
         return self.values_of("imu")
 
     def reports(self, text: str, level: bytes = ERROR, since: int = 0) -> bool:
-        """Return whether a status with `text` has come, not counting the first `since`."""
         return any(text in one.message and one.level == level for one in self.reported[since:])
 
     def send(self, stamp, rate=(0.0, 0.0, 0.0), acceleration=(0.0, 0.0, G), orientation=None, noise=1e-9, covariance=0):
@@ -111,7 +108,6 @@ def make_imu() -> Iterator[Callable[..., ImuRig]]:
 
 @pytest.fixture
 def imu(make_imu) -> ImuRig:
-    """A node whose IMU is mounted as MOUNTING says."""
     imu = make_imu(MOUNTED)
     imu.wait_until(imu.publisher.get_subscription_count)
     return imu

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The tools' reader of parameter files against rcl's own: a real node that is given the same text."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable, Iterator

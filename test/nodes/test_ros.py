@@ -5,8 +5,6 @@ Subscriptions outside the executor, the parameters of other nodes, standard serv
 signals, discovery, and numbers on /diagnostics.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import os
@@ -103,7 +101,6 @@ class Pair:
 
 @pytest.fixture
 def pair(request, executor) -> Iterator[Pair]:
-    """A pair, whose quality of service may be a parameter."""
     pair = Pair(executor.get_nodes()[0], getattr(request, "param", QUEUE))
     yield pair
     pair.subscription.stop()

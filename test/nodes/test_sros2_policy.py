@@ -31,7 +31,6 @@ NO_RULES = {"publish": set(), "subscribe": set(), "reply": set(), "request": set
 
 
 def reads(nodes):
-    """Return the services by which the parameters of these nodes are read."""
     return {f"{node}/{service}" for node in nodes for service in ("get_parameters", "list_parameters")}
 
 

@@ -53,7 +53,6 @@ class WornRig(CompensatorRig):
         self.effort = []
 
     def found(self, key: str) -> str:
-        """Return the newest value of a key of the wearer."""
         return self.values_of("wearer")[key]
 
     @property

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """A headless Chromium."""
     from ..support.panel_browser import chromium
 
     with chromium() as browser:
@@ -61,5 +60,4 @@ def visit(browser: Browser, stage: Stage) -> Iterator[Callable[..., Page]]:
 
 @pytest.fixture
 def page(visit: Callable[..., Page]) -> Page:
-    """The open page."""
     return visit()

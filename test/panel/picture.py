@@ -4,8 +4,6 @@
 `python -m test.panel.picture`; needs chromium and the extras panel and test.
 """
 
-from __future__ import annotations
-
 from playwright.sync_api import Browser
 
 from ..support import ROOT
@@ -17,7 +15,6 @@ RECORDING = {"on": True, "foreign": False, "folder": "recordings/P01/2026-03-14/
 
 
 def main() -> None:
-    """Draw both pictures."""
     stage = Stage()
     stage.arms.pose = (0.0, 0.4, 0.5, 0.8)
     stage.arms.states.update(right="active", left="active")

@@ -5,8 +5,6 @@ The last one is the page for everyone: in German, by the keyboard alone, on a ph
 by axe. What requests are allowed, and what becomes of them, the tests of control, server and node show.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,12 +34,10 @@ HANDLED = "fetch('/strings').then((answer) => answer.text())"
 
 
 def wait_until(page: Page, condition: Callable[[], bool]) -> None:
-    """Wait until `condition()` holds, while the page goes on."""
     waiting.wait_until(condition, lambda: page.wait_for_timeout(100))
 
 
 def wait_for_text(page: Page, selector: str, *texts: str) -> None:
-    """Wait until an element shows all these texts."""
     page.wait_for_selector(selector + "".join(f':has-text("{text}")' for text in texts))
 
 
@@ -255,7 +251,6 @@ def test_a_fault_moves_no_button_names_the_change_of_load_before_it_and_is_clear
 
 
 def change_mode(page: Page, mode: str, *words: str) -> None:
-    """Change it after a question with these words."""
     page.click(of_arm(f'[data-mode="{mode}"]'))
     confirm(page, *words)
     page.wait_for_selector(of_arm(f'[data-mode="{mode}"][aria-pressed="true"]'))
@@ -606,7 +601,6 @@ def test_the_keyboard_alone_reaches_everything(page, stage):
 
 
 def serious(page: Page) -> list[str]:
-    """Return the serious findings of axe."""
     findings = Axe().run(page).response["violations"]
     severe = [finding for finding in findings if finding["impact"] in ("serious", "critical")]
     return [f"{finding['id']}: {[node['html'][:120] for node in finding['nodes']]}" for finding in severe]

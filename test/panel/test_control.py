@@ -4,8 +4,6 @@
 Requests are checked, one page holds control, and letting down always works. The texts are complete in every language.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math
@@ -14,6 +12,7 @@ import shutil
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock, Mock, call
 
 import pytest
 import yaml
@@ -45,15 +44,9 @@ class Panel(Control):
     def __init__(self) -> None:
         self.now = 100.0
         self.arms, self.files, self.notes = PlayedArms(), PlayedFiles(), list[str]()
-        self.note_error: Exception | None = None
-        super().__init__(self.arms, self.files, self.write, lambda: self.now)
+        super().__init__(self.arms, self.files, lambda text: self.notes.append(text), lambda: self.now)
         self.first, self.second = (self.opened(f"10.0.0.{n}") for n in (1, 2))
         self.arms.leases.clear()
-
-    def write(self, text: str) -> None:
-        if self.note_error:
-            raise self.note_error
-        self.notes.append(text)
 
     def opened(self, address: str = "10.0.0.3", secret: str = "") -> Page:
         page = self.open(secret, address)
@@ -72,7 +65,6 @@ class Panel(Control):
 
 @pytest.fixture
 def panel() -> Panel:
-    """A panel with two pages."""
     return Panel()
 
 
@@ -156,7 +148,7 @@ def test_nothing_keeps_an_arm_up_neither_the_other_arm_nor_the_log(panel, caplog
     panel.arms.errors["right"] = RuntimeError("the client is gone")
     assert panel.ask(panel.first, "let_down") == (409, "right: RuntimeError: the client is gone")
     panel.arms.errors.clear()
-    panel.note_error = OSError("no space left")
+    panel.notes = Mock(**{"append.side_effect": OSError("no space left")})
     assert panel.ask(panel.first, "let_down") == (200, "") and panel.arms.calls == 2 * DOWN
     assert "no space left" in caplog.text and "page 1: let down: done" in caplog.text
     panel.arms.names = ()
@@ -239,22 +231,7 @@ for line in ({"folder": str(folder)}, {"step": 0, "left": 4.0}, LAST, {"problem"
 CANNOT_START = "import sys; print('trial: no rclpy', file=sys.stderr); raise SystemExit(2)"
 
 
-class Device:
-    """One compensator, and a bridge whose state is `state`."""
-
-    def __init__(self):
-        self.state, self.performed = "active", []
-        compensator = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
-        self.parameters = lambda: {"/right/compensator": compensator, "/right/simulator": {}}
-        self.states = lambda: {"right": self.state}
-
-    def mark(self, text):
-        self.marked = text
-        return ""
-
-    async def perform(self, script):
-        self.performed.append(script)
-        return ""
+COMPENSATOR = {"mode": "one_g", "robot.mass": [0.5] * 4, "anfis": [], **WEARER_FILE}
 
 
 class Kept(Recordings):
@@ -262,7 +239,15 @@ class Kept(Recordings):
 
     def __init__(self, folder):
         (folder / "short.yaml").write_text(yaml.safe_dump({"name": "short", "steps": [{"hold": 4.0}]}))
-        self.device, self.notes, self.out = Device(), [], folder / "out"
+        self.notes, self.out = [], folder / "out"
+        self.device = Mock(
+            **{"parameters.return_value": {"/right/compensator": COMPENSATOR, "/right/simulator": {}}},
+            **{
+                "states.return_value": {"right": "active"},
+                "mark.return_value": "",
+                "perform": AsyncMock(return_value=""),
+            },
+        )
         super().__init__(str(self.out), folder, self.device, print, lambda: 0.0)
         self._control = Control(PlayedArms(), self, self.notes.append, lambda: 0.0)
         self._page = self._control.open("", "10.0.0.1")
@@ -291,7 +276,6 @@ class Kept(Recordings):
 
 @pytest.fixture
 def kept(tmp_path):
-    """A panel's recordings."""
     return Kept(tmp_path)
 
 
@@ -343,7 +327,10 @@ def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_
     assert kept.begin("P01") == ""
     first, *_, end = kept.followed()
     assert first["recording"]["on"] and (first["trial"]["phase"], first["trial"]["step"]) == ("running", -1)
-    assert not first["trial"]["guided"] and kept.device.performed == [str(tmp_path / "short.yaml"), ""]
+    assert not first["trial"]["guided"] and kept.device.perform.mock_calls == [
+        call(str(tmp_path / "short.yaml")),
+        call(""),
+    ]
     name = "P01/2026-03-14/short_20260314_120000"
     assert end["trial"] == {"phase": "done", "name": "short", "problem": problem, "report": name}
     assert not end["recording"]["on"]
@@ -360,7 +347,7 @@ def test_a_trial_of_a_subject_is_followed_to_its_report_and_listed_also_after_a_
 def test_a_trial_that_cannot_start_says_why(kept, run_instead):
     run_instead(CANNOT_START)
     assert kept.followed()[-1]["trial"]["problem"] == "trial: no rclpy"
-    kept.device.state = "disabled"
+    kept.device.states.return_value = {"right": "disabled"}
     assert "every arm is active" in asyncio.run(kept.trial("short"))
 
 
@@ -386,7 +373,7 @@ def test_what_belongs_to_the_wearer_is_kept_in_a_file_and_read_again_with_the_su
 
 
 def test_a_marker_without_a_text_is_called_marker_and_half_of_a_character_is_refused(kept):
-    assert kept.ask("marker", text="") == "" and kept.device.marked == "marker"
+    assert kept.ask("marker", text="") == "" and kept.device.mark.mock_calls == [call("marker")]
     assert kept.ask("marker", text=["a"]).startswith("text ")
     assert kept.ask("marker", text="calm \ud83d").startswith("text must be")
 
@@ -399,23 +386,22 @@ UNKNOWN = dict.fromkeys(LOAD)
 
 
 class PanelLook:
-    """The panel's look at one arm ten times a second; `cause` is what it names."""
+    """The panel's look at one arm ten times a second."""
 
     def __init__(self, changing: str = "none") -> None:
-        self.changes, self.now, self.cause = LoadChanges(), 0.0, None
-        self.load: dict[str, Any] = LOAD
+        self.changes, self.now, self.load = LoadChanges(), 0.0, dict[str, Any](LOAD)
         self.fault, self.changing = "none", changing
         self.go(1.0)
 
     def go(self, seconds: float, load: dict[str, Any] | None = None) -> Any:
-        self.load = {**self.load, **(load or {})}
+        """Return what is named as the cause of a fault, so many seconds after this load was set."""
+        self.load |= load or {}
         known = {name: value for name, value in self.load.items() if value is not None}
         for _ in range(round(10 * seconds)):
             self.now += 0.1
             state = {"bridge": {"fault": self.fault}, "compensator": {"changing load": self.changing}}
             arms = self.changes.with_causes({"right": state}, {"right": ({}, known)}, self.now)
-            self.cause = arms["right"]["cause"]
-        return self.cause
+        return arms["right"]["cause"]
 
     def fail(self, seconds: float = 0.1) -> Any:
         self.fault = "over_speed"

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The panel as a process with the simulated device, driven by a real browser."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +30,6 @@ AWAY = {"name": "away", "steps": [{"move": [0.0, 0.9, 0.6, 0.8], "over": over} f
 
 
 def panel_diagnostics(bag: Path) -> list[str]:
-    """Return the messages of the panel in a recording."""
     types = get_typestore(Stores.ROS2_JAZZY)
     messages = Storage(bag).messages(lambda topic, msgtype: topic == "/diagnostics")
     arrays = [types.deserialize_cdr(data, msgtype) for _, msgtype, _, data in messages]

@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The node `panel` as a process with an arm that the test plays: its page, its parameters, what it asks of the arm."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -72,7 +70,6 @@ class PanelProcess:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., PanelProcess]]:
-    """A function that starts a panel with these parameters."""
     panels: list[PanelProcess] = []
 
     def start(**parameters: object) -> PanelProcess:

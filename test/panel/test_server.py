@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The web server over real connections: what it refuses, and what it sends."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,7 +26,6 @@ def origin_of(stage: Stage) -> str:
 
 @contextmanager
 def live(stage: Stage, hello: str = '{"page": ""}', **headers: str) -> Iterator[ClientConnection]:
-    """Open a live connection as a page does."""
     origin: Any = headers.pop("origin", origin_of(stage))
     address = stage.url.replace("http", "ws") + "live"
     with connect(address, origin=origin or None, additional_headers=headers) as connection:
@@ -37,7 +34,6 @@ def live(stage: Stage, hello: str = '{"page": ""}', **headers: str) -> Iterator[
 
 
 def first(connection: ClientConnection, kind: str) -> dict[str, Any]:
-    """Return the first message of this type."""
     while (message := json.loads(connection.recv(timeout=PATIENCE)))["type"] != kind:
         pass
     return message
@@ -140,12 +136,9 @@ def test_without_the_token_nothing_is_served_and_with_it_everything(locked):
         assert first(connection, "page")["number"] == 1
 
 
-def test_a_port_in_use_is_an_error_that_names_it(stage):
+def test_every_page_gets_setup_and_state_a_reloaded_page_stays_the_same_and_its_copy_replaces_it(stage):
     with pytest.raises(ParameterError, match=f"{stage.port}.* must be a free address"):
         PanelServer("127.0.0.1", stage.port, "", stage.control)
-
-
-def test_every_page_gets_setup_and_state_a_reloaded_page_stays_the_same_and_its_copy_replaces_it(stage):
     with live(stage) as connection:
         page, setup, state = (first(connection, kind) for kind in ("page", "setup", "state"))
         assert set(setup["arms"]) == {"right", "left"} and setup["language"] == "auto"

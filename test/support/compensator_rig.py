@@ -65,7 +65,6 @@ class CompensatorRig(NodeRig):
         self._thread = threading.Thread(target=self._spin)  # so that neither node keeps the other from sending
 
     def start(self, with_wearer: bool = False) -> CompensatorRig:
-        """Start the compensator, and a wearer beside it."""
         self.node = self.add(CompensatorNode(), is_spun=False)
         self.wearer = self.add(WearerNode(), is_spun=False) if with_wearer else None
         self._thread.start()

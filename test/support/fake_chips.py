@@ -4,8 +4,6 @@
 Scales and registers are those of the data sheets: RM-MPU-6000A, DS-000189 (ICM-20948) and DS12814 (LSM6DSOX).
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import struct
@@ -19,8 +17,6 @@ Axes = tuple[float, float, float]
 
 
 class FakeTime:
-    """A clock that only `wait` moves."""
-
     def __init__(self) -> None:
         self.now = 1000.0  # s
 
@@ -73,7 +69,6 @@ class FakeChip:
         return self.registers[self.bank << 8 | register]
 
     def measure(self) -> None:
-        """Bring the data registers up to the present."""
         layout, registers = self._layout, self.registers
         if not (rate := layout.rate(registers)):
             return

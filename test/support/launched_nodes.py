@@ -112,12 +112,10 @@ class LaunchedNodes:
 
     @property
     def names(self) -> list[str]:
-        """The full names of the nodes to start."""
         nodes = load(self.path)
         return [*nodes, *(wearers(nodes) if self.wearer else ())]
 
     def has_started(self) -> bool:
-        """Return whether `start` was called."""
         return self._thread is not None
 
     def start(self) -> LaunchedNodes:
@@ -134,7 +132,6 @@ class LaunchedNodes:
 
     @property
     def have_ended(self) -> bool:
-        """Whether every process has ended."""
         return self._thread is not None and not self._thread.is_alive()
 
     def process(self, node: str) -> subprocess.Popen[str]:
@@ -142,7 +139,6 @@ class LaunchedNodes:
         return self.launcher.process(full_name(node))
 
     def pid(self, node: str) -> int:
-        """Return the ID of a node's process."""
         return self.process(node).pid
 
     def truth_path(self, node: str = "/right/simulator") -> Path:
@@ -170,7 +166,6 @@ class LaunchedNodes:
 
 
 def executable(name: str) -> str:
-    """Return the path of an installed executable of the package."""
     return str(Path(sys.executable).with_name(name))
 
 
@@ -182,7 +177,6 @@ def full_name(node: str) -> str:
 
 
 def children(pid: int) -> list[int]:
-    """Return the IDs of the child processes of `pid`."""
     return [
         int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()
     ]

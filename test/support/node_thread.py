@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Nodes of a test, in a ROS context of their own; on a separate thread, if wanted."""
 
-from __future__ import annotations
-
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -125,7 +123,6 @@ class Served:
         self._own.spin_once(0.01)
 
     def answer(self, future: Any) -> Any:
-        """Return the response of a request."""
         wait_until(future.done, self.spin)
         return future.result()
 

@@ -4,8 +4,6 @@
 Debian's chromium is used, because Playwright's own browsers come from elsewhere. Without it the tests are skipped.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -65,7 +63,6 @@ def of_arm(name: str, arm: str = "right") -> str:
 
 
 def wait_for_state(page: Page, state: str, arm: str = "right") -> None:
-    """Wait until the page shows the arm in this state."""
     page.wait_for_selector(of_arm(f'.badge[data-state="{state}"]', arm))
 
 

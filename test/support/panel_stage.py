@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The panel's web server with two arms that a test plays: everything but ROS and the device is real."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import threading
@@ -116,7 +114,6 @@ class PlayedArms:
         return ""
 
     def fail(self, arm: str, code: str) -> None:
-        """Latch a fault."""
         self.faults[arm], self.states[arm] = code, "fault"
 
     def state(self, name: str, now: float) -> dict[str, Any]:

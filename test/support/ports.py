@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Ports and ROS domains that other test runs, and the other workers of this one, leave alone."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import os
@@ -32,7 +30,6 @@ def _claim(kind: str, count: int) -> tuple[int, socket.socket | None]:
 
 
 def own_domain() -> int:
-    """Return the ROS domain of this process."""
     return 1 + _claim("domain", DOMAINS)[0]
 
 
@@ -53,6 +50,5 @@ def _is_free(port: int) -> bool:
 
 
 def free_port() -> int:
-    """Return a TCP port of loopback that is free."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         return int(server.getsockname()[1])

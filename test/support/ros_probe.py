@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """A ROS node in the test's process that records what the nodes under test publish, and calls their services."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
@@ -84,7 +82,6 @@ class RosProbe:
 
     @property
     def state(self) -> str | None:
-        """The state that can_bridge reports."""
         return self.diagnostic("can_bridge", "state")
 
     @property
@@ -109,7 +106,6 @@ class RosProbe:
             self._deadline = float("inf")
 
     def call(self, service_type: Any, name: str, request: Any) -> Any:
-        """Return the response of the service `name`."""
         client = self._clients.get(name) or self._clients.setdefault(name, self.node.create_client(service_type, name))
         self.wait_until(client.service_is_ready)
         future = client.call_async(request)
@@ -131,7 +127,6 @@ class RosProbe:
         return self.call(SetParametersAtomically, f"{self.arm}/{node}/set_parameters_atomically", request).result
 
     def joint_angles(self) -> list[float]:
-        """Return the newest joint angles in rad."""
         return list(self.joint_states[-1].position)
 
     def wearer_is_at(self, action: str) -> bool:

@@ -5,8 +5,6 @@ Run with `-m test.support.stalls`, it wakes every `TICK` s on each processor: a 
 alone. For each line on its standard input it prints the longest time in s between two wake-ups since the last line.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -55,7 +53,6 @@ class Machine:
             warnings.warn(f"{stood_still(gap)}: not judged: {error}", stacklevel=3)
 
     def close(self) -> None:
-        """End the process."""
         self._clock.communicate()
 
 

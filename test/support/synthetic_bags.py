@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings of known content: what motors measure of a known motion, its messages, and bags of them, by rosbags."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -140,7 +138,6 @@ def joint_state(
 
 
 def string(text: str) -> bytes:
-    """Return a serialised std_msgs/String."""
     return serialised(STRING, text)
 
 
@@ -225,7 +222,6 @@ def bag_of(*recordings: Recording, **more: Any) -> Bag:
 
 
 def only(path: Path) -> Recording:
-    """Return the recording of the only arm in the bag at `path`."""
     (recording,) = read_bag(path).recordings
     return recording
 

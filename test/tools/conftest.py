@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """The commands as a user runs them, within the test's process, on packaged parameter files that a test changes."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
@@ -20,15 +18,12 @@ from ..support import CONFIG
 
 
 class Ended(NamedTuple):
-    """How a command ended."""
-
     code: int
     out: str
     err: str
 
     @property
     def text(self) -> str:
-        """All that it printed."""
         return self.out + self.err
 
 

@@ -4,8 +4,6 @@
 The records are those of the simulated IMU.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
@@ -78,7 +76,6 @@ SCALE, BIAS = np.array((1.02, 0.97, 1.01)), np.array((0.2, -0.3, 0.1))
 
 
 def angle_of(found: object, expected: np.ndarray) -> float:
-    """Return the angle in rad between two mountings."""
     error = rotation_matrix(found) @ rotation_matrix(expected).T
     return math.acos(max(-1.0, min(1.0, (np.trace(error) - 1.0) / 2.0)))
 

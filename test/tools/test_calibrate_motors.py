@@ -1,8 +1,6 @@
 # Copyright exo_gravity maintainers. SPDX-License-Identifier: Apache-2.0
 """Finding each joint's motor, direction and zero: in virtual time, and once through the command line on a bus."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

@@ -5,8 +5,6 @@ rosbags is the independent writer and decoder. What was recorded is known, so is
 messages decoded in bulk, events, parameters, and time series as a table of pandas.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os
@@ -57,7 +55,6 @@ each_form = pytest.mark.parametrize("form", FORMS, ids=[f"{plugin.name}-{mode}" 
 
 
 def read(folder: Path, content: Entries = CONTENT, *form: object):
-    """Write a bag into `folder`, and return what is read of it."""
     return read_bag(made.write_bag(folder / "bag", content, *form))
 
 
@@ -310,7 +307,6 @@ def restamped(data: bytes, change: Callable[[int], int]) -> bytes:
 
 
 def unstamped(data: bytes) -> bytes:
-    """A joint state whose publisher does not set the stamp."""
     return restamped(data, lambda stamp: 0)
 
 
