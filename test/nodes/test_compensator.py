@@ -42,7 +42,6 @@ from exo_gravity.hardware.urdf_arm import UrdfArm
 from exo_gravity.lab.inputs.arms import read_arm
 from exo_gravity.lab.inputs.parameter_file import packaged_config
 from exo_gravity.nodes.compensator import arm
-from exo_gravity.nodes.compensator.arm import declared
 from exo_gravity.nodes.compensator.node import CompensatorNode
 from exo_gravity.nodes.ros.inner import NodeExecutor
 from exo_gravity.nodes.ros.messages import to_nanoseconds
@@ -53,7 +52,6 @@ from exo_gravity.tools import train_anfis
 from ..support import CONFIG, PARTS, ROBOT
 from ..support.chains import random_chain
 from ..support.node_thread import NodeRig
-from ..support.urdf_oracle import MujocoArm
 from ..support.waiting import each_closed, pause, wait_until
 
 keep_to_this_machine()
@@ -538,7 +536,6 @@ CARRIED = gravity_torque(ROBOT.with_wearer(LOAD.mass, LOAD.cog, 0.4), POSE)
 GIVEN = np.array((0.0, 4.0, 1.5, 0.0))  # Nm, of the wearer
 WEIGHT = NEEDED - gravity_torque(ROBOT, POSE)  # Nm, that carries the wearer's arm
 NONE = ["0.0"] * len(PARTS)  # Nm
-DOWN = (0.0, 0.0, -9.80665)
 
 
 class WornRig(CompensatorRig):
@@ -664,7 +661,7 @@ def test_the_wearers_torque_on_an_arm_of_three_joints_is_known_once_its_urdf_arr
     text = packaged_config("arms/three_joints.urdf").read_text(encoding="utf-8")
     urdf = {"urdf.topic": "/robot_description", "urdf.hand": "hand", "max_effort": [30.0] * 3}
     rig = worn({"law": "urdf", "use_imu": "false", "joint_names": f"[{','.join(names)}]", **urdf}, names, pose)
-    rig.effort = (MujocoArm(text, names).torque(pose, DOWN) - given).tolist()
+    rig.effort = np.subtract(UrdfArm(text, names).torque(pose, Tilt.of("left")), given).tolist()
     rig.user.create_publisher(String, "/robot_description", LATCHED).publish(String(data=text))
     rig.start(with_wearer=True)
     torques = rig.estimates[""]
@@ -717,12 +714,12 @@ def test_a_joint_that_is_not_listed_is_at_0_for_compensator_wearer_and_tools(alo
     own = [Parameter(name, value=value) for name, value in given.items()]
     has = {"parameter_overrides": own, "automatically_declare_parameters_from_overrides": True}
     node = alone.add(rclpy.create_node("compensator", **has), is_spun=False)
-    _, values, read, arm = declared(node)
-    assert arm.fixed == (names[1],)
+    _, values, read, made = arm.declared(node)
+    assert made.fixed == (names[1],)
     of_tools = read_arm({"/right/can_bridge": bridge, "/right/compensator": given}, "/right").settings
-    made = read(values), alone.wearer._read(values), of_tools
-    oracle = MujocoArm(text, listed)
+    all_of_them = read(values), alone.wearer._read(values), of_tools
+    expected = UrdfArm(text, listed)
     for theta in np.random.default_rng(0).uniform(-2.0, 2.0, (10, 2)):
-        for settings in made:
+        for settings in all_of_them:
             torque, _ = settings.torque(theta.tolist(), Tilt.of("left"))
-            np.testing.assert_allclose(torque, oracle.torque(theta, DOWN), rtol=0.0, atol=1e-10)
+            assert torque == pytest.approx(expected.torque(theta.tolist(), Tilt.of("left")), abs=1e-10)
